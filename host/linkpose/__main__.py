@@ -1,0 +1,5 @@
+"""`python -m linkpose` is `linkpose`."""
+
+from linkpose.cli import main
+
+main()

@@ -1,0 +1,63 @@
+"""The command line. Each command is one module of this package, imported only when it is typed."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from linkpose import __version__
+from linkpose.errors import LinkposeError
+
+# Command -> what it does in a line. The module `linkpose.cli.<command>` holds its click command under the name `command`.
+COMMANDS = {
+    "ports": "List the serial ports and say which is the board.",
+    "info": "Show the board's versions, sensors, settings and link health.",
+    "record": "Record the sensors into a CSV file.",
+    "estimate": "Run the filters, live or over a recording.",
+    "evaluate": "Compare estimates with a reference.",
+    "simulate": "Make a recording and its truth from a simulated rig.",
+}
+
+
+class LazyGroup(click.Group):
+    """A group that knows its commands by name and imports a command only to run it or to show its help."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command = importlib.import_module(f"linkpose.cli.{cmd_name}").command
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.version_option(__version__, prog_name="linkpose")
+def group() -> None:
+    """Measure how a joint-connected link or a small mobile robot moves, with an Arduino UNO in place of a motion-capture room."""
+
+
+def main() -> None:
+    """Entry point. Every failure a user can cause ends here as one sentence and a status."""
+    try:
+        status = group.main(standalone_mode=False)
+    except click.exceptions.Abort:
+        status = 130
+    except click.ClickException as error:
+        error.show()
+        status = error.exit_code
+    except LinkposeError as error:
+        click.echo(f"linkpose: {error}", err=True)
+        status = 1
+    except BrokenPipeError:  # the reader of our output has gone, as in `linkpose ... | head`
+        sys.stderr.close()
+        status = 1
+    sys.exit(status if isinstance(status, int) else 0)

@@ -1,0 +1,1 @@
+"""The wire: frames, messages, decoders. Imports nothing above itself."""
