@@ -41,8 +41,8 @@ def load_schema(path: Path = SCHEMA) -> dict:
         if message["id"] in ids:
             raise ValueError(f"{name} has the id of {ids[message['id']]}")
         ids[message["id"]] = name
-        if message["direction"] not in ("board_to_host", "host_to_board"):
-            raise ValueError(f"{name}: no such direction: {message['direction']}")
+        if message["direction"] != ("host_to_board" if message["id"] & 0x80 else "board_to_host"):
+            raise ValueError(f"{name}: the id's top bit and the direction disagree: {message['direction']}")
         for field in all_fields(message):
             if field["type"] not in STRUCT_CODE:
                 raise ValueError(f"{name}.{field['name']}: no such type: {field['type']}")
@@ -75,7 +75,9 @@ def schema_crc(schema: dict) -> int:
     """CRC-32 of all that changes the meaning of a byte on the wire; comments and docs do not count."""
 
     def meaning(field: dict) -> dict:
-        return {key: field[key] for key in ("name", "type", "unit", "scale", "offset", "scale_by", "enum") if key in field}
+        return {
+            key: field[key] for key in ("name", "type", "unit", "scale", "offset", "scale_by", "enum") if key in field
+        }
 
     canonical = {
         "protocol": [schema["protocol"]["major"], schema["protocol"]["minor"]],
@@ -115,7 +117,7 @@ def cpp_struct(name: str, fields: list[dict], extra: list[str]) -> list[str]:
     for field in fields:
         remark = "; ".join(r for r in (field.get("unit"), field.get("doc")) if r)
         lines.append(f"  {CPP_TYPE[field['type']]} {field['name']};" + (f"  // {remark}" if remark else ""))
-    return lines + extra + ["};", f"static_assert(sizeof({name}) == {size_of_struct(fields, extra)}, \"no padding\");"]
+    return lines + extra + ["};", f'static_assert(sizeof({name}) == {size_of_struct(fields, extra)}, "no padding");']
 
 
 def size_of_struct(fields: list[dict], extra: list[str]) -> str:
@@ -127,7 +129,13 @@ def cpp_message(message: dict) -> list[str]:
     name = camel(message["name"])
     lines = ["", f"// {message['doc']}"]
     if not message["fields"] and "repeat" not in message:
-        return [*lines, f"struct {name} {{", f"  static constexpr uint8_t kType = {message['id']:#04x};", "  static constexpr uint8_t kSize = 0;", "};"]
+        return [
+            *lines,
+            f"struct {name} {{",
+            f"  static constexpr uint8_t kType = {message['id']:#04x};",
+            "  static constexpr uint8_t kSize = 0;",
+            "};",
+        ]
     body: list[str] = [f"  static constexpr uint8_t kType = {message['id']:#04x};"]
     if repeat := message.get("repeat"):
         group = cpp_struct("Mouse", repeat["fields"], [])
@@ -144,7 +152,9 @@ def cpp_message(message: dict) -> list[str]:
             f"  Mouse mice[kMaxMice];  // {repeat['doc']}",
             f"  static constexpr uint8_t kSize = {largest_body(message)};  // with all mice",
             "  // Length of the body that carries the first `count` mice.",
-            f"  static constexpr uint8_t size(uint8_t count) {{ return {size_of(message['fields'])} + count * sizeof(Mouse); }}",
+            "  static constexpr uint8_t size(uint8_t count) {",
+            f"    return {size_of(message['fields'])} + count * sizeof(Mouse);",
+            "  }",
             "};",
             f'static_assert(sizeof({name}) == {name}::kSize, "no padding");',
         ]
@@ -181,7 +191,10 @@ def cpp_header(schema: dict) -> str:
         f"constexpr uint8_t kProtocolMinor = {schema['protocol']['minor']};",
         f"constexpr uint32_t kSchemaCrc = {schema_crc(schema):#010x};",
         f"constexpr uint32_t kBaud = {schema['protocol']['baud']};",
-        *(f"constexpr uint8_t kVersion{part} = {number};" for part, number in zip(("Major", "Minor", "Patch"), version, strict=True)),
+        *(
+            f"constexpr uint8_t kVersion{part} = {number};"
+            for part, number in zip(("Major", "Minor", "Patch"), version, strict=True)
+        ),
         "// Longest type + body + CRC in each direction.",
         f"constexpr uint8_t kMaxPayloadToHost = {max(largest_body(m) for m in to_host) + 3};",
         f"constexpr uint8_t kMaxPayloadToBoard = {max(largest_body(m) for m in to_board) + 3};",
@@ -242,7 +255,9 @@ def python_module(schema: dict) -> str:
         name = camel(message["name"])
         tail = None
         if repeat := message.get("repeat"):
-            lines += python_class(f"{name}Mouse", f"{repeat['doc'][0].upper()}{repeat['doc'][1:]}.", repeat["fields"], None)
+            lines += python_class(
+                f"{name}Mouse", f"{repeat['doc'][0].upper()}{repeat['doc'][1:]}.", repeat["fields"], None
+            )
             tail = f"    mice: tuple[{name}Mouse, ...] = ()"
         lines += python_class(name, message["doc"], message["fields"], tail)
     names = [camel(m["name"]) for m in schema["message"]]
@@ -265,9 +280,9 @@ def python_module(schema: dict) -> str:
         repeat = message.get("repeat")
         group = "".join(STRUCT_CODE[f["type"]] for f in repeat["fields"]) if repeat else ""
         group_cls = f"{camel(message['name'])}Mouse" if repeat else "None"
-        lines.append(
-            f'    Layout({message["id"]:#04x}, {camel(message["name"])}, "{code}", "{group}", {group_cls}, {repeat["max"] if repeat else 0}),'
-        )
+        most = repeat["max"] if repeat else 0
+        name = camel(message["name"])
+        lines.append(f'    Layout({message["id"]:#04x}, {name}, "{code}", "{group}", {group_cls}, {most}),')
     lines += [")", "", "SCALES: dict[str, Scale] = {"]
     for message in schema["message"]:
         for field in all_fields(message):
@@ -284,7 +299,7 @@ def python_module(schema: dict) -> str:
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected, no final XOR. crc16(b"123456789") == 0x29B1"""
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, start 0xFFFF, not reflected, no final XOR; "123456789" gives 0x29B1."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte << 8
@@ -319,7 +334,9 @@ def golden_values(message: dict, pattern: str) -> tuple[list[int], list[list[int
     fields = [value(f, i) for i, f in enumerate(message["fields"])]
     repeat = message.get("repeat")
     count = {"zeros": 0, "extremes": repeat["max"], "running": 3}[pattern] if repeat else 0
-    groups = [[value(f, 31 + 5 * g + i) for i, f in enumerate(repeat["fields"])] for g in range(count)] if repeat else []
+    groups = (
+        [[value(f, 31 + 5 * g + i) for i, f in enumerate(repeat["fields"])] for g in range(count)] if repeat else []
+    )
     return fields, groups
 
 
@@ -339,7 +356,9 @@ def golden_frames(schema: dict) -> list[dict]:
                     "message": message["name"],
                     "direction": message["direction"],
                     "fields": dict(zip((f["name"] for f in message["fields"]), values, strict=True)),
-                    "mice": [dict(zip((f["name"] for f in message["repeat"]["fields"]), g, strict=True)) for g in groups],
+                    "mice": [
+                        dict(zip((f["name"] for f in message["repeat"]["fields"]), g, strict=True)) for g in groups
+                    ],
                     "payload": payload.hex(),
                     "frame": frame(payload).hex(),
                 }
@@ -368,7 +387,9 @@ def rejected_frames(schema: dict) -> list[dict]:
             {"name": f"{message['name']} unknown type", "cause": "type", "frame": unknown.hex()},
             {"name": f"{message['name']} COBS code past the end", "cause": "cobs", "frame": bytes(broken).hex()},
         ]
-    rows.append({"name": "too short for a type and a CRC", "cause": "length", "frame": (cobs(b"\x85\x01") + b"\0").hex()})
+    rows.append(
+        {"name": "too short for a type and a CRC", "cause": "length", "frame": (cobs(b"\x85\x01") + b"\0").hex()}
+    )
     long = cobs(bytes([1]) + bytes([5]) * (schema["protocol"]["max_frame"] + 40)) + b"\0"
     rows.append({"name": "longer than any frame", "cause": "length", "frame": long.hex()})
     return rows
@@ -378,7 +399,9 @@ def vectors(schema: dict) -> str:
     document = {
         "note": NOTE,
         "schema_crc": schema_crc(schema),
-        "crc16": [{"data": data.hex(), "crc": crc16(data)} for data in (b"", b"123456789", b"\0" * 32, bytes(range(256)))],
+        "crc16": [
+            {"data": data.hex(), "crc": crc16(data)} for data in (b"", b"123456789", b"\0" * 32, bytes(range(256)))
+        ],
         "frames": golden_frames(schema),
         "rejected": rejected_frames(schema),
     }

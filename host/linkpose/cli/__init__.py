@@ -10,7 +10,7 @@ import click
 from linkpose import __version__
 from linkpose.errors import LinkposeError
 
-# Command -> what it does in a line. The module `linkpose.cli.<command>` holds its click command under the name `command`.
+# Command -> what it does. The module `linkpose.cli.<command>` holds its click command under the name `command`.
 COMMANDS = {
     "ports": "List the serial ports and say which is the board.",
     "info": "Show the board's versions, sensors, settings and link health.",
@@ -42,7 +42,7 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
 @click.version_option(__version__, prog_name="linkpose")
 def group() -> None:
-    """Measure how a joint-connected link or a small mobile robot moves, with an Arduino UNO in place of a motion-capture room."""
+    """Measure how a joint-connected link or a small robot moves, with an Arduino UNO for a motion-capture room."""
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """Calibration of the MPU-6050: true = (measured - offset) / scale for the accelerometer, measured - bias for the gyro.
+    """Calibration of the MPU-6050: acceleration = (measured - offset) / scale, rate = measured - bias.
 
     The noises are the standard deviations of one sample at rest. The defaults are the data sheet's typical figures.
     """
@@ -75,7 +75,7 @@ class Rig:
 
     @staticmethod
     def from_dict(tables: Mapping[str, Any], origin: str) -> Rig:
-        """The inverse of `as_dict`. Raises LinkposeError for an unknown key or a value that cannot be; `origin` names the file."""
+        """The inverse of `as_dict`; `origin` names the file. Raises LinkposeError for what cannot be."""
         _refuse_unknown(tables, [f.name for f in fields(Rig)], origin, "")
         parts: dict[str, Any] = {}
         for name, cls in (("joint", Joint), ("imu", Imu), ("baro", Baro)):
@@ -122,10 +122,12 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         raise LinkposeError(f"{origin}: {name} must be a table: write [{name}]")
     known = {f.name: f for f in fields(cls)}
     _refuse_unknown(table, list(known), origin, f"{name}.")
-    values = {}
+    values: dict[str, Any] = {}
     for key, value in table.items():
         is_vector = "Vector" in str(known[key].type)
-        values[key] = _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
+        values[key] = (
+            _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
+        )
         if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "counts_per_m")) and values[key] <= 0:
             raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be above 0")
         if key == "accel_scale" and min(values[key]) <= 0:
@@ -134,7 +136,9 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         return cls(**values)
     except TypeError:
         missing = [k for k in ("x_m", "y_m") if k in known and k not in values]
-        raise LinkposeError(f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame") from None
+        raise LinkposeError(
+            f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
+        ) from None
 
 
 def _read_number(value: Any, origin: str, where: str) -> float:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 VERSION = "0.1.0"
 PROTOCOL_MAJOR = 1
 PROTOCOL_MINOR = 0
-SCHEMA_CRC = 0x3d0aa551
+SCHEMA_CRC = 0x89879a12
 BAUD = 250000
 MAX_FRAME = 132
 
@@ -44,6 +44,7 @@ class SampleFlags(IntFlag):
     MOUSE2_OVERFLOW = 0x200
     MOUSE3_OVERFLOW = 0x400
     MOUSE4_OVERFLOW = 0x800
+    GAP_BEFORE = 0x8000
 
 
 class Command(IntEnum):

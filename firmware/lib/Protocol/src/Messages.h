@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kProtocolMajor = 1;
 constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0x3d0aa551;
+constexpr uint32_t kSchemaCrc = 0x89879a12;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -46,6 +46,7 @@ constexpr uint16_t kMouse1Overflow = 0x0100;
 constexpr uint16_t kMouse2Overflow = 0x0200;
 constexpr uint16_t kMouse3Overflow = 0x0400;
 constexpr uint16_t kMouse4Overflow = 0x0800;
+constexpr uint16_t kGapBefore = 0x8000;
 }  // namespace sample_flags
 
 // What an ACK or a NAK answers: the type byte of the host's message.
@@ -115,7 +116,9 @@ struct __attribute__((packed)) Hello {
   Mouse mice[kMaxMice];  // one for each mouse port that the firmware serves
   static constexpr uint8_t kSize = 58;  // with all mice
   // Length of the body that carries the first `count` mice.
-  static constexpr uint8_t size(uint8_t count) { return 46 + count * sizeof(Mouse); }
+  static constexpr uint8_t size(uint8_t count) {
+    return 46 + count * sizeof(Mouse);
+  }
 };
 static_assert(sizeof(Hello) == Hello::kSize, "no padding");
 
@@ -144,7 +147,9 @@ struct __attribute__((packed)) Sample {
   Mouse mice[kMaxMice];  // one for each port up to the last at which a mouse was ever found since boot
   static constexpr uint8_t kSize = 45;  // with all mice
   // Length of the body that carries the first `count` mice.
-  static constexpr uint8_t size(uint8_t count) { return 29 + count * sizeof(Mouse); }
+  static constexpr uint8_t size(uint8_t count) {
+    return 29 + count * sizeof(Mouse);
+  }
 };
 static_assert(sizeof(Sample) == Sample::kSize, "no padding");
 
@@ -174,7 +179,9 @@ struct __attribute__((packed)) Status {
   Mouse mice[kMaxMice];  // one for each mouse port that the firmware serves
   static constexpr uint8_t kSize = 60;  // with all mice
   // Length of the body that carries the first `count` mice.
-  static constexpr uint8_t size(uint8_t count) { return 36 + count * sizeof(Mouse); }
+  static constexpr uint8_t size(uint8_t count) {
+    return 36 + count * sizeof(Mouse);
+  }
 };
 static_assert(sizeof(Status) == Status::kSize, "no padding");
 
