@@ -1,0 +1,264 @@
+"""The rig of the first paper: a link on a ball joint, moved by hand, with a GY-87 on it. Tests 1 to 3.
+
+Truth is a function of time, so any instant may be asked for. What the sensors give is a function of the instant and of the
+reading's number (its noise), so that a run is the same whether it is made whole, block by block, or sample by sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.errors import LinkposeError
+from linkpose.sensors.rig import Joint, Rig, Vector
+from linkpose.simulation import baro, imu
+from linkpose.simulation.imu import STANDARD_GRAVITY_M_S2
+from linkpose.simulation.motion import HandMotion, Kinematics
+from linkpose.wire.messages import Sample, SampleFlags
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+PAPER_J2S_M: Vector = (-0.09, -0.04, 1.65)
+PAPER_DURATION_S = 65.0
+_BLOCK = 1000  # samples made at once
+
+
+class PaperTest(NamedTuple):
+    """A Test of the paper's chapter 3."""
+
+    mean_accel_m_s2: float  # mean ‖a‖ over the whole test
+    tempo: float  # how much faster than Test 1 the link is swung
+
+
+TESTS = {1: PaperTest(6.8, 1.0), 2: PaperTest(10.7, 1.12), 3: PaperTest(12.5, 1.2)}
+
+# Streams of random numbers, apart from each other so that a setting changes only what it is about.
+_MOTION, _ERRORS, _WEATHER, _IMU_NOISE, _BARO_NOISE = range(5)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkTruth:
+    """The truth at N instants; vectors are (N, 3) in the sensor's frame."""
+
+    time_s: Floats
+    height_m: Floats  # of the sensor over the joint centre, Z·d
+    roll_deg: Floats
+    pitch_deg: Floats
+    tilt: Floats  # Z, n's Z axis (unit vector)
+    accel_m_s2: Floats  # linear acceleration a
+    specific_force_m_s2: Floats  # gZ + a
+    rate_rad_s: Floats  # ω
+    rate_derivative_rad_s2: Floats  # dω/dt
+    pressure_Pa: Floats  # of the air at the sensor
+    temp_degC: Floats
+
+
+class RawBlock(NamedTuple):
+    """N consecutive SAMPLEs as arrays; the fields are those of `wire.messages.Sample`."""
+
+    tick: Integers
+    t_us: Integers
+    accel: NDArray[np.int16]  # (N, 3)
+    imu_temp: NDArray[np.int16]
+    gyro: NDArray[np.int16]  # (N, 3)
+    baro_ut: Integers
+    baro_up: Integers
+    baro_count: Integers  # of all pressures read so far, not wrapped
+    flags: Integers
+
+    def samples(self) -> Iterator[Sample]:
+        """As messages, with the counters wrapped as the board wraps them."""
+        rows = zip(
+            (self.tick & 0xFFFF).tolist(),
+            (self.t_us & 0xFFFFFFFF).tolist(),
+            self.accel.tolist(),
+            self.imu_temp.tolist(),
+            self.gyro.tolist(),
+            self.baro_ut.tolist(),
+            self.baro_up.tolist(),
+            (self.baro_count & 0xFF).tolist(),
+            self.flags.tolist(),
+            strict=True,
+        )
+        for seq, t_us, accel, temp, gyro, ut, up, count, flags in rows:
+            yield Sample(seq, t_us, *accel, temp, *gyro, ut, up, count, flags)
+
+
+class LinkRun:
+    """A run of the simulated link. Pure: every method gives the same for the same arguments, in any order."""
+
+    def __init__(
+        self,
+        test: int = 1,
+        seed: int = 0,
+        duration_s: float | None = PAPER_DURATION_S,
+        rate_hz: float = 100.0,
+        errors: str = "calibrated",
+        j2s_m: Vector = PAPER_J2S_M,
+        *,
+        accel_range_g: int = 8,
+        gyro_range_deg_s: int = 1000,
+        oversampling: int = 1,
+    ) -> None:
+        """`duration_s` None never ends (a live board). Raises LinkposeError for a value that cannot be."""
+        _check(test, seed, duration_s, rate_hz, errors, j2s_m)
+        self.test, self.seed, self.duration_s = test, seed, duration_s
+        self.rate_hz, self.errors, self.j2s_m = rate_hz, errors, j2s_m
+        self.accel_range_g, self.gyro_range_deg_s, self.oversampling = accel_range_g, gyro_range_deg_s, oversampling
+        self._d = np.array(j2s_m, dtype=np.float64)
+        paper = TESTS[test]
+        self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
+        self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
+        self.imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS, test]))
+        self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
+        self._schedule = baro.Schedule(1 / rate_hz, oversampling)
+
+    @property
+    def count(self) -> int | None:
+        """How many samples the run has, None when it never ends."""
+        return None if self.duration_s is None else round(self.duration_s * self.rate_hz)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig file that belongs to the run."""
+        return Rig(joint=Joint(self.j2s_m))
+
+    def at(self, time_s: Floats) -> LinkTruth:
+        """The truth at any instants (N,), s. After the end the link stays at rest."""
+        moving = self._motion.at(np.atleast_1d(np.asarray(time_s, dtype=np.float64)))
+        accel = moving.acceleration(self._d)
+        height = moving.tilt @ self._d
+        speed = np.linalg.norm(np.cross(moving.rate_rad_s, self._d), axis=1)
+        return LinkTruth(
+            time_s=np.atleast_1d(np.asarray(time_s, dtype=np.float64)),
+            height_m=height,
+            roll_deg=np.degrees(np.arctan2(moving.tilt[:, 1], moving.tilt[:, 2])),
+            pitch_deg=np.degrees(np.arctan2(-moving.tilt[:, 0], np.hypot(moving.tilt[:, 1], moving.tilt[:, 2]))),
+            tilt=moving.tilt,
+            accel_m_s2=accel,
+            specific_force_m_s2=STANDARD_GRAVITY_M_S2 * moving.tilt + accel,
+            rate_rad_s=moving.rate_rad_s,
+            rate_derivative_rad_s2=moving.rate_derivative_rad_s2,
+            pressure_Pa=self._weather.pressure(time_s, height, speed),
+            temp_degC=_temperature(time_s),
+        )
+
+    def truth(self) -> LinkTruth:
+        """The truth at every sample. Only of a run that ends."""
+        if self.count is None:
+            raise LinkposeError("a run without an end has no whole truth: give it a duration")
+        return self.at(np.arange(self.count) / self.rate_hz)
+
+    def imu_counts(self, time_s: Floats, first: int) -> NDArray[np.int16]:
+        """Raw accel xyz, temperature, gyro xyz (N, 7) as in the MPU-6050's burst, at any instants (N,).
+
+        `first` is the number of the first of these readings since the start: it names their noise.
+        """
+        moving = self._motion.at(time_s)
+        force = STANDARD_GRAVITY_M_S2 * moving.tilt + moving.acceleration(self._d)
+        noise = imu.white((self.seed, _IMU_NOISE, self.test), first, len(time_s), 7)
+        errors = self.imu_errors
+        accel = force @ errors.accel_matrix.T + errors.accel_bias_m_s2 + errors.accel_noise_m_s2 * noise[:, :3]
+        rate = moving.rate_rad_s @ errors.gyro_matrix.T + errors.gyro_bias_rad_s
+        rate = rate + errors.gyro_noise_rad_s * noise[:, 4:]
+        disturbed = self.errors != "none"
+        temp = _temperature(time_s) + 2.0 + 0.02 * disturbed * noise[:, 3]  # the chip warms itself
+        return np.column_stack(
+            [
+                imu.accel_counts(accel, self.accel_range_g),
+                imu.temperature_counts(temp),
+                imu.gyro_counts(rate, self.gyro_range_deg_s),
+            ]
+        )
+
+    def baro_temperature(self, time_s: Floats) -> Integers:
+        """Raw temperature UT (N,) of the BMP180, with the data sheet's words, at any instants (N,)."""
+        return baro.raw_temperature(_temperature(time_s))
+
+    def baro_pressure(self, time_s: Floats, first: int) -> Integers:
+        """Raw pressure UP (N,) of the BMP180, with the data sheet's words, at any instants (N,), the first being reading `first`."""
+        moving = self._motion.at(time_s)
+        speed = np.linalg.norm(np.cross(moving.rate_rad_s, self._d), axis=1)
+        pressure = self._weather.pressure(time_s, moving.tilt @ self._d, speed)
+        if self.errors != "none":
+            noise = imu.white((self.seed, _BARO_NOISE, self.test), first, len(time_s), 1)[:, 0]
+            pressure = pressure + baro.PRESSURE_NOISE_PA * noise
+        return baro.raw_pressure(pressure, _temperature(time_s), self.oversampling)
+
+    def block(self, first: int, count: int) -> RawBlock:
+        """The SAMPLEs of ticks first … first + count − 1."""
+        tick = np.arange(first, first + count, dtype=np.int64)
+        time_s = tick / self.rate_hz
+        counts = self.imu_counts(time_s, first)
+        pressures = self._schedule.pressures_read(tick)
+        ut, up = self._baro_of(tick, pressures)
+        full = (counts == -32768) | (counts == 32767)
+        flags = np.full(count, int(SampleFlags.IMU_VALID), dtype=np.int64)
+        flags |= np.where(full[:, :3].any(axis=1), int(SampleFlags.ACCEL_SATURATED), 0)
+        flags |= np.where(full[:, 4:].any(axis=1), int(SampleFlags.GYRO_SATURATED), 0)
+        flags |= np.where(pressures > 0, int(SampleFlags.BARO_VALID), 0)
+        t_us = np.rint(time_s * 1e6).astype(np.int64)
+        return RawBlock(tick, t_us, counts[:, :3], counts[:, 3], counts[:, 4:], ut, up, pressures, flags)
+
+    def blocks(self) -> Iterator[RawBlock]:
+        """All SAMPLEs, block by block; without end when the run has none."""
+        first = 0
+        while self.count is None or first < self.count:
+            count = _BLOCK if self.count is None else min(_BLOCK, self.count - first)
+            yield self.block(first, count)
+            first += count
+
+    def samples(self) -> Iterator[Sample]:
+        """All SAMPLEs one by one, in bounded memory; without end when the run has none."""
+        for block in self.blocks():
+            yield from block.samples()
+
+    def _baro_of(self, tick: Integers, pressures: Integers) -> tuple[Integers, Integers]:
+        """UT and UP that the SAMPLEs of these ticks carry: the last ones read, 0 before the first pressure."""
+        if pressures[-1] == 0:
+            return np.zeros_like(tick), np.zeros_like(tick)
+        temperatures = self._schedule.temperatures_read(tick)
+        oldest_ut, oldest_up = max(0, int(temperatures[0]) - 1), max(0, int(pressures[0]) - 1)
+        uts = self.baro_temperature(self._schedule.temperature_time(np.arange(oldest_ut, temperatures[-1])))
+        ups = self.baro_pressure(self._schedule.pressure_time(np.arange(oldest_up, pressures[-1])), oldest_up)
+        known = pressures > 0
+        ut = np.where(known, uts[np.maximum(temperatures - 1 - oldest_ut, 0)], 0)
+        return ut, np.where(known, ups[np.maximum(pressures - 1 - oldest_up, 0)], 0)
+
+
+def simulate(
+    test: int,
+    seed: int,
+    duration_s: float | None = PAPER_DURATION_S,
+    rate_hz: float = 100.0,
+    errors: str = "calibrated",
+    j2s_m: Vector = PAPER_J2S_M,
+) -> LinkRun:
+    """A run of Test 1, 2 or 3. Raises LinkposeError for a value that cannot be."""
+    return LinkRun(test, seed, duration_s, rate_hz, errors, j2s_m)
+
+
+def _temperature(time_s: Floats) -> Floats:
+    """Temperature (°C) of the air: a room that warms by a few tenths of a degree in minutes."""
+    return np.asarray(25.0 + 0.3 * (1 - np.exp(-time_s / 200.0)))
+
+
+def _check(test: int, seed: int, duration_s: float | None, rate_hz: float, errors: str, j2s_m: Vector) -> None:
+    if test not in TESTS:
+        raise LinkposeError(f"there is no Test {test}: take 1, 2 or 3")
+    if seed < 0:
+        raise LinkposeError(f"the seed is {seed}: take a whole number from 0 up")
+    if duration_s is not None and not (math.isfinite(duration_s) and duration_s >= 1):
+        raise LinkposeError(f"a duration of {duration_s} s is too short to move the link: take 1 s or more")
+    if not 50 <= rate_hz <= 500:
+        raise LinkposeError(f"the board samples at 50 to 500 Hz, not at {rate_hz:g} Hz")
+    if errors not in imu.LEVELS:
+        raise LinkposeError(f"there are no errors called {errors!r}: take {', '.join(imu.LEVELS)}")
+    if not 0.01 <= math.hypot(*j2s_m) <= 10:
+        raise LinkposeError(f"a J2S of {j2s_m} m is no link: its length must be 0.01 to 10 m")
