@@ -28,7 +28,7 @@ def pressure_at_height(height_m: Floats, reference_Pa: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Weather:
-    """Slow drift of the room's pressure (doors, wind, ventilation), and the suction at a sensor that moves through the air."""
+    """Slow drift of the room's pressure (doors, wind), and the suction at a sensor that moves through the air."""
 
     reference_Pa: float
     amplitude_Pa: Floats  # (K,)
@@ -52,7 +52,7 @@ class Weather:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """When the firmware converts what: one conversion in the gap after each IMU read, one temperature to nine pressures.
+    """When the firmware converts what: one conversion after each IMU read, one temperature to nine pressures.
 
     Conversions that are longer than the gap take several ticks. Result k is in the SAMPLE of the tick that reads it.
     """
@@ -104,7 +104,7 @@ def raw_temperature(temp_degC: Floats, words: tuple[int, ...] = DATASHEET_WORDS)
     # B5 = X1 + MC 2^11 / (X1 + MD), solved for X1
     half = 0.5 * (b5 - md)
     x1 = half + np.sqrt(half**2 + b5 * md - mc * 2.0**11)
-    return np.rint(x1 * 2.0**15 / ac5 + ac6).astype(np.int64)
+    return np.asarray(np.rint(x1 * 2.0**15 / ac5 + ac6), dtype=np.int64)
 
 
 def raw_pressure(
@@ -118,4 +118,4 @@ def raw_pressure(
     # p = q + ((q/2^8)² 3038/2^16 − 7357 q/2^16 + 3791) / 2^4, solved for q
     square, linear = 3038 / 2**36, 1 - 7357 / 2**20
     q = (-linear + np.sqrt(linear**2 - 4 * square * (3791 / 16 - pressure_Pa))) / (2 * square)
-    return np.rint(q * b4 / 2 / (50000 >> oversampling) + b3).astype(np.int64)
+    return np.asarray(np.rint(q * b4 / 2 / (50000 >> oversampling) + b3), dtype=np.int64)

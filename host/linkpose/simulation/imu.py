@@ -37,8 +37,8 @@ class ImuErrors:
     def draw(level: str, rng: np.random.Generator) -> ImuErrors:
         """Errors of one specimen.
 
-        "calibrated": what a calibration leaves (gyro bias σ 0.05 °/s, accelerometer bias σ 0.03 m/s² and scale σ 0.2 %).
-        "datasheet": an uncalibrated part within the data sheet's tolerances (±20 °/s, ±50 mg, 3 % scale, 2 % cross-axis).
+        "calibrated": what a calibration leaves: gyro bias σ 0.05 °/s, accelerometer bias σ 0.03 m/s², scale σ 0.2 %.
+        "datasheet": an uncalibrated part within the data sheet: ±20 °/s, ±50 mg, 3 % scale, 2 % cross-axis.
         "none": the pure signals.
         """
         if level == "none":
@@ -62,7 +62,7 @@ def _tolerance(rng: np.random.Generator) -> Floats:
 
 
 def white(seed: tuple[int, ...], first: int, count: int, width: int) -> Floats:
-    """Standard normal numbers (count, width) of readings first, first + 1, …: a function of the reading's number alone."""
+    """Standard normal numbers (count, width) of the readings from `first` on, each a function of its own number alone."""
     rows = []
     for block in range(first // _BLOCK, (first + count - 1) // _BLOCK + 1):
         whole = _white_block(seed, block, width)

@@ -1,7 +1,7 @@
 """The rig of the first paper: a link on a ball joint, moved by hand, with a GY-87 on it. Tests 1 to 3.
 
-Truth is a function of time, so any instant may be asked for. What the sensors give is a function of the instant and of the
-reading's number (its noise), so that a run is the same whether it is made whole, block by block, or sample by sample.
+Truth is a function of time, so any instant may be asked for. What the sensors give is a function of the instant and of
+the reading's number (its noise), so that a run is the same whether it is made whole, in blocks, or sample by sample.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation.imu import STANDARD_GRAVITY_M_S2
-from linkpose.simulation.motion import HandMotion, Kinematics
+from linkpose.simulation.motion import HandMotion
 from linkpose.wire.messages import Sample, SampleFlags
 
 Floats = NDArray[np.float64]
@@ -86,8 +86,8 @@ class RawBlock(NamedTuple):
             self.flags.tolist(),
             strict=True,
         )
-        for seq, t_us, accel, temp, gyro, ut, up, count, flags in rows:
-            yield Sample(seq, t_us, *accel, temp, *gyro, ut, up, count, flags)
+        for seq, t_us, (ax, ay, az), temp, (gx, gy, gz), ut, up, count, flags in rows:
+            yield Sample(seq, t_us, ax, ay, az, temp, gx, gy, gz, ut, up, count, flags)
 
 
 class LinkRun:
@@ -182,7 +182,10 @@ class LinkRun:
         return baro.raw_temperature(_temperature(time_s))
 
     def baro_pressure(self, time_s: Floats, first: int) -> Integers:
-        """Raw pressure UP (N,) of the BMP180, with the data sheet's words, at any instants (N,), the first being reading `first`."""
+        """Raw pressure UP (N,) of the BMP180, with the data sheet's words, at any instants (N,).
+
+        `first` is the number of the first of these readings since the start: it names their noise.
+        """
         moving = self._motion.at(time_s)
         speed = np.linalg.norm(np.cross(moving.rate_rad_s, self._d), axis=1)
         pressure = self._weather.pressure(time_s, moving.tilt @ self._d, speed)
