@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.sensors.bmp180 import Calibration
+
 Floats = NDArray[np.float64]
 
-# AC1 … AC6, B1, B2, MB, MC, MD of the data sheet's worked example.
-DATASHEET_WORDS = (408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
+# The data sheet's worked example.
+DATASHEET_WORDS = Calibration(408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
 PRESSURE_NOISE_PA = 3.0  # 0.25 m
 _CONVERSION_S = (0.0045, 0.0075, 0.0135, 0.0255)  # at oversampling 0 to 3; a temperature takes as long as the first
 _SETTLE_S = 0.0005  # the bus is silent for this long before the result is read
@@ -97,21 +99,20 @@ class Schedule:
         return np.asarray(number * self.cycle_ticks * self.tick_s + 0.5 * _CONVERSION_S[0])
 
 
-def raw_temperature(temp_degC: Floats, words: tuple[int, ...] = DATASHEET_WORDS) -> NDArray[np.int64]:
+def raw_temperature(temp_degC: Floats, words: Calibration = DATASHEET_WORDS) -> NDArray[np.int64]:
     """UT whose compensated temperature is `temp_degC`."""
-    ac5, ac6, mc, md = words[4], words[5], words[9], words[10]
     b5 = temp_degC * 160 - 8
     # B5 = X1 + MC 2^11 / (X1 + MD), solved for X1
-    half = 0.5 * (b5 - md)
-    x1 = half + np.sqrt(half**2 + b5 * md - mc * 2.0**11)
-    return np.asarray(np.rint(x1 * 2.0**15 / ac5 + ac6), dtype=np.int64)
+    half = 0.5 * (b5 - words.md)
+    x1 = half + np.sqrt(half**2 + b5 * words.md - words.mc * 2.0**11)
+    return np.asarray(np.rint(x1 * 2.0**15 / words.ac5 + words.ac6), dtype=np.int64)
 
 
 def raw_pressure(
-    pressure_Pa: Floats, temp_degC: Floats, oversampling: int, words: tuple[int, ...] = DATASHEET_WORDS
+    pressure_Pa: Floats, temp_degC: Floats, oversampling: int, words: Calibration = DATASHEET_WORDS
 ) -> NDArray[np.int64]:
     """UP whose compensated pressure is `pressure_Pa` at `temp_degC`."""
-    ac1, ac2, ac3, ac4, _, _, b1, b2, _, _, _ = words
+    ac1, ac2, ac3, ac4, b1, b2 = words.ac1, words.ac2, words.ac3, words.ac4, words.b1, words.b2
     b6 = temp_degC * 160 - 8 - 4000
     b3 = ((ac1 * 4 + (b2 * (b6**2 / 2**12) + ac2 * b6) / 2**11) * 2**oversampling + 2) / 4
     b4 = ac4 * ((ac3 * b6 / 2**13 + b1 * (b6**2 / 2**12) / 2**16 + 2) / 4 + 32768) / 2**15

@@ -1,6 +1,6 @@
 """How an MPU-6050 errs, and the counts that it gives.
 
-The counts are made with the schema's scales, the ones that `linkpose.sensors` reads them with.
+The counts are made with the scales that `linkpose.sensors` reads them with.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY, accel_scale, gyro_scale
 from linkpose.wire.messages import SCALES
 
 Floats = NDArray[np.float64]
 
-STANDARD_GRAVITY_M_S2 = 9.80665
 GYRO_NOISE_RAD_S = float(np.radians(0.05))  # data sheet, 3.1: total RMS noise 0.05 °/s
 ACCEL_NOISE_M_S2 = 0.04  # data sheet, 3.2: 400 µg/√Hz over about 100 Hz
 _BLOCK = 1000  # readings whose noise is drawn at once
@@ -50,7 +50,7 @@ class ImuErrors:
         else:
             gyro_matrix, accel_matrix = _tolerance(rng), _tolerance(rng)
             gyro_bias = np.radians(20.0) * rng.uniform(-1, 1, 3)
-            accel_bias = 0.05 * STANDARD_GRAVITY_M_S2 * rng.uniform(-1, 1, 3)
+            accel_bias = 0.05 * STANDARD_GRAVITY * rng.uniform(-1, 1, 3)
         return ImuErrors(gyro_matrix, gyro_bias, GYRO_NOISE_RAD_S, accel_matrix, accel_bias, ACCEL_NOISE_M_S2)
 
 
@@ -62,7 +62,7 @@ def _tolerance(rng: np.random.Generator) -> Floats:
 
 
 def white(seed: tuple[int, ...], first: int, count: int, width: int) -> Floats:
-    """Standard normal numbers (count, width) of the readings from `first` on, each a function of its own number alone."""
+    """Standard normal numbers (count, width) of the readings from `first` on, a function of each one's number alone."""
     rows = []
     for block in range(first // _BLOCK, (first + count - 1) // _BLOCK + 1):
         whole = _white_block(seed, block, width)
@@ -77,11 +77,11 @@ def _white_block(seed: tuple[int, ...], block: int, width: int) -> Floats:
 
 
 def accel_counts(accel_m_s2: Floats, range_g: int) -> NDArray[np.int16]:
-    return to_counts(accel_m_s2, SCALES["SAMPLE.accel_x"].scale * range_g * STANDARD_GRAVITY_M_S2)
+    return to_counts(accel_m_s2, accel_scale(range_g))
 
 
 def gyro_counts(gyro_rad_s: Floats, range_deg_s: int) -> NDArray[np.int16]:
-    return to_counts(gyro_rad_s, np.radians(SCALES["SAMPLE.gyro_x"].scale * range_deg_s))
+    return to_counts(gyro_rad_s, gyro_scale(range_deg_s))
 
 
 def temperature_counts(temp_degC: Floats) -> NDArray[np.int16]:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Joint, Rig, Vector
 from linkpose.simulation import baro, imu
-from linkpose.simulation.imu import STANDARD_GRAVITY_M_S2
 from linkpose.simulation.motion import HandMotion
 from linkpose.wire.messages import Sample, SampleFlags
 
@@ -142,7 +142,7 @@ class LinkRun:
             pitch_deg=np.degrees(np.arctan2(-moving.tilt[:, 0], np.hypot(moving.tilt[:, 1], moving.tilt[:, 2]))),
             tilt=moving.tilt,
             accel_m_s2=accel,
-            specific_force_m_s2=STANDARD_GRAVITY_M_S2 * moving.tilt + accel,
+            specific_force_m_s2=STANDARD_GRAVITY * moving.tilt + accel,
             rate_rad_s=moving.rate_rad_s,
             rate_derivative_rad_s2=moving.rate_derivative_rad_s2,
             pressure_Pa=self._weather.pressure(time_s, height, speed),
@@ -161,7 +161,7 @@ class LinkRun:
         `first` is the number of the first of these readings since the start: it names their noise.
         """
         moving = self._motion.at(time_s)
-        force = STANDARD_GRAVITY_M_S2 * moving.tilt + moving.acceleration(self._d)
+        force = STANDARD_GRAVITY * moving.tilt + moving.acceleration(self._d)
         noise = imu.white((self.seed, _IMU_NOISE, self.test), first, len(time_s), 7)
         errors = self.imu_errors
         accel = force @ errors.accel_matrix.T + errors.accel_bias_m_s2 + errors.accel_noise_m_s2 * noise[:, :3]
