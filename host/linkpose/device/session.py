@@ -1,0 +1,400 @@
+"""A session with the board: handshake, settings, streaming, and coming back after a reset or a pulled cable."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import BinaryIO, NamedTuple, TypeVar
+
+from linkpose.device.clock import DeviceClock
+from linkpose.device.link import Arrival, Disconnected, Link
+from linkpose.device.timeline import Placed, Timeline
+from linkpose.errors import LinkposeError
+from linkpose.sensors.conversion import Settings
+from linkpose.wire.frames import Corrupt, OtherProtocol
+from linkpose.wire.messages import (
+    PROTOCOL_MAJOR,
+    PROTOCOL_MINOR,
+    SCHEMA_CRC,
+    VERSION,
+    Ack,
+    Command,
+    Configure,
+    GetInfo,
+    Hello,
+    Message,
+    Nak,
+    NakReason,
+    Ping,
+    Pong,
+    Sample,
+    SelfTest,
+    SelfTestResult,
+    Start,
+    Status,
+    Stop,
+)
+
+HANDSHAKE_TIMEOUT_S = 4.0  # a bootloader waits for up to two seconds before it starts the firmware
+ASK_INTERVAL_S = 0.4
+ANSWER_TIMEOUT_S = 1.0
+FIRST_PINGS = 5
+PING_INTERVAL_S = 1.0
+SILENCE_S = 1.5  # of a board that should be streaming
+RETRY_INTERVAL_S = 0.25
+
+Answer = TypeVar("Answer", bound="Message")
+Notify = Callable[[str], None]
+
+
+class Placement(NamedTuple):
+    """A sample and its place in time."""
+
+    sample: Sample
+    place: Placed
+
+
+@dataclass(slots=True)
+class Health:
+    """How the link has fared so far."""
+
+    samples: int
+    lost: int
+    corrupt: Corrupt
+    gaps: int
+    duration_s: float
+    rate_hz: float
+    drift_ppm: float | None
+    drift_std_ppm: float | None
+    status: Status | None  # the board's own counters, as it last told them
+
+
+class Session:
+    """Talks to one board. A context manager: leaving it stops the stream and frees the port.
+
+    `notify` gets a line for the user whenever something happens that is no failure (cable pulled, board back).
+    """
+
+    def __init__(self, port: str, notify: Notify, capture: BinaryIO | None = None) -> None:
+        self.port = port
+        self._notify = notify
+        self._capture = capture
+        self._link = Link(port, capture)
+        self._clock = DeviceClock()
+        self._timeline: Timeline | None = None
+        self._pings: dict[int, float] = {}
+        self._token = 0
+        self._status: Status | None = None
+        self._corrupt_before = Corrupt()
+        try:
+            self.hello = self._handshake()
+        except BaseException:
+            self._link.close()
+            raise
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Disconnected):
+            self._link.send(Stop())
+        self._link.close()
+
+    # ---- handshake ----
+
+    def _handshake(self) -> Hello:
+        """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
+        link = self._link
+        heard = bytearray()
+        deadline, ask_at = time.monotonic() + HANDSHAKE_TIMEOUT_S, 0.0
+        try:
+            while time.monotonic() < deadline:
+                if time.monotonic() >= ask_at:
+                    link.send(Stop())
+                    link.send(GetInfo())
+                    ask_at = time.monotonic() + ASK_INTERVAL_S
+                arrival = link.receive(0.05)
+                if arrival is None:
+                    continue
+                heard += arrival.data[: 512 - len(heard)]
+                for message in arrival.messages:
+                    if isinstance(message, OtherProtocol):
+                        raise LinkposeError(_other_protocol(message))
+                    if isinstance(message, Hello) and not message.streaming:
+                        return self._accept(message)
+        except Disconnected as error:
+            raise LinkposeError(f"{self.port} went away during the handshake ({error}); check the cable") from error
+        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
+
+    def _accept(self, hello: Hello) -> Hello:
+        """Checks the versions. What was heard before the handshake is no part of the session."""
+        if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
+            raise LinkposeError(
+                f"the board's firmware {firmware_version(hello)} and this linkpose {VERSION} were built from different "
+                "wire schemas of one version; type `linkpose flash`"
+            )
+        if hello.protocol_minor != PROTOCOL_MINOR:
+            older = "board" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
+            self._notify(
+                f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older"
+            )
+        self._link.decoder.corrupt = Corrupt()
+        return hello
+
+    # ---- commands ----
+
+    def configure(self, settings: Configure) -> Hello:
+        """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
+        self._command(settings, Command.CONFIGURE)
+        self._link.send(GetInfo())
+        self.hello = self._await(Hello, "GET_INFO")
+        return self.hello
+
+    def self_test(self) -> SelfTestResult:
+        """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""
+        self._command(SelfTest(), Command.SELF_TEST)
+        return self._await(SelfTestResult, "SELF_TEST", 3.0)
+
+    def _command(self, message: Message, command: Command) -> None:
+        try:
+            self._link.send(message)
+        except Disconnected as error:
+            raise LinkposeError(f"{self.port} went away ({error}); check the cable") from error
+        deadline = time.monotonic() + ANSWER_TIMEOUT_S
+        while (left := deadline - time.monotonic()) > 0:
+            for answer in self._messages(left):
+                if isinstance(answer, Nak) and answer.command == command:
+                    raise LinkposeError(f"the board refused {command.name}: {_reason(answer.reason)}")
+                if isinstance(answer, Ack) and answer.command == command:
+                    return
+        raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
+
+    def _await(self, kind: type[Answer], asked: str, timeout_s: float = ANSWER_TIMEOUT_S) -> Answer:
+        deadline = time.monotonic() + timeout_s
+        while (left := deadline - time.monotonic()) > 0:
+            for answer in self._messages(left):
+                if isinstance(answer, kind):
+                    return answer
+        raise LinkposeError(f"the board did not answer {asked}; unplug it, plug it in and try again")
+
+    def _messages(self, timeout_s: float) -> list[Message | OtherProtocol]:
+        try:
+            arrival = self._link.receive(timeout_s)
+        except Disconnected as error:
+            raise LinkposeError(f"{self.port} went away ({error}); check the cable") from error
+        return arrival.messages if arrival else []
+
+    # ---- the clock ----
+
+    def _ping(self) -> None:
+        self._token = (self._token + 1) % (1 << 32)
+        self._pings = {self._token: self._link.send(Ping(self._token))}
+
+    def _hear_pong(self, pong: Pong, time_s: float) -> None:
+        sent = self._pings.pop(pong.token, None)
+        if sent is not None:
+            self._clock.pong(pong.t_us, sent, time_s)
+
+    def _tie_clocks(self) -> None:
+        """A few round trips before the first sample."""
+        for _ in range(FIRST_PINGS):
+            self._ping()
+            deadline = time.monotonic() + ANSWER_TIMEOUT_S
+            while self._pings and time.monotonic() < deadline:
+                arrival = self._link.receive(ANSWER_TIMEOUT_S)
+                for message in arrival.messages if arrival else []:
+                    if isinstance(message, Pong) and arrival:
+                        self._hear_pong(message, arrival.time_s)
+        if not self._clock.ready:
+            raise LinkposeError(f"{self.port}: the board does not answer PING; unplug it, plug it in and try again")
+
+    # ---- streaming ----
+
+    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
+        """Samples as they arrive, in lists of those that came together, for `duration_s` of the board's time.
+
+        A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
+        was reset or unplugged is waited for, and goes on in the same timeline with the gap marked.
+        """
+        timeline = self._timeline = Timeline(self.hello.sample_rate_hz)
+        end_s = None if duration_s is None else duration_s - 0.5 / self.hello.sample_rate_hz
+        self._begin()
+        while True:
+            try:
+                placements = self._next(timeline)
+            except Disconnected as error:
+                self._notify(f"{self.port} is gone ({error}); waiting for the board to come back, Ctrl-C ends")
+                timeline.interrupted("cable")
+                yield []
+                for _ in self._reconnect():
+                    yield []
+                continue
+            if end_s is not None:
+                placements = [p for p in placements if p.place.time_s < end_s]
+            yield placements
+            if end_s is not None and timeline.duration_s > end_s:
+                return
+
+    def _begin(self) -> None:
+        """Ties the clocks anew and starts the stream."""
+        self._clock = DeviceClock()
+        self._tie_clocks()
+        self._command(Start(), Command.START)
+        self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
+
+    def _next(self, timeline: Timeline) -> list[Placement]:
+        arrival = self._link.receive(0.1)
+        now = time.monotonic()
+        if now - self._pinged_at >= PING_INTERVAL_S:
+            self._pinged_at = now
+            self._ping()
+        if arrival is None:
+            self._ask_when_silent(now)
+            return []
+        placements = []
+        for message in arrival.messages:
+            if isinstance(message, Sample):
+                self._heard_at = now
+                place = timeline.place(message, self._clock, arrival.time_s)
+                if place is not None:
+                    placements.append(Placement(message, place))
+            else:
+                self._hear(message, arrival, timeline)
+        return placements
+
+    def _ask_when_silent(self, now: float) -> None:
+        """A board that fell silent may have been reset while its HELLO was lost: ask who is there."""
+        if now - self._heard_at > SILENCE_S and now - self._asked_at > SILENCE_S:
+            self._asked_at = now
+            self._link.send(GetInfo())
+
+    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
+        if isinstance(message, Pong):
+            self._hear_pong(message, arrival.time_s)
+        elif isinstance(message, Status):
+            self._status = message
+        elif isinstance(message, OtherProtocol):
+            raise LinkposeError(_other_protocol(message))
+        elif isinstance(message, Hello) and not message.streaming:
+            self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
+            timeline.interrupted("reset")
+            self._resume(message)
+
+    def _resume(self, hello: Hello) -> None:
+        """Puts the settings of before in force again and goes on streaming."""
+        before, self.hello = self.hello, hello
+        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
+            raise LinkposeError(f"another board answers at {self.port} now; record it into a file of its own")
+        if _configured(before) != _configured(hello):
+            self.configure(_configured(before))
+        self._begin()
+
+    def _reconnect(self) -> Iterator[None]:
+        """Waits until the board can be opened again and streams; yields while it waits."""
+        self._link.close()
+        for part, count in self._link.decoder.corrupt.as_dict().items():
+            setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
+        while True:
+            time.sleep(RETRY_INTERVAL_S)
+            yield
+            try:
+                self._link = Link(self.port, self._capture)
+            except LinkposeError:
+                continue
+            try:
+                self._resume(self._handshake())
+            except (Disconnected, LinkposeError):
+                self._link.close()
+                continue
+            self._notify(f"the board is back at {self.port}; going on, the gap is marked")
+            return
+
+    # ---- health ----
+
+    def health(self) -> Health:
+        """Counts so far."""
+        timeline = self._timeline or Timeline(self.hello.sample_rate_hz)
+        now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
+        duration = timeline.duration_s
+        return Health(
+            samples=timeline.samples,
+            lost=timeline.lost,
+            corrupt=Corrupt(**{cause: now[cause] + before[cause] for cause in now}),
+            gaps=len(timeline.gaps),
+            duration_s=duration,
+            rate_hz=timeline.samples / duration if duration else 0.0,
+            drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
+            drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
+            status=self._status,
+        )
+
+    @property
+    def gaps(self) -> list[dict[str, float | int | str]]:
+        """The gaps so far, for a recording's closing line."""
+        timeline = self._timeline
+        return [
+            {"after_s": round(g.after_s, 6), "duration_s": round(g.duration_s, 6), "lost": g.lost, "cause": g.cause}
+            for g in (timeline.gaps if timeline else [])
+        ]
+
+
+def firmware_version(hello: Hello) -> str:
+    return f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}"
+
+
+def reset_causes(hello: Hello) -> str:
+    """Names of the reset flags that are set, such as "watchdog"."""
+    from linkpose.wire.messages import ResetCause
+
+    names = [cause.name.lower().replace("_", " ") for cause in ResetCause if hello.reset_cause & cause and cause.name]
+    return ", ".join(names) or "cause unknown"
+
+
+def _configured(hello: Hello) -> Configure:
+    """The CONFIGURE that puts the settings of a HELLO in force."""
+    resolutions = [mouse.counts_per_mm for mouse in hello.mice if mouse.counts_per_mm]
+    return Configure(
+        hello.sample_rate_hz,
+        hello.accel_range_g,
+        hello.gyro_range_deg_s,
+        hello.dlpf,
+        hello.baro_oversampling,
+        max(resolutions, default=8),
+    )
+
+
+def _reason(code: int) -> str:
+    try:
+        return NakReason(code).name.lower().replace("_", " ")
+    except ValueError:
+        return f"reason {code}"
+
+
+def _other_protocol(other: OtherProtocol) -> str:
+    theirs = f"{other.protocol_major}.{other.protocol_minor}"
+    ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
+    if other.protocol_major < PROTOCOL_MAJOR:
+        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; type `linkpose flash`"
+    return (
+        f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; "
+        "type `pip install --upgrade linkpose`"
+    )
+
+
+def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
+    """What came instead of a HELLO, and what to do about it."""
+    if not heard:
+        return "the board is silent; type `linkpose flash` if it never had this firmware, or choose another --port"
+    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
+    if printable > 0.8 * len(heard):
+        text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
+        return f"another firmware answers: {text!r}; type `linkpose flash` to put linkpose's on the board"
+    if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
+        return "the board answers only in part; check the cable and try again"
+    return (
+        "only noise came, and no frame; the device runs at another baud rate or is no linkpose board: check the port, "
+        "or type `linkpose flash`"
+    )

@@ -1,0 +1,93 @@
+"""The place of each sample in time and in the count of samples; what is missing is counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.wire.messages import Sample
+
+_SEQ_WRAP = 1 << 16
+
+
+class Clock(Protocol):
+    """What a timeline needs of a clock: see `DeviceClock`."""
+
+    def unwrap(self, t_us: int, host_s: float) -> int: ...
+    def host_time(self, t_us: int) -> float: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Samples that never came."""
+
+    after_s: float  # time of the last sample before it
+    duration_s: float
+    lost: int
+    cause: str  # "link": frames lost or dropped; "reset": the board started anew; "cable": the port was gone
+
+
+class Placed(NamedTuple):
+    """A sample's place: seconds since the first, ticks since START, and its flags with `gap_before`."""
+
+    time_s: float
+    seq: int
+    flags: int
+
+
+class Timeline:
+    """Places the samples of one recording one after another, over wraps, losses and restarts of the board."""
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._period_s = 1.0 / sample_rate_hz
+        self._start_s = 0.0  # the host's time of the first sample
+        self._last: Placed | None = None
+        self._wire_seq = 0  # the last sample's seq as it came
+        self._cause = "link"
+        self._restarted = False
+        self.samples = 0
+        self.lost = 0
+        self.gaps: list[Gap] = []
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the end of the last one's interval."""
+        return self._last.time_s + self._period_s if self._last else 0.0
+
+    def interrupted(self, cause: str) -> None:
+        """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters start anew."""
+        self._cause, self._restarted = cause, True
+
+    def place(self, sample: Sample, clock: Clock, arrived_s: float) -> Placed | None:
+        """Place of a sample that arrived at `arrived_s` (s, the host's clock); None for one that came twice."""
+        host_s = clock.host_time(clock.unwrap(sample.t_us, arrived_s))
+        last = self._last
+        if last is None:
+            self._start_s = host_s
+            time_s, seq, missing = 0.0, sample.seq, sample.seq  # START set the count to 0
+        else:
+            time_s = max(host_s - self._start_s, last.time_s)
+            ticks = self._ticks(sample.seq, (time_s - last.time_s) / self._period_s)
+            if ticks == 0:
+                return None
+            seq, missing = last.seq + ticks, ticks - 1
+        marked = missing or (self._restarted and last)
+        if marked:
+            before = last.time_s if last else -missing * self._period_s
+            self.gaps.append(Gap(before, time_s - before, missing, self._cause))
+            self.lost += missing
+        self._restarted, self._cause, self._wire_seq = False, "link", sample.seq
+        self._last = Placed(time_s, seq, sample.flags | (GAP_BEFORE if marked else 0))
+        self.samples += 1
+        return self._last
+
+    def _ticks(self, seq: int, elapsed: float) -> int:
+        """Ticks from the last sample to the one of this seq, which came `elapsed` periods later.
+
+        The count says them up to 65536; the clock says how often it wrapped, and all of them after a restart.
+        """
+        step = (seq - self._wire_seq) % _SEQ_WRAP
+        if self._restarted or (step > elapsed + _SEQ_WRAP / 4 and step > 1):
+            return max(1, round(elapsed))
+        return step + max(0, round((elapsed - step) / _SEQ_WRAP)) * _SEQ_WRAP

@@ -1,0 +1,120 @@
+"""A CSV file that survives: metadata ahead, rows on disk within a second, whole rows only, a closing line.
+
+    # linkpose <kind> 1
+    # {"...": "metadata, JSON"}
+    time_s,...
+    0.000000,...
+    # {"...": "closing metadata, JSON"}
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from linkpose.errors import LinkposeError
+
+FLUSH_INTERVAL_S = 0.5
+
+
+def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
+    """The three lines before the rows."""
+    return f"# linkpose {kind} 1\n# {json.dumps(metadata)}\n{','.join(columns)}\n"
+
+
+class CsvFile:
+    """Writes such a file row by row. Also a context manager: leaving it without `close` leaves out the closing line.
+
+    Raises LinkposeError where the file cannot be made or written; what was written before stays whole and readable.
+    """
+
+    def __init__(self, path: Path, kind: str, metadata: Mapping[str, Any], columns: Sequence[str], force: bool) -> None:
+        self.path = path
+        self._pending: list[str] = []
+        self._flushed_at = time.monotonic()
+        self._fd = create(path, force)
+        self._put(head(kind, metadata, columns))
+
+    def write(self, lines: Iterable[str]) -> None:
+        """Adds rows, each a line without its end. They are on disk within a second as long as this is called."""
+        self._pending += lines
+        if time.monotonic() - self._flushed_at >= FLUSH_INTERVAL_S:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hands all rows to the operating system: from here on, killing this process does not lose them."""
+        self._flushed_at = time.monotonic()
+        if self._pending:
+            lines, self._pending = self._pending, []
+            self._put("\n".join(lines) + "\n")
+
+    def close(self, closing: Mapping[str, Any]) -> None:
+        """Writes what is left and the closing line, and waits until the disk has it."""
+        self.flush()
+        self._put(f"# {json.dumps(closing)}\n")
+        with contextlib.suppress(OSError):  # a pipe cannot be synced
+            os.fsync(self._fd)
+        self._release()
+
+    def __enter__(self) -> CsvFile:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._fd >= 0:
+            with contextlib.suppress(LinkposeError):  # another failure is on its way to the user
+                self.flush()
+            self._release()
+
+    def _put(self, text: str) -> None:
+        write_all(self._fd, self.path, text.encode())
+
+    def _release(self) -> None:
+        os.close(self._fd)
+        self._fd = -1
+
+
+def create(path: Path, force: bool) -> int:
+    """Opens a new file for writing and gives its descriptor. An existing one is kept unless `force`."""
+    flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if force else os.O_EXCL)
+    try:
+        if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
+            flags = os.O_WRONLY
+        return os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
+    except FileExistsError:
+        raise LinkposeError(f"{path} exists already; name another file or add --force to replace it") from None
+    except OSError as error:
+        reason = error.strerror
+        raise LinkposeError(f"cannot write {path}: {reason}; name a file in a folder you may write to") from error
+
+
+def write_all(fd: int, path: Path, data: bytes) -> None:
+    """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
+    left = memoryview(data)
+    written = 0
+    try:
+        while len(left):
+            count = os.write(fd, left)
+            written += count
+            left = left[count:]
+    except OSError as error:
+        if written:
+            _cut_back(fd, data[:written])
+        if error.errno == errno.EPIPE:
+            raise LinkposeError(f"the reader of {path} has gone; nothing more can be written to it") from error
+        raise LinkposeError(
+            f"cannot write to {path} any more: {error.strerror}; what was written so far is whole, "
+            "make room or name a file on another disk"
+        ) from error
+
+
+def _cut_back(fd: int, written: bytes) -> None:
+    """Removes a partial last line that a full disk left behind."""
+    partial = len(written) - (written.rfind(b"\n") + 1)
+    with contextlib.suppress(OSError):
+        os.ftruncate(fd, os.fstat(fd).st_size - partial)
