@@ -195,6 +195,8 @@ def cpp_header(schema: dict) -> str:
             f"constexpr uint8_t kVersion{part} = {number};"
             for part, number in zip(("Major", "Minor", "Patch"), version, strict=True)
         ),
+        "// Longest run of bytes between two 0x00 that may be a frame.",
+        f"constexpr uint8_t kMaxFrame = {schema['protocol']['max_frame']};",
         "// Longest type + body + CRC in each direction.",
         f"constexpr uint8_t kMaxPayloadToHost = {max(largest_body(m) for m in to_host) + 3};",
         f"constexpr uint8_t kMaxPayloadToBoard = {max(largest_body(m) for m in to_board) + 3};",

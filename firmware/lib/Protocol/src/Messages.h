@@ -14,6 +14,8 @@ constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
 constexpr uint8_t kVersionPatch = 0;
+// Longest run of bytes between two 0x00 that may be a frame.
+constexpr uint8_t kMaxFrame = 132;
 // Longest type + body + CRC in each direction.
 constexpr uint8_t kMaxPayloadToHost = 63;
 constexpr uint8_t kMaxPayloadToBoard = 11;

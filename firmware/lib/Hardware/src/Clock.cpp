@@ -1,0 +1,104 @@
+#include "Clock.h"
+
+#include <avr/interrupt.h>
+#include <avr/io.h>
+#include <util/atomic.h>
+
+#include "Idle.h"
+#include "Twi.h"
+
+namespace clock {
+namespace {
+
+constexpr uint32_t kStepsPerSecond = F_CPU / 8;
+
+// The burst begins this many steps after the tick: more than the longest time for which another interrupt or a locked
+// section can hold the tick's interrupt up, so that all bursts begin at the same distance.
+constexpr uint8_t kBurstDelaySteps = 24;
+
+volatile uint32_t tick_number;
+volatile uint32_t tick_us;
+volatile uint8_t tick_half_us;  // 0 or 1 step on top of tick_us
+volatile uint16_t period_steps;
+volatile uint16_t next_period_steps;
+
+uint16_t period_of(uint16_t rate_hz) { return static_cast<uint16_t>(kStepsPerSecond / rate_hz); }
+
+}  // namespace
+
+void begin(uint16_t rate_hz) {
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+    period_steps = next_period_steps = period_of(rate_hz);
+    TCCR1A = 0;
+    TCCR1B = _BV(WGM12) | _BV(CS11);
+    OCR1A = period_steps - 1;
+    TCNT1 = 0;
+    TIFR1 = _BV(OCF1A) | _BV(OCF1B);
+    TIMSK1 = _BV(OCIE1A);
+  }
+}
+
+void set_rate(uint16_t rate_hz) {
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { next_period_steps = period_of(rate_hz); }
+}
+
+Tick tick() {
+  Tick latest;
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+    latest.number = tick_number;
+    latest.t_us = tick_us;
+  }
+  return latest;
+}
+
+uint32_t now_us_locked() {
+  uint16_t steps = TCNT1;
+  if (TIFR1 & _BV(OCF1A)) steps = TCNT1 + period_steps;  // a tick that waits for its interrupt
+  return tick_us + ((steps + tick_half_us) >> 1);
+}
+
+uint32_t now_us() {
+  uint32_t now;
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { now = now_us_locked(); }
+  return now;
+}
+
+uint16_t steps_left() {
+  uint16_t left;
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { left = TIFR1 & _BV(OCF1A) ? 0 : OCR1A - TCNT1; }
+  return left;
+}
+
+void arm_deadline_locked(uint16_t steps) {
+  OCR1B = TCNT1 + steps;
+  TIFR1 = _BV(OCF1B);
+  TIMSK1 |= _BV(OCIE1B);
+}
+
+void disarm_deadline() { TIMSK1 &= static_cast<uint8_t>(~_BV(OCIE1B)); }
+
+}  // namespace clock
+
+ISR(TIMER1_COMPA_vect) {
+  idle::note_wake();
+  while (TCNT1L < clock::kBurstDelaySteps) {
+  }
+  twi::start_burst();
+  // A tick ends the period that was in force until now.
+  const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
+  clock::tick_us += (clock::period_steps >> 1) + (halves >> 1);
+  clock::tick_half_us = halves & 1;
+  clock::tick_number++;
+  if (clock::period_steps != clock::next_period_steps) {
+    clock::period_steps = clock::next_period_steps;
+    OCR1A = clock::period_steps - 1;  // well before TCNT1 gets there
+  }
+  idle::signal_work();
+}
+
+ISR(TIMER1_COMPB_vect) {
+  idle::note_wake();
+  clock::disarm_deadline();
+  twi::expire();
+  idle::signal_work();
+}

@@ -1,0 +1,23 @@
+// Why the board started, the watchdog, the free stack, and the LED.
+#pragma once
+#include <stdint.h>
+
+namespace board {
+
+// Bits of wire::reset_cause.
+uint8_t reset_cause();
+
+// From now on the board resets when feed_watchdog() is not called for 0.5 s.
+void start_watchdog();
+void feed_watchdog();
+
+// Bytes of the stack never touched since boot.
+uint16_t free_stack();
+
+void begin_led();
+void set_led(bool on);
+
+// What nobody uses (ADC, SPI, Timer0, Timer2) is switched off.
+void power_down_unused();
+
+}  // namespace board

@@ -1,0 +1,114 @@
+#include "Link.h"
+
+#include <Idle.h>
+#include <System.h>
+#include <Twi.h>
+#include <Uart.h>
+#include <stddef.h>
+#include <string.h>
+
+namespace {
+
+// HELLO goes out at boot when all sensors are set up or found absent, and after this time at the latest.
+constexpr uint32_t kGreetUs = 300000;
+constexpr uint32_t kStatusUs = 1000000;
+
+}  // namespace
+
+void Link::note_pass(uint32_t us) {
+  if (us > longest_pass_us_) longest_pass_us_ = us < UINT16_MAX ? static_cast<uint16_t>(us) : UINT16_MAX;
+}
+
+void Link::run() {
+  receive();
+  greet();
+  send_status();
+}
+
+void Link::receive() {
+  uint8_t byte;
+  while (uart::take(byte, received_us_)) {
+    switch (decoder_.push(byte)) {
+      case FrameDecoder::Event::kNone: break;
+      case FrameDecoder::Event::kCorrupt: corrupt_++; break;
+      case FrameDecoder::Event::kFrame:
+        commands::carry_out(decoder_.type(), decoder_.body(), decoder_.size(), *this);
+        break;
+    }
+  }
+}
+
+void Link::greet() {
+  if (greeted_ || !(sampler_.sensors_settled() || clock::now_us() > kGreetUs)) return;
+  greeted_ = true;
+  send_hello();
+}
+
+void Link::send_hello() {
+  const wire::Configure& settings = sampler_.settings();
+  const uint16_t* const words = sampler_.baro().calibration();
+  wire::Hello hello;
+  hello.protocol_major = wire::kProtocolMajor;
+  hello.protocol_minor = wire::kProtocolMinor;
+  hello.schema_crc = wire::kSchemaCrc;
+  hello.firmware_major = wire::kVersionMajor;
+  hello.firmware_minor = wire::kVersionMinor;
+  hello.firmware_patch = wire::kVersionPatch;
+  hello.source_revision = LINKPOSE_SOURCE_REVISION;
+  hello.reset_cause = board::reset_cause();
+  hello.streaming = sampler_.streaming();
+  hello.sample_rate_hz = settings.sample_rate_hz;
+  hello.sensors = (sampler_.imu().present() ? wire::sensors::kMpu6050 : 0) |
+                  (sampler_.baro().present() ? wire::sensors::kBmp180 : 0);
+  hello.imu_id = sampler_.imu().id();
+  hello.accel_range_g = settings.accel_range_g;
+  hello.gyro_range_deg_s = settings.gyro_range_deg_s;
+  hello.dlpf = settings.dlpf;
+  hello.baro_oversampling = settings.baro_oversampling;
+  static_assert(sizeof(wire::Hello) - sizeof hello.mice - offsetof(wire::Hello, ac1) == 2 * Bmp180::kCalibrationWords,
+                "AC1 to MD stand side by side");
+  memcpy(&hello.ac1, words, 2 * Bmp180::kCalibrationWords);
+  uart::put(wire::Hello::kType, &hello, wire::Hello::size(0));
+}
+
+void Link::send_status() {
+  const uint32_t now = clock::now_us();
+  const uint32_t elapsed_us = now - status_us_;
+  if (elapsed_us < kStatusUs) return;
+  status_us_ = now;
+  const uint32_t slept_us = idle::take_slept() / 2;
+  const uint16_t longest_pass_us = longest_pass_us_;
+  longest_pass_us_ = 0;
+  if (!sampler_.streaming()) return;
+
+  wire::Status status;
+  status.t_us = now;
+  status.ticks = clock::tick().number;
+  status.ticks_missed = sampler_.ticks_missed();
+  status.frames_dropped = uart::frames_dropped();
+  status.commands_corrupt = corrupt_;
+  status.rx_overruns = uart::overruns();
+  status.i2c_errors = twi::errors();
+  status.i2c_recoveries = twi::recoveries();
+  status.imu_restarts = sampler_.imu().restarts();
+  status.baro_restarts = sampler_.baro().restarts();
+  status.loop_worst_us = longest_pass_us;
+  status.stack_free = board::free_stack();
+  status.cpu_load = slept_us < elapsed_us ? static_cast<uint16_t>((elapsed_us - slept_us) / (elapsed_us / 1000)) : 0;
+  uart::put(wire::Status::kType, &status, wire::Status::size(0));
+}
+
+void Link::send_pong(uint32_t token) {
+  const wire::Pong pong = {token, received_us_};
+  uart::put(wire::Pong::kType, &pong, wire::Pong::kSize);
+}
+
+void Link::acknowledge(uint8_t command) {
+  const wire::Ack ack = {command};
+  uart::put(wire::Ack::kType, &ack, wire::Ack::kSize);
+}
+
+void Link::refuse(uint8_t command, wire::NakReason reason) {
+  const wire::Nak nak = {command, static_cast<uint8_t>(reason)};
+  uart::put(wire::Nak::kType, &nak, wire::Nak::kSize);
+}

@@ -1,0 +1,43 @@
+// The board's side of the wire protocol: commands in, HELLO, STATUS and answers out.
+#pragma once
+#include <Commands.h>
+#include <FrameDecoder.h>
+
+#include "Sampler.h"
+
+class Link : public commands::Board {
+ public:
+  explicit Link(Sampler& sampler) : sampler_(sampler) {}
+
+  // The time from wake-up to the present, for the longest pass in STATUS.
+  void note_pass(uint32_t us);
+  void run();
+
+  bool streaming() const override { return sampler_.streaming(); }
+  uint16_t sample_rate_hz() const override { return sampler_.settings().sample_rate_hz; }
+  bool imu_present() const override { return sampler_.imu().present(); }
+  uint8_t mouse_ports() const override { return 0; }
+  uint8_t mice_in_sample() const override { return 0; }
+  void send_hello() override;
+  void send_pong(uint32_t token) override;
+  void acknowledge(uint8_t command) override;
+  void refuse(uint8_t command, wire::NakReason reason) override;
+  void configure(const wire::Configure& settings) override { sampler_.configure(settings); }
+  void start() override { sampler_.start(); }
+  void stop() override { sampler_.stop(); }
+  void reset_mice(uint8_t) override {}
+  void self_test() override { sampler_.self_test(); }
+
+ private:
+  void receive();
+  void greet();
+  void send_status();
+
+  Sampler& sampler_;
+  FrameDecoder decoder_;
+  uint32_t received_us_ = 0;
+  uint32_t status_us_ = 0;
+  uint16_t longest_pass_us_ = 0;
+  uint16_t corrupt_ = 0;
+  bool greeted_ = false;
+};

@@ -1,0 +1,131 @@
+#include "Sampler.h"
+
+#include <Twi.h>
+#include <Uart.h>
+#include <string.h>
+
+namespace {
+
+constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8};
+
+Mpu6050::Settings imu_settings(const wire::Configure& settings) {
+  return {settings.accel_range_g, settings.gyro_range_deg_s, settings.dlpf};
+}
+
+// The SAMPLE does not wait longer for the requests of a tick than this: at 500 Hz a tick is 2 ms.
+constexpr uint32_t kSampleDeadlineUs = 1500;
+
+}  // namespace
+
+Sampler::Sampler()
+    : settings_(kDefaults), imu_(imu_settings(kDefaults)), baro_(kDefaults.baro_oversampling) {}
+
+void Sampler::configure(const wire::Configure& settings) {
+  settings_ = settings;
+  imu_.configure(imu_settings(settings));
+  baro_.configure(settings.baro_oversampling);
+  clock::set_rate(settings.sample_rate_hz);
+}
+
+void Sampler::start() {
+  streaming_ = true;
+  first_tick_ = clock::tick().number + 1;
+}
+
+void Sampler::run() {
+  const clock::Tick now = clock::tick();
+  if (now.number != tick_.number) begin_tick(now);
+  if (phase_ == Phase::kBurst && twi::burst_state() != twi::State::kBusy) take_burst();
+  if (phase_ == Phase::kRequests && !requests_pending()) phase_ = Phase::kQuiet;
+  if (sample_due_ && (phase_ == Phase::kQuiet || clock::now_us() - tick_.t_us > kSampleDeadlineUs)) {
+    sample_due_ = false;
+    send_sample();
+  }
+  send_self_test_result();
+}
+
+void Sampler::begin_tick(const clock::Tick& tick) {
+  if (streaming_) {
+    // Ticks in between, and the one before when its SAMPLE was not made.
+    const uint32_t since = tick.number - tick_.number - 1 + sample_due_;
+    const uint32_t streamed = tick.number - first_tick_;
+    ticks_missed_ += since < streamed ? since : streamed;
+  }
+  tick_ = tick;
+  phase_ = Phase::kBurst;
+  sample_due_ = streaming_ && static_cast<int32_t>(tick.number - first_tick_) >= 0;
+}
+
+void Sampler::take_burst() {
+  const twi::State state = twi::burst_state();
+  reading_.valid = false;
+  if (state != twi::State::kIdle) {
+    imu_.accept_burst(state == twi::State::kDone, twi::burst_data(), clock::now_us(), reading_);
+  }
+  if (twi::down()) twi::free_bus();
+  phase_ = Phase::kRequests;
+}
+
+// Gives the bus to the drivers in turn. False when neither wants it any more.
+bool Sampler::requests_pending() {
+  for (;;) {
+    if (request_running_) {
+      const twi::State state = twi::take_request_state();
+      if (state == twi::State::kBusy) return true;
+      finish_request(state == twi::State::kDone);
+      if (twi::down()) twi::free_bus();
+    }
+    I2cRequest request;
+    const uint32_t now = clock::now_us();
+    request_is_imu_ = imu_.next(now, request);
+    if (!request_is_imu_ && !baro_.next(now, request)) return false;
+    if (!twi::begin_request(request)) return false;  // at the next tick, then
+    request_running_ = true;
+  }
+}
+
+void Sampler::finish_request(bool ok) {
+  request_running_ = false;
+  const uint32_t now = clock::now_us();
+  if (request_is_imu_) {
+    imu_.finish(ok, twi::request_data(), now);
+    twi::set_burst(Mpu6050::kAddress, Mpu6050::kBurstRegister, imu_.wants_burst() ? Mpu6050::kBurstLength : 0);
+  } else {
+    baro_.finish(ok, twi::request_data(), now);
+  }
+}
+
+void Sampler::send_sample() {
+  namespace flag = wire::sample_flags;
+  wire::Sample sample;
+  sample.seq = static_cast<uint16_t>(tick_.number - first_tick_);
+  sample.t_us = tick_.t_us;
+  sample.accel_x = reading_.accel[0];
+  sample.accel_y = reading_.accel[1];
+  sample.accel_z = reading_.accel[2];
+  sample.imu_temp = reading_.temperature;
+  sample.gyro_x = reading_.gyro[0];
+  sample.gyro_y = reading_.gyro[1];
+  sample.gyro_z = reading_.gyro[2];
+  sample.baro_ut = baro_.temperature();
+  sample.baro_up = baro_.pressure();
+  sample.baro_count = baro_.count();
+  sample.flags = 0;
+  if (reading_.valid) sample.flags |= flag::kImuValid;
+  if (reading_.valid && reading_.accel_saturated) sample.flags |= flag::kAccelSaturated;
+  if (reading_.valid && reading_.gyro_saturated) sample.flags |= flag::kGyroSaturated;
+  if (baro_.valid()) sample.flags |= flag::kBaroValid;
+  uart::put(wire::Sample::kType, &sample, wire::Sample::size(0));
+}
+
+void Sampler::send_self_test_result() {
+  Mpu6050::SelfTest test;
+  if (!imu_.take_self_test(test)) return;
+  wire::SelfTestResult result;
+  static_assert(sizeof result == sizeof test.trim + sizeof test.plain + sizeof test.excited + 1, "same order");
+  memcpy(&result.trim_x, test.trim, sizeof test.trim);
+  memcpy(&result.plain_accel_x, test.plain, sizeof test.plain);
+  memcpy(&result.excited_accel_x, test.excited, sizeof test.excited);
+  result.baro_id = baro_.present() ? Bmp180::kId : 0;
+  uart::put(wire::SelfTestResult::kType, &result, wire::SelfTestResult::kSize);
+}

@@ -1,0 +1,50 @@
+// What happens between two ticks: the IMU's burst is awaited, then the drivers get their turn on the bus, then the
+// SAMPLE is made. The bus is quiet from there to the next tick, for the BMP180's conversion.
+#pragma once
+#include <Bmp180.h>
+#include <Clock.h>
+#include <Messages.h>
+#include <Mpu6050.h>
+
+class Sampler {
+ public:
+  Sampler();
+
+  void run();
+
+  void configure(const wire::Configure& settings);
+  void start();
+  void stop() { streaming_ = false; }
+  void self_test() { imu_.start_self_test(); }
+
+  const wire::Configure& settings() const { return settings_; }
+  bool streaming() const { return streaming_; }
+  bool sensors_settled() const { return imu_.settled() && baro_.settled(); }
+  bool healthy() const { return imu_.present() && baro_.present(); }
+  uint32_t ticks_missed() const { return ticks_missed_; }
+  const Mpu6050& imu() const { return imu_; }
+  const Bmp180& baro() const { return baro_; }
+
+ private:
+  enum class Phase : uint8_t { kBurst, kRequests, kQuiet };
+
+  void begin_tick(const clock::Tick& tick);
+  void take_burst();
+  bool requests_pending();
+  void finish_request(bool ok);
+  void send_sample();
+  void send_self_test_result();
+
+  wire::Configure settings_;
+  Mpu6050 imu_;
+  Bmp180 baro_;
+  Mpu6050::Reading reading_ = {};
+  clock::Tick tick_ = {0, 0};
+  uint32_t first_tick_ = 0;  // the one with seq 0
+  uint32_t ticks_missed_ = 0;
+  Phase phase_ = Phase::kQuiet;
+  bool sample_due_ = false;
+  bool streaming_ = false;
+  bool request_running_ = false;
+  bool request_is_imu_ = false;
+};
