@@ -29,6 +29,7 @@ void loop() {
   sampler.run();
   host.run();
   led.run();
+  board::scan_stack();
   host.note_pass(clock::now_us() - woken_us);
   idle::wait_for_work();
 }

@@ -10,6 +10,9 @@ extern uint8_t __stack;
 namespace {
 
 constexpr uint8_t kPaint = 0xC5;
+constexpr uint8_t kStackBytesPerScan = 32;
+
+uint16_t free_stack_bytes = 0;
 
 // Kept out of .bss, which is cleared after these were written.
 uint8_t cause_of_hardware __attribute__((section(".noinit")));
@@ -42,10 +45,17 @@ uint8_t reset_cause() {
 void start_watchdog() { wdt_enable(WDTO_500MS); }
 void feed_watchdog() { wdt_reset(); }
 
-uint16_t free_stack() {
-  const uint8_t* at = &_end;
-  while (at <= &__stack && *at == kPaint) at++;
-  return static_cast<uint16_t>(at - &_end);
+uint16_t free_stack() { return free_stack_bytes; }
+
+// A full scan takes half a millisecond, so each pass of the main loop does a part of it.
+void scan_stack() {
+  static const uint8_t* at = &_end;
+  for (uint8_t left = kStackBytesPerScan; left > 0; left--, at++) {
+    if (at <= &__stack && *at == kPaint) continue;
+    free_stack_bytes = static_cast<uint16_t>(at - &_end);
+    at = &_end;
+    return;
+  }
 }
 
 void begin_led() { DDRB |= _BV(DDB5); }

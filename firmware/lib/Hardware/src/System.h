@@ -11,8 +11,9 @@ uint8_t reset_cause();
 void start_watchdog();
 void feed_watchdog();
 
-// Bytes of the stack never touched since boot.
+// Bytes of the stack never touched since boot, as of the last scan that scan_stack() completed.
 uint16_t free_stack();
+void scan_stack();
 
 void begin_led();
 void set_led(bool on);
