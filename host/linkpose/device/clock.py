@@ -12,7 +12,8 @@ WRAP_US = 1 << 32  # the board's clock wraps after 71.6 minutes
 DRIFT_PRIOR = 2.5e-3  # standard deviation: a ceramic resonator holds half a per cent
 DRIFT_WALK = 1e-7  # per square root of a second: it warms up
 DRIFT_LIMIT = 0.01  # no UNO is as far off; a simulated board that runs faster than time is
-ROUND_TRIP_FLOOR_S = 2e-4  # even the shortest round trip is not split evenly
+ROUND_TRIP_FLOOR_S = 2e-4  # standard deviation of the middle of even the shortest round trip,
+UNEVEN = 0.1  # and as a share of it: the way there and the way back differ
 GATE = 4.0  # standard deviations
 SLEW_TIME_S = 5.0  # over which the output takes up what the fit has learnt
 SLEW_LIMIT = 1e-3
@@ -56,7 +57,7 @@ class DeviceClock:
         """Learns from a PING sent and its PONG received at these host times."""
         round_trip = received_s - sent_s
         self._shortest_s = min(self._shortest_s, round_trip)
-        noise = (ROUND_TRIP_FLOOR_S + (round_trip - self._shortest_s) / 2) ** 2
+        noise = (ROUND_TRIP_FLOOR_S + UNEVEN * round_trip + (round_trip - self._shortest_s) / 2) ** 2
         middle = (sent_s + received_s) / 2
         if self._fit_us is None:
             self._fit_us = self._epoch_us = t_us

@@ -14,6 +14,7 @@ import serial
 
 from linkpose.device.ports import open_port
 from linkpose.errors import LinkposeError
+from linkpose.sensors.rig import Rig
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
 from linkpose.wire.messages import Message
 
@@ -45,6 +46,7 @@ class Link:
         self._port = open_port(port)
         self._capture = capture
         self.now: Callable[[], float] = getattr(self._port, "clock", time.monotonic)
+        self.rig: Rig | None = getattr(self._port, "rig", None)
         self._arrived: queue.SimpleQueue[tuple[float, bytes] | Exception] = queue.SimpleQueue()
         self._closing = False
         with contextlib.suppress(serial.SerialException, OSError):

@@ -6,7 +6,7 @@ import errno
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import serial
 from serial.tools import list_ports
@@ -86,7 +86,7 @@ def open_port(name: str) -> serial.Serial:
         port = serial.serial_for_url(name, **options)
     except (serial.SerialException, OSError, ValueError) as error:
         raise LinkposeError(_why_not(name, error)) from error
-    return cast(serial.Serial, port)  # every handler has the same methods, whatever its base class
+    return port
 
 
 def _why_not(name: str, error: Exception) -> str:

@@ -10,9 +10,10 @@ from typing import BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
 from linkpose.device.link import Arrival, Disconnected, Link
-from linkpose.device.timeline import Placed, Timeline
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import Settings
+from linkpose.sensors.rig import Rig
+from linkpose.sensors.timeline import Gap, Placed, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
@@ -63,7 +64,7 @@ class Health:
     samples: int
     lost: int
     corrupt: Corrupt
-    gaps: int
+    gaps: list[Gap]
     duration_s: float
     rate_hz: float
     drift_ppm: float | None
@@ -87,12 +88,19 @@ class Session:
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
+        self._started: Arrival | None = None  # what came together with the ACK of START
+        self._heard_at = self._asked_at = self._pinged_at = 0.0  # s, monotonic: last sample, GET_INFO and PING
         self._corrupt_before = Corrupt()
         try:
             self.hello = self._handshake()
         except BaseException:
             self._link.close()
             raise
+
+    @property
+    def rig(self) -> Rig | None:
+        """The rig that a simulated board brings along; None of a real one."""
+        return self._link.rig
 
     def __enter__(self) -> Session:
         return self
@@ -158,34 +166,31 @@ class Session:
         self._command(SelfTest(), Command.SELF_TEST)
         return self._await(SelfTestResult, "SELF_TEST", 3.0)
 
-    def _command(self, message: Message, command: Command) -> None:
-        try:
-            self._link.send(message)
-        except Disconnected as error:
-            raise LinkposeError(f"{self.port} went away ({error}); check the cable") from error
-        deadline = time.monotonic() + ANSWER_TIMEOUT_S
-        while (left := deadline - time.monotonic()) > 0:
-            for answer in self._messages(left):
+    def _command(self, message: Message, command: Command) -> Arrival:
+        """Sends a command; the arrival that holds its ACK, from the ACK on. Raises LinkposeError on a NAK."""
+        self._link.send(message)
+        for arrival in self._arrivals(ANSWER_TIMEOUT_S):
+            for at, answer in enumerate(arrival.messages):
                 if isinstance(answer, Nak) and answer.command == command:
                     raise LinkposeError(f"the board refused {command.name}: {_reason(answer.reason)}")
                 if isinstance(answer, Ack) and answer.command == command:
-                    return
+                    return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
         raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
 
     def _await(self, kind: type[Answer], asked: str, timeout_s: float = ANSWER_TIMEOUT_S) -> Answer:
-        deadline = time.monotonic() + timeout_s
-        while (left := deadline - time.monotonic()) > 0:
-            for answer in self._messages(left):
+        for arrival in self._arrivals(timeout_s):
+            for answer in arrival.messages:
                 if isinstance(answer, kind):
                     return answer
         raise LinkposeError(f"the board did not answer {asked}; unplug it, plug it in and try again")
 
-    def _messages(self, timeout_s: float) -> list[Message | OtherProtocol]:
-        try:
-            arrival = self._link.receive(timeout_s)
-        except Disconnected as error:
-            raise LinkposeError(f"{self.port} went away ({error}); check the cable") from error
-        return arrival.messages if arrival else []
+    def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
+        """What arrives within a time."""
+        deadline = time.monotonic() + timeout_s
+        while (left := deadline - time.monotonic()) > 0:
+            arrival = self._link.receive(left)
+            if arrival is not None:
+                yield arrival
 
     # ---- the clock ----
 
@@ -202,12 +207,12 @@ class Session:
         """A few round trips before the first sample."""
         for _ in range(FIRST_PINGS):
             self._ping()
-            deadline = time.monotonic() + ANSWER_TIMEOUT_S
-            while self._pings and time.monotonic() < deadline:
-                arrival = self._link.receive(ANSWER_TIMEOUT_S)
-                for message in arrival.messages if arrival else []:
-                    if isinstance(message, Pong) and arrival:
+            for arrival in self._arrivals(ANSWER_TIMEOUT_S):
+                for message in arrival.messages:
+                    if isinstance(message, Pong):
                         self._hear_pong(message, arrival.time_s)
+                if not self._pings:
+                    break
         if not self._clock.ready:
             raise LinkposeError(f"{self.port}: the board does not answer PING; unplug it, plug it in and try again")
 
@@ -242,11 +247,11 @@ class Session:
         """Ties the clocks anew and starts the stream."""
         self._clock = DeviceClock()
         self._tie_clocks()
-        self._command(Start(), Command.START)
+        self._started = self._command(Start(), Command.START)
         self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival = self._link.receive(0.1)
+        arrival, self._started = self._started or self._link.receive(0.1), None
         now = time.monotonic()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
@@ -323,22 +328,13 @@ class Session:
             samples=timeline.samples,
             lost=timeline.lost,
             corrupt=Corrupt(**{cause: now[cause] + before[cause] for cause in now}),
-            gaps=len(timeline.gaps),
+            gaps=timeline.gaps,
             duration_s=duration,
             rate_hz=timeline.samples / duration if duration else 0.0,
             drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
             status=self._status,
         )
-
-    @property
-    def gaps(self) -> list[dict[str, float | int | str]]:
-        """The gaps so far, for a recording's closing line."""
-        timeline = self._timeline
-        return [
-            {"after_s": round(g.after_s, 6), "duration_s": round(g.duration_s, 6), "lost": g.lost, "cause": g.cause}
-            for g in (timeline.gaps if timeline else [])
-        ]
 
 
 def firmware_version(hello: Hello) -> str:

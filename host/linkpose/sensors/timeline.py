@@ -12,10 +12,25 @@ _SEQ_WRAP = 1 << 16
 
 
 class Clock(Protocol):
-    """What a timeline needs of a clock: see `DeviceClock`."""
+    """What a timeline needs of a clock."""
 
     def unwrap(self, t_us: int, host_s: float) -> int: ...
     def host_time(self, t_us: int) -> float: ...
+
+
+class BoardClock:
+    """The board's own seconds, for samples whose arrival nobody stamped (a raw capture, a simulation)."""
+
+    def __init__(self) -> None:
+        self._last_us = 0
+
+    def unwrap(self, t_us: int, host_s: float) -> int:
+        """The first time with these low 32 bits that is not before the last."""
+        self._last_us += (t_us - self._last_us) % (1 << 32)
+        return self._last_us
+
+    def host_time(self, t_us: int) -> float:
+        return t_us * 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +41,15 @@ class Gap:
     duration_s: float
     lost: int
     cause: str  # "link": frames lost or dropped; "reset": the board started anew; "cable": the port was gone
+
+    def as_dict(self) -> dict[str, float | int | str]:
+        """For a recording's closing line."""
+        return {
+            "after_s": round(self.after_s, 6),
+            "duration_s": round(self.duration_s, 6),
+            "lost": self.lost,
+            "cause": self.cause,
+        }
 
 
 class Placed(NamedTuple):

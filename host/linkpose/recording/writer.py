@@ -1,0 +1,90 @@
+"""Writes recordings: the one way from samples to a recording's CSV, for a live board and a simulated one."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from linkpose import __version__
+from linkpose.recording import columns
+from linkpose.recording.csvfile import CsvFile
+from linkpose.sensors.conversion import Converter, Row, Settings
+from linkpose.sensors.rig import Rig
+from linkpose.sensors.timeline import BoardClock, Timeline
+from linkpose.wire.frames import Corrupt
+from linkpose.wire.messages import Hello, Sample, Sensors
+
+
+def metadata(hello: Hello, settings: Settings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
+    """The second line of a recording, from which everything in it can be understood."""
+    return {
+        "software": f"linkpose {__version__}",
+        "start_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="milliseconds"),
+        "device": device,
+        "firmware": {
+            "version": f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}",
+            "source_revision": f"{hello.source_revision:08x}",
+            "protocol": f"{hello.protocol_major}.{hello.protocol_minor}",
+        },
+        "settings": {
+            "sample_rate_hz": settings.sample_rate_hz,
+            "accel_range_g": settings.accel_range_g,
+            "gyro_range_deg_s": settings.gyro_range_deg_s,
+            "dlpf": settings.dlpf,
+            "baro_oversampling": settings.baro_oversampling,
+        },
+        "sensors": [sensor.name.lower() for sensor in Sensors if hello.sensors & sensor and sensor.name],
+        "imu_id": hello.imu_id,
+        "bmp180": settings.bmp180._asdict(),
+        "mice": [mouse._asdict() for mouse in hello.mice],
+        "clock": clock,
+        "rig": rig.as_dict(),
+    }
+
+
+def closing(timeline: Timeline, corrupt: Corrupt, drift_ppm: float | None, **more: Any) -> dict[str, Any]:
+    """The last line of a recording: how it went."""
+    duration = timeline.duration_s
+    return {
+        "samples": timeline.samples,
+        "lost": timeline.lost,
+        "corrupt": corrupt.as_dict(),
+        "gaps": [gap.as_dict() for gap in timeline.gaps[:MOST_GAPS]],
+        "gap_count": len(timeline.gaps),
+        "duration_s": round(duration, 6),
+        "rate_hz": round(timeline.samples / duration, 3) if duration else 0.0,
+        "drift_ppm": None if drift_ppm is None else round(drift_ppm, 1),
+        **more,
+    }
+
+
+MOST_GAPS = 1000  # listed in the closing line; the rows mark every one
+
+
+class RecordingWriter(CsvFile):
+    """A recording under way. Raises LinkposeError as `CsvFile` does."""
+
+    def __init__(self, path: Path, head: dict[str, Any], mouse_ports: int, force: bool) -> None:
+        super().__init__(path, "recording", head, columns.names(mouse_ports), force)
+
+    def write_rows(self, rows: Iterable[Row]) -> None:
+        """Adds samples."""
+        self.write([columns.text(row) for row in rows])
+
+
+def write_recording(
+    path: Path, hello: Hello, samples: Iterable[Sample], device: str, rig: Rig, force: bool
+) -> Timeline:
+    """Writes samples that are all there already, in the board's own time; their timeline."""
+    settings = Settings.of(hello)
+    converter, timeline, clock = Converter(settings), Timeline(settings.sample_rate_hz), BoardClock()
+    head = metadata(hello, settings, device, rig, {"source": "board", "drift_ppm": None})
+    with RecordingWriter(path, head, settings.mouse_ports, force) as writer:
+        for sample in samples:
+            place = timeline.place(sample, clock, 0.0)
+            if place is not None:
+                writer.write_rows([converter.row(sample, *place)])
+        writer.close(closing(timeline, Corrupt(), None))
+    return timeline
