@@ -1,4 +1,4 @@
-"""A CSV file that survives: metadata ahead, rows on disk within a second, whole rows only, a closing line.
+"""A CSV file that survives: metadata ahead, rows handed over as they come, whole rows only, a closing line.
 
     # linkpose <kind> 1
     # {"...": "metadata, JSON"}
@@ -13,14 +13,11 @@ import contextlib
 import errno
 import json
 import os
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from linkpose.errors import LinkposeError
-
-FLUSH_INTERVAL_S = 0.5
 
 
 def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
@@ -29,35 +26,23 @@ def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
 
 
 class CsvFile:
-    """Writes such a file row by row. Also a context manager: leaving it without `close` leaves out the closing line.
+    """Writes such a file. Also a context manager: leaving it without `close` leaves out the closing line.
 
     Raises LinkposeError where the file cannot be made or written; what was written before stays whole and readable.
     """
 
     def __init__(self, path: Path, kind: str, metadata: Mapping[str, Any], columns: Sequence[str], force: bool) -> None:
         self.path = path
-        self._pending: list[str] = []
-        self._flushed_at = time.monotonic()
         self._fd = create(path, force)
-        self._put(head(kind, metadata, columns))
+        self.write(head(kind, metadata, columns))
 
-    def write(self, lines: Iterable[str]) -> None:
-        """Adds rows, each a line without its end. They are on disk within a second as long as this is called."""
-        self._pending += lines
-        if time.monotonic() - self._flushed_at >= FLUSH_INTERVAL_S:
-            self.flush()
-
-    def flush(self) -> None:
-        """Hands all rows to the operating system: from here on, killing this process does not lose them."""
-        self._flushed_at = time.monotonic()
-        if self._pending:
-            lines, self._pending = self._pending, []
-            self._put("\n".join(lines) + "\n")
+    def write(self, text: str) -> None:
+        """Adds whole lines. They are with the operating system at once: killing this process does not lose them."""
+        write_all(self._fd, self.path, text.encode())
 
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""
-        self.flush()
-        self._put(f"# {json.dumps(closing)}\n")
+        self.write(f"# {json.dumps(closing)}\n")
         with contextlib.suppress(OSError):  # a pipe cannot be synced
             os.fsync(self._fd)
         self._release()
@@ -65,14 +50,9 @@ class CsvFile:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._fd >= 0:
-            with contextlib.suppress(LinkposeError):  # another failure is on its way to the user
-                self.flush()
             self._release()
-
-    def _put(self, text: str) -> None:
-        write_all(self._fd, self.path, text.encode())
 
     def _release(self) -> None:
         os.close(self._fd)

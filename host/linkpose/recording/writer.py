@@ -71,7 +71,7 @@ class RecordingWriter(CsvFile):
 
     def write_rows(self, rows: Iterable[Row]) -> None:
         """Adds samples."""
-        self.write([columns.text(row) for row in rows])
+        self.write("".join(columns.text(row) + "\n" for row in rows))
 
 
 def write_recording(
@@ -82,9 +82,7 @@ def write_recording(
     converter, timeline, clock = Converter(settings), Timeline(settings.sample_rate_hz), BoardClock()
     head = metadata(hello, settings, device, rig, {"source": "board", "drift_ppm": None})
     with RecordingWriter(path, head, settings.mouse_ports, force) as writer:
-        for sample in samples:
-            place = timeline.place(sample, clock, 0.0)
-            if place is not None:
-                writer.write_rows([converter.row(sample, *place)])
+        places = ((sample, timeline.place(sample, clock, 0.0)) for sample in samples)
+        writer.write_rows(converter.row(sample, *place) for sample, place in places if place is not None)
         writer.close(closing(timeline, Corrupt(), None))
     return timeline

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, TypeVar
 
 from linkpose.wire.messages import SCALES
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Number = TypeVar("Number", float, NDArray[np.float64])
 
 STANDARD_GRAVITY = 9.80665  # m/s² per g, by definition
 
@@ -24,7 +31,7 @@ def gyro_scale(gyro_range_deg_s: int) -> float:
     return math.radians(SCALES["SAMPLE.gyro_x"].scale * gyro_range_deg_s)
 
 
-def temperature(count: int) -> float:
-    """Die temperature in degC (register map, 4.18)."""
+def temperature(count: Number) -> Number:
+    """Die temperature in degC of a count, or of an array of them (register map, 4.18)."""
     scale = SCALES["SAMPLE.imu_temp"]
     return count * scale.scale + scale.offset

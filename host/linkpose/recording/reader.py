@@ -1,0 +1,224 @@
+"""Reads recordings, a CSV or a raw capture, into the measurements that filters take."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.errors import LinkposeError
+from linkpose.recording import columns
+from linkpose.recording.table import Table, read_bytes, read_table
+from linkpose.sensors import bmp180, mpu6050
+from linkpose.sensors.conversion import GAP_BEFORE, MOUSE_VALID, TIME_DECIMALS, Settings
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Rig
+from linkpose.sensors.timeline import Gap
+from linkpose.wire.messages import Hello, SampleFlags
+
+_T_WRAP = 1 << 32
+_SEQ_WRAP = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A recording in memory."""
+
+    path: Path
+    measurements: Measurements
+    rig: Rig | None  # the one in force while it was recorded; None of a raw capture
+    sample_rate_hz: float
+    metadata: dict[str, Any]
+    remarks: list[str]  # what the reader should know: a cut file, corrupt frames
+
+
+def load_recording(path: Path) -> Recording:
+    """Reads a recording. Raises LinkposeError naming the file, the line and the cure for anything that is none."""
+    if path.suffix == ".bin":
+        return _from_capture(path)
+    return _from_csv(path)
+
+
+# ---- CSV ----
+
+
+def _from_csv(path: Path) -> Recording:
+    table = read_table(path, "recording")
+    mouse_ports = _check_columns(table)
+    has_imu = all(name in table.columns for name in columns.ACCEL + columns.GYRO)
+    if not (has_imu or mouse_ports):
+        missing = [name for name in columns.ACCEL + columns.GYRO if name not in table.columns]
+        raise LinkposeError(f"{path} has no column {', '.join(missing)}, and no mice: nothing to estimate from")
+    measurements = Measurements(
+        table.columns["time_s"],
+        _vectors(table, columns.ACCEL),
+        _vectors(table, columns.GYRO),
+        _column(table, "imu_temp_degC"),
+        _column(table, "pressure_Pa"),
+        _column(table, "baro_temp_degC"),
+        _fresh(table),
+        _mice(table, mouse_ports),
+        _flags(table),
+    )
+    remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
+    rig = Rig.from_dict(table.metadata["rig"], f"{path}, line 2") if "rig" in table.metadata else None
+    return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
+
+
+def _check_columns(table: Table) -> int:
+    """Number of mouse ports; raises LinkposeError for a column that no recording has, or without time_s."""
+    table.require("time_s")
+    known = columns.names(columns.MAX_MICE)
+    for name in table.columns:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1, 0.4)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            raise LinkposeError(f"{table.path}: unknown column {name}; {hint}")
+    ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
+    for port in ports:
+        table.require(*columns.mouse_columns(port))
+    return max(ports, default=0)
+
+
+def _column(table: Table, name: str) -> Floats:
+    return table.columns.get(name, np.full(len(table), np.nan))
+
+
+def _vectors(table: Table, names: tuple[str, ...]) -> Floats:
+    return np.column_stack([_column(table, name) for name in names])
+
+
+def _fresh(table: Table) -> NDArray[np.bool_]:
+    """As the file says, or where the pressure changes in a file that does not say."""
+    if "baro_fresh" in table.columns:
+        return np.asarray(table.columns["baro_fresh"] == 1)
+    pressure = _column(table, "pressure_Pa")
+    return np.asarray(np.isfinite(pressure) & (np.diff(pressure, prepend=np.nan) != 0))
+
+
+def _mice(table: Table, ports: int) -> Floats:
+    pairs = [_vectors(table, columns.mouse_columns(port)) for port in range(1, ports + 1)]
+    return np.stack(pairs, axis=1) if pairs else np.empty((len(table), 0, 2))
+
+
+def _flags(table: Table) -> NDArray[np.uint16]:
+    """As the file says; where it does not, what is there is valid."""
+    if "flags" not in table.columns:
+        imu = np.isfinite(_vectors(table, columns.ACCEL + columns.GYRO)).all(axis=1)
+        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint16)
+    flags = table.columns["flags"]
+    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFF)))
+    if len(wrong):
+        raise LinkposeError(
+            f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 65535"
+        )
+    return flags.astype(np.uint16)
+
+
+def _rate(table: Table) -> float:
+    """The sample rate that the metadata tells, or else the usual interval's."""
+    rate = table.metadata.get("settings", {}).get("sample_rate_hz")
+    if isinstance(rate, int | float) and rate > 0:
+        return float(rate)
+    intervals = np.diff(table.columns["time_s"])
+    usual = float(np.median(intervals[intervals > 0])) if np.any(intervals > 0) else 0.01
+    return 1.0 / usual
+
+
+# ---- raw capture ----
+
+
+def _from_capture(path: Path) -> Recording:
+    from linkpose.wire.capture import decode_capture
+
+    capture = decode_capture(read_bytes(path))
+    hellos = [(before, message) for before, message in capture.others if isinstance(message, Hello)]
+    if not hellos:
+        raise LinkposeError(f"{path} holds no HELLO of a board; it is no raw capture of `linkpose record --raw`")
+    if not len(capture.samples):
+        raise LinkposeError(f"{path} holds no sample; the board was never started")
+    first = [hello for before, hello in hellos if before == 0]
+    settings = Settings.of(first[-1] if first else hellos[0][1])
+    raw = capture.samples
+    restarts = sorted({before for before, hello in hellos if 0 < before < len(raw) and not hello.streaming})
+    time_s, gap_before, gaps = _times(raw, restarts, settings.sample_rate_hz)
+    flags = (raw["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
+    measurements = _measurements(raw, time_s, flags, settings, int(capture.mouse_count.max(initial=0)))
+    remarks = [f"{path}: times are the board's own, for a raw capture holds no other clock"]
+    if capture.corrupt.total:
+        remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
+    if gaps:
+        remarks.append(f"{path}: {sum(gap.lost for gap in gaps)} samples lost in {len(gaps)} gaps")
+    return Recording(path, measurements, None, settings.sample_rate_hz, {"device": str(path)}, remarks)
+
+
+def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[Floats, NDArray[np.int64], list[Gap]]:
+    """Board time from 0 over its wraps, the flag of samples after a gap, and the gaps.
+
+    After a restart nobody knows how long the board was away: the next sample follows one interval later, marked.
+    """
+    t_us, seq = raw["t_us"].astype(np.int64), raw["seq"].astype(np.int64)
+    step_us = np.diff(t_us, prepend=t_us[:1]) % _T_WRAP
+    ticks = np.diff(seq, prepend=-1) % _SEQ_WRAP
+    step_us[restarts], ticks[restarts] = round(1e6 / rate_hz), 1
+    step_us[0] = 0
+    time_s = np.round(np.cumsum(step_us) * 1e-6, TIME_DECIMALS)
+    marked = ticks > 1
+    gaps = [
+        Gap(float(time_s[max(i - 1, 0)]), float(step_us[i] * 1e-6), int(ticks[i] - 1), "link")
+        for i in np.flatnonzero(marked).tolist()
+    ]
+    marked[restarts] = True
+    return time_s, np.where(marked, GAP_BEFORE, 0), gaps
+
+
+def _measurements(
+    raw: NDArray[np.void], time_s: Floats, flags: NDArray[np.int64], settings: Settings, mouse_ports: int
+) -> Measurements:
+    """The same values, to the last bit, as `Converter` gives one by one."""
+    valid = (flags & int(SampleFlags.IMU_VALID) != 0)[:, None]
+    accel = np.column_stack([raw[name] for name in ("accel_x", "accel_y", "accel_z")]).astype(np.float64)
+    gyro = np.column_stack([raw[name] for name in ("gyro_x", "gyro_y", "gyro_z")]).astype(np.float64)
+    accel = np.round(accel * mpu6050.accel_scale(settings.accel_range_g), mpu6050.ACCEL_DECIMALS)
+    gyro = np.round(gyro * mpu6050.gyro_scale(settings.gyro_range_deg_s), mpu6050.GYRO_DECIMALS)
+    temp = np.round(mpu6050.temperature(raw["imu_temp"].astype(np.float64)), mpu6050.TEMPERATURE_DECIMALS)
+    pressure, baro_temp, fresh = _baro(raw, flags, settings)
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :mouse_ports].astype(np.float64)
+    mouse_valid = flags[:, None] & np.array(MOUSE_VALID)[:mouse_ports] != 0
+    return Measurements(
+        time_s,
+        np.where(valid, accel, np.nan),
+        np.where(valid, gyro, np.nan),
+        np.where(valid[:, 0], temp, np.nan),
+        pressure,
+        baro_temp,
+        fresh,
+        np.where(mouse_valid[:, :, None], mice, np.nan),
+        flags.astype(np.uint16),
+    )
+
+
+def _baro(
+    raw: NDArray[np.void], flags: NDArray[np.int64], settings: Settings
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Pressure and temperature, each reading repeated until the next; where a new one came."""
+    valid = flags & int(SampleFlags.BARO_VALID) != 0
+    if not bmp180.is_sound(settings.bmp180):
+        nothing = np.full(len(raw), np.nan)
+        return nothing, nothing, np.zeros(len(raw), np.bool_)
+    count = raw["baro_count"].astype(np.int64)
+    again = np.concatenate([[True], ~valid[:-1]])  # the first reading, or the first after the sensor was away
+    fresh = valid & (again | (np.diff(count, prepend=-1) != 0))
+    ut, up = raw["baro_ut"].astype(np.int64), raw["baro_up"].astype(np.int64)
+    with np.errstate(divide="ignore"):
+        temp, pressure = bmp180.compensate(ut, up, settings.bmp180, settings.baro_oversampling)
+    latest = np.maximum.accumulate(np.where(fresh, np.arange(len(raw)), 0))
+    return (
+        np.where(valid, pressure[latest].astype(np.float64), np.nan),
+        np.where(valid, temp[latest] / 10, np.nan),
+        fresh,
+    )
