@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from linkpose.simulation import imu
 from linkpose.simulation.baro import PRESSURE_NOISE_PA
 from linkpose.simulation.link import LinkRun
-from numpy.typing import NDArray
 from virtual_uno import VirtualUno
 
 RATE_HZ = 1000  # rows of the tables, the MPU-6050's own sample rate

@@ -16,9 +16,10 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 sys.path.insert(0, str(HERE.parents[1] / "host"))
 
-from linkpose.simulation.link import simulate  # noqa: E402
 from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
+
+from linkpose.simulation.link import simulate  # noqa: E402
 from virtual_uno import VirtualUno, VirtualUnoError  # noqa: E402
 
 DEFAULT_HEX = HERE.parents[1] / ".pio" / "build" / "uno_distro" / "firmware.hex"
@@ -61,12 +62,12 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--test", type=int, default=1, help="Test of the simulated rig: 1, 2 or 3")
     parser.add_argument("--seed", type=int, default=0, help="of the rig and of everything random on the board")
     parser.add_argument("--errors", default="calibrated", help="of the sensors: calibrated, datasheet or none")
-    parser.add_argument("--duration", type=float, default=None, help="seconds of the board's time; without end if left out")
+    parser.add_argument("--duration", type=float, default=None, help="seconds of the board's time; else endless")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
     pace.add_argument("--flat-out", dest="paced", action="store_false", help="as fast as the host reads")
     parser.add_argument("--no-reset-on-open", dest="reset_on_open", action="store_false", help="as without DTR")
-    parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="noise that traffic adds to the BMP180")
+    parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="what traffic adds to the BMP180")
     parser.add_argument("--fault", action="append", default=[], metavar="SECONDS:FAULT", help="see below")
     return parser.parse_args()
 

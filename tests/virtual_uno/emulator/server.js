@@ -36,6 +36,15 @@ const OPERATIONS = {
     board[sensor].plug(present);
     return {};
   },
+  /** A transaction that some other master makes in no time; null when the slave does not answer. */
+  transact({ address, write, read }) {
+    const { bus } = board;
+    const written = write.length === 0 || (bus.address(address << 1) && write.every((byte) => bus.write(byte)));
+    const answered = written && (read === 0 || bus.address((address << 1) | 1));
+    const bytes = answered ? Array.from({ length: read }, () => bus.read()) : null;
+    bus.stop();
+    return { bytes };
+  },
   hold_sda({ clocks }) {
     board.bus.hold(clocks ?? Infinity);
     return {};
