@@ -1,0 +1,182 @@
+"""One extended and one unscented Kalman filter over a motion model and measurement models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.errors import LinkposeError
+from linkpose.localization import models
+from linkpose.localization.ekf import ekf_step
+from linkpose.localization.gate import chi_square_quantile
+from linkpose.localization.grid import GridMap, no_map
+from linkpose.localization.linalg import Floats, lower_cholesky
+from linkpose.localization.ukf import ukf_step
+
+FilterName = Literal["ekf", "ukf"]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A motion model's form: its number, its states with their units in the name, and how many controls and noises it
+    takes.
+    """
+
+    model: int
+    states: tuple[str, ...]
+    controls: int
+    noises: int
+
+    @property
+    def is_angle(self) -> Bools:
+        """Which states live on the circle: the headings."""
+        return np.array([name.startswith("heading") for name in self.states])
+
+    def extended(self, constants: tuple[str, ...]) -> Motion:
+        """With constants to estimate after its own states."""
+        return Motion(self.model, self.states + constants, self.controls, self.noises)
+
+
+UNICYCLE = Motion(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
+SUBMERSIBLE = Motion(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
+PLANAR_TWIST = Motion(
+    models.PLANAR_TWIST, ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s", "gyro_bias_rad_s"), 0, 4
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a sensor read at one instant.
+
+    `values` (m,) with covariance R (m, m); `parameters` is the model's table. The rows belong together in blocks of
+    `block`: a block is gated as one, with `block` degrees of freedom. `angles` says which rows are angles.
+    """
+
+    model: int
+    values: Floats
+    covariance: Floats
+    parameters: Floats
+    block: int = 1
+    angles: tuple[bool, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """The unscented transform: κ places the sigma points √(n_a + κ) standard deviations out. α and β scale it; 1 and 0
+    leave it plain.
+    """
+
+    alpha: float = 1.0
+    beta: float = 0.0
+    kappa: float = 0.0
+
+    def check(self) -> None:
+        """Raises LinkposeError for a transform without sigma points or with a covariance that can turn indefinite."""
+        if self.kappa < 0:
+            raise LinkposeError(
+                f"κ {self.kappa:g} gives the centre point a negative weight, and P may cease to be positive definite; "
+                "use 0 or more"
+            )
+        if not 0 < self.alpha <= 1:
+            raise LinkposeError(f"α {self.alpha:g} is not within 0 to 1; try 0.1")
+        if self.beta < 0:
+            raise LinkposeError(f"β {self.beta:g} is below 0; 2 is best for Gaussian errors")
+
+
+@dataclass(slots=True)
+class KalmanFilter:
+    """A filter under way. `state` (n,) and `covariance` (n, n) are of the instant up to which it was stepped.
+
+    `noise_root` (q, q) is the lower Cholesky factor of Q, the covariance of the motion model's noises over one control
+    sample. `gate` is the probability that a good measurement passes; None takes all.
+    """
+
+    name: FilterName
+    motion: Motion
+    state: Floats
+    covariance: Floats
+    noise_root: Floats
+    gate: float | None = None
+    transform: Transform = field(default_factory=Transform)
+    grid: GridMap = field(default_factory=no_map)
+    _is_angle: Bools = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._is_angle = self.motion.is_angle
+        self.state = np.array(self.state, dtype=np.float64)
+        self.covariance = np.array(self.covariance, dtype=np.float64)
+        if self.name == "ukf":
+            self.transform.check()
+
+    def step(self, interval_s: float, control: Floats, hold_s: Floats, measurement: Measurement | None = None) -> Bools:
+        """Moves on by `interval_s` under `control` (controls,), then corrects with the measurement. Returns which
+        blocks passed the gate.
+
+        `hold_s` (q,) is how long each noise keeps its value: a control sample is one draw of Q, which the parts of its
+        interval share. Raises LinkposeError when the covariance has ceased to be positive definite.
+        """
+        root = self.noise_root
+        if interval_s > 0.0:
+            root = root * np.sqrt(hold_s / interval_s)[:, np.newaxis]
+        if measurement is None:
+            measurement = _NOTHING
+        blocks = len(measurement.values) // measurement.block
+        d2 = np.empty(blocks)
+        threshold = np.inf if self.gate is None or not blocks else chi_square_quantile(self.gate, measurement.block)
+        rows = (
+            np.zeros(len(measurement.values), np.bool_)
+            if not measurement.angles
+            else np.tile(measurement.angles, blocks)
+        )
+        arguments = (
+            self.motion.model,
+            self.state,
+            self.covariance,
+            control,
+            root,
+            interval_s,
+            measurement.model,
+            measurement.values,
+            measurement.covariance,
+            measurement.parameters,
+            np.concatenate((self._is_angle, rows)),
+            threshold,
+            d2,
+            self.grid.blocked,
+            self.grid.geometry,
+        )
+        if self.name == "ekf":
+            sound = ekf_step(*arguments)
+        else:
+            sound = ukf_step(*arguments, self.transform.alpha, self.transform.beta, self.transform.kappa)
+        if not sound:
+            raise LinkposeError(
+                f"the {self.name}'s covariance is no longer positive definite; "
+                "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
+            )
+        return np.asarray(d2 <= threshold)
+
+    def widen(self, factor: float) -> None:
+        """Multiplies the standard deviations of the motion model's position and heading, which keeps the covariance
+        positive definite.
+        """
+        grow = np.array([factor if name in ("x_m", "y_m", "heading_rad") else 1.0 for name in self.motion.states])
+        self.covariance *= np.outer(grow, grow)
+
+
+_NOTHING = Measurement(models.DIRECT, np.empty(0), np.empty((0, 0)), np.empty((0, 2)))
+
+
+def covariance_root(covariance: Floats, name: str) -> Floats:
+    """The lower Cholesky factor. Raises LinkposeError naming the matrix when it is not positive definite."""
+    root = np.zeros_like(covariance)
+    if not lower_cholesky(np.ascontiguousarray(covariance, dtype=np.float64), root):
+        raise LinkposeError(
+            f"{name} is not positive definite, so it has no Cholesky factor; "
+            "lower its correlations or raise its variances"
+        )
+    return root

@@ -1,0 +1,119 @@
+"""Small dense linear algebra for the compiled filters: plain loops, which compile faster than BLAS calls and link to
+nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@njit(cache=True)
+def wrap_angle(angle: float) -> float:
+    """The same direction in [-π, π)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True)
+def wrap_where(values: Floats, is_angle: NDArray[np.bool_]) -> None:
+    """Puts those elements of a vector that are angles on the circle, in place."""
+    for i in range(values.shape[0]):
+        if is_angle[i]:
+            values[i] = wrap_angle(values[i])
+
+
+@njit(cache=True)
+def product(a: Floats, b: Floats) -> Floats:
+    """a b."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            for j in range(b.shape[1]):
+                out[i, j] += a[i, k] * b[k, j]
+    return out
+
+
+@njit(cache=True)
+def product_transposed(a: Floats, b: Floats) -> Floats:
+    """a bᵀ."""
+    out = np.zeros((a.shape[0], b.shape[0]))
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            total = 0.0
+            for k in range(a.shape[1]):
+                total += a[i, k] * b[j, k]
+            out[i, j] = total
+    return out
+
+
+@njit(cache=True)
+def symmetrise(a: Floats) -> None:
+    """(a + aᵀ)/2, in place: rounding must not make a covariance lopsided."""
+    for i in range(a.shape[0]):
+        for j in range(i):
+            mean = 0.5 * (a[i, j] + a[j, i])
+            a[i, j] = mean
+            a[j, i] = mean
+
+
+@njit(cache=True)
+def lower_cholesky(a: Floats, lower: Floats) -> bool:
+    """Fills `lower` with L, L Lᵀ = a. False when a is not positive definite; a column whose variance is 0 is allowed
+    and stays 0.
+    """
+    n = a.shape[0]
+    for j in range(n):
+        for i in range(j):
+            lower[i, j] = 0.0
+        pivot = a[j, j]
+        for k in range(j):
+            pivot -= lower[j, k] * lower[j, k]
+        if not math.isfinite(pivot) or pivot < 0.0 or (pivot == 0.0 and a[j, j] != 0.0):
+            return False
+        root = math.sqrt(pivot)
+        lower[j, j] = root
+        for i in range(j + 1, n):
+            total = a[i, j]
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            lower[i, j] = total / root if root > 0.0 else 0.0
+    return True
+
+
+@njit(cache=True)
+def right_divide(t: Floats, lower: Floats) -> Floats:
+    """t S⁻¹ for S = L Lᵀ: the Kalman gain from the cross covariance t."""
+    n = lower.shape[0]
+    out = t.copy()
+    for row in range(t.shape[0]):
+        for i in range(n):
+            total = out[row, i]
+            for k in range(i):
+                total -= lower[i, k] * out[row, k]
+            out[row, i] = total / lower[i, i]
+        for i in range(n - 1, -1, -1):
+            total = out[row, i]
+            for k in range(i + 1, n):
+                total -= lower[k, i] * out[row, k]
+            out[row, i] = total / lower[i, i]
+    return out
+
+
+@njit(cache=True)
+def mahalanobis_squared(v: Floats, lower: Floats) -> float:
+    """vᵀ S⁻¹ v for S = L Lᵀ."""
+    n = v.shape[0]
+    y = np.empty(n)
+    d2 = 0.0
+    for i in range(n):
+        total = v[i]
+        for k in range(i):
+            total -= lower[i, k] * y[k]
+        y[i] = total / lower[i, i]
+        d2 += y[i] * y[i]
+    return d2

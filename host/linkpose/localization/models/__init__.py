@@ -1,0 +1,91 @@
+"""Motion and measurement models, one a file, and the choice among them that the compiled filters make.
+
+A motion model has `propagate` and `jacobians`, a measurement model `predict` and `jacobian`, each compiled, and a
+number `ID`. A new model is a new file and a branch below. The choice is by number because a compiled function that
+takes functions as arguments cannot be cached on disk.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from linkpose.localization.linalg import Floats
+from linkpose.localization.models import (
+    beacon_range,
+    beams,
+    direct,
+    landmark,
+    mouse_velocity,
+    planar_twist,
+    rate_gyro,
+    submersible,
+    unicycle,
+)
+
+UNICYCLE, SUBMERSIBLE, PLANAR_TWIST = unicycle.ID, submersible.ID, planar_twist.ID
+BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
+MOUSE_VELOCITY, RATE_GYRO = mouse_velocity.ID, rate_gyro.ID
+
+
+@njit(cache=True)
+def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
+    """Fills `out` with the state after `interval` seconds."""
+    if motion == UNICYCLE:
+        unicycle.propagate(state, control, noise, interval, out)
+    elif motion == SUBMERSIBLE:
+        submersible.propagate(state, control, noise, interval, out)
+    else:
+        planar_twist.propagate(state, control, noise, interval, out)
+
+
+@njit(cache=True)
+def motion_jacobians(
+    motion: int, state: Floats, control: Floats, interval: float, by_state: Floats, by_noise: Floats
+) -> None:
+    """Fills two zeroed matrices, (n, n) and (n, q), with the slopes of `propagate`."""
+    if motion == UNICYCLE:
+        unicycle.jacobians(state, control, interval, by_state, by_noise)
+    elif motion == SUBMERSIBLE:
+        submersible.jacobians(state, control, interval, by_state, by_noise)
+    else:
+        planar_twist.jacobians(state, control, interval, by_state, by_noise)
+
+
+@njit(cache=True)
+def predict(
+    model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
+) -> None:
+    """Fills `out` with the measurement that `state` leads to expect."""
+    if model == BEAMS:
+        beams.predict(state, parameters, blocked, geometry, out)
+    elif model == BEACON_RANGE:
+        beacon_range.predict(state, parameters, out)
+    elif model == LANDMARK:
+        landmark.predict(state, parameters, out)
+    elif model == DIRECT:
+        direct.predict(state, parameters, out)
+    elif model == MOUSE_VELOCITY:
+        mouse_velocity.predict(state, parameters, out)
+    else:
+        rate_gyro.predict(state, parameters, out)
+
+
+@njit(cache=True)
+def jacobian(
+    model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
+) -> None:
+    """Fills a zeroed matrix (m, n) with the slopes of `predict`."""
+    if model == BEAMS:
+        beams.jacobian(state, parameters, blocked, geometry, out)
+    elif model == BEACON_RANGE:
+        beacon_range.jacobian(state, parameters, out)
+    elif model == LANDMARK:
+        landmark.jacobian(state, parameters, out)
+    elif model == DIRECT:
+        direct.jacobian(state, parameters, out)
+    elif model == MOUSE_VELOCITY:
+        mouse_velocity.jacobian(state, parameters, out)
+    else:
+        rate_gyro.jacobian(state, parameters, out)

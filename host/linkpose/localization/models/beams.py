@@ -1,0 +1,48 @@
+"""Laser ranges against a grid map: h_i = the distance along beam i from the sensor's pose to the first wall, by ray
+casting.
+
+A row of parameters is (beam angle rad, sensor x m, y m, θ rad on the robot, longest range m).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from linkpose.localization.grid import cast_ray
+from linkpose.localization.linalg import Floats
+
+ID = 0
+TURN_STEP = math.radians(
+    0.5
+)  # of the difference quotient; the step in x and y is one cell, as a smaller one sees only a stair's face
+
+
+@njit(cache=True)
+def predict(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
+    """The ranges (m) from the pose (x, y, θ) that `state` starts with."""
+    c, s = math.cos(state[2]), math.sin(state[2])
+    for i in range(out.shape[0]):
+        x = state[0] + c * parameters[i, 1] - s * parameters[i, 2]
+        y = state[1] + s * parameters[i, 1] + c * parameters[i, 2]
+        angle = state[2] + parameters[i, 3] + parameters[i, 0]
+        out[i] = cast_ray(blocked, geometry, x, y, angle, parameters[i, 4])
+
+
+@njit(cache=True)
+def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
+    """Fills ∂h/∂state by central differences: a map has no formula."""
+    above, below = np.empty(out.shape[0]), np.empty(out.shape[0])
+    moved = state.copy()
+    for j in range(3):
+        step = TURN_STEP if j == 2 else geometry[0]
+        moved[j] = state[j] + step
+        predict(moved, parameters, blocked, geometry, above)
+        moved[j] = state[j] - step
+        predict(moved, parameters, blocked, geometry, below)
+        moved[j] = state[j]
+        for i in range(out.shape[0]):
+            out[i, j] = (above[i] - below[i]) / (2.0 * step)

@@ -1,0 +1,124 @@
+"""CSV tables of numbers with named columns: beacons and true paths."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from linkpose.errors import LinkposeError
+from linkpose.localization.events import beacon_name, read_number
+from linkpose.localization.linalg import Floats, wrap_angle
+from linkpose.recording.table import Table, read_table
+
+Beacons = dict[str, tuple[float, float, float]]
+LONGEST_TRUTH_GAP_S = 1.0  # between two true poses: an estimate inside a longer gap has nothing to be compared with
+
+
+def read_beacons(path: Path) -> Beacons:
+    """Reads `id,x_m,y_m[,z_m]` into name -> (x, y, z) in m. Raises LinkposeError with file, line and cure."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except UnicodeDecodeError as error:
+        raise LinkposeError(
+            f"{path} is not a CSV file: {error}; give the header id,x_m,y_m and one row a beacon"
+        ) from error
+    except OSError as error:
+        raise LinkposeError(f"cannot read the beacons {path}: {error.strerror}") from error
+    rows = [
+        (number, text.split(",")) for number, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")
+    ]
+    header = [name.strip() for name in rows[0][1]] if rows else []
+    if header not in (["id", "x_m", "y_m"], ["id", "x_m", "y_m", "z_m"]):
+        raise LinkposeError(
+            f"{path} has the header {','.join(header)[:60]!r}; a beacon file has id,x_m,y_m or id,x_m,y_m,z_m"
+        )
+    beacons: Beacons = {}
+    for line, cells in rows[1:]:
+        if len(cells) != len(header):
+            raise LinkposeError(
+                f"{path} line {line}: {len(cells)} of {len(header)} columns; complete or delete the row"
+            )
+        number, *place = (read_number(cell, path, line) for cell in cells)
+        name = beacon_name(number)
+        if name in beacons:
+            raise LinkposeError(f"{path} line {line}: beacon {name} stands there twice; give each its own id")
+        beacons[name] = (place[0], place[1], place[2] if len(place) == 3 else 0.0)
+    if not beacons:
+        raise LinkposeError(f"{path} names no beacons; give one row a beacon: id,x_m,y_m")
+    return beacons
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """A true path: times (N,) and positions (N, 2 or 3) in m; headings (N,) in rad, unwrapped, or None where they are
+    not known.
+    """
+
+    time_s: Floats
+    position_m: Floats
+    heading_rad: Floats | None
+
+    def covers(self, time_s: Floats) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        """Which times lie between two true poses that are near enough to interpolate."""
+        after = np.searchsorted(self.time_s, time_s)
+        inside = (time_s >= self.time_s[0]) & (time_s <= self.time_s[-1])
+        gap = self.time_s[np.minimum(after, len(self.time_s) - 1)] - self.time_s[np.maximum(after - 1, 0)]
+        return np.asarray(inside & (gap <= LONGEST_TRUTH_GAP_S))
+
+    def position_at(self, time_s: Floats) -> Floats:
+        """Positions (M, 2 or 3) by linear interpolation."""
+        return np.column_stack([np.interp(time_s, self.time_s, axis) for axis in self.position_m.T])
+
+
+def read_truth(path: Path) -> Truth:
+    """Reads `time_s,x_m,y_m[,z_m][,heading_rad]` among other columns. Raises LinkposeError with file, line and cure."""
+    columns = _read_whole(path, "time_s", "x_m", "y_m").columns
+    axes = [columns[name] for name in ("x_m", "y_m", "z_m") if name in columns]
+    heading = np.unwrap(columns["heading_rad"]) if "heading_rad" in columns else None
+    return Truth(columns["time_s"], np.column_stack(axes), heading)
+
+
+def _read_whole(path: Path, *required: str) -> Table:
+    """A table that has these columns, and a finite number in each field that matters."""
+    table = read_table(path)
+    table.require(*required)
+    for name in (*required, "z_m", "heading_rad"):
+        missing = np.flatnonzero(~np.isfinite(table.columns.get(name, np.zeros(1))))
+        if len(missing):
+            raise LinkposeError(
+                f"{path}, line {table.first_line + int(missing[0])}: {name} is no finite number; "
+                "complete or delete the row"
+            )
+    return table
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of an estimated path against the truth. The heading's is None where the truth has no heading."""
+
+    position_rmse_m: float
+    position_max_m: float
+    heading_rmse_rad: float | None
+
+
+def score(time_s: Floats, position_m: Floats, heading_rad: Floats, truth: Truth) -> Score:
+    """Compares estimates at their own times (N,), positions (N, 2 or 3), headings (N,). Raises LinkposeError when the
+    times do not meet.
+    """
+    rows = truth.covers(time_s)
+    if not rows.any():
+        raise LinkposeError(
+            f"the true path ({truth.time_s[0]:.6g} to {truth.time_s[-1]:.6g} s) has no pose at the log's times "
+            f"({time_s[0]:.6g} to {time_s[-1]:.6g} s); give the truth of this log"
+        )
+    axes = min(position_m.shape[1], truth.position_m.shape[1])
+    error = position_m[rows, :axes] - truth.position_at(time_s[rows])[:, :axes]
+    distance2 = np.sum(error * error, axis=1)
+    heading = None
+    if truth.heading_rad is not None:
+        off = heading_rad[rows] - np.interp(time_s[rows], truth.time_s, truth.heading_rad)
+        heading = math.sqrt(float(np.mean([wrap_angle(value) ** 2 for value in off])))
+    return Score(math.sqrt(float(np.mean(distance2))), math.sqrt(float(np.max(distance2))), heading)
