@@ -41,9 +41,9 @@ class Weather:
     @staticmethod
     def draw(rng: np.random.Generator, disturbed: bool) -> Weather:
         period_s = np.geomspace(15.0, 600.0, 6) * rng.uniform(0.8, 1.25, 6)
-        amplitude = 1.6 * rng.uniform(0.6, 1.4, 6) * disturbed
+        amplitude = 1.0 * rng.uniform(0.6, 1.4, 6) * disturbed
         phase = rng.uniform(0, 2 * np.pi, 6)
-        return Weather(rng.uniform(99_000, 102_000), amplitude, 2 * np.pi / period_s, phase, 0.5 * disturbed)
+        return Weather(rng.uniform(99_000, 102_000), amplitude, 2 * np.pi / period_s, phase, 0.3 * disturbed)
 
     def pressure(self, time_s: Floats, height_m: Floats, speed_m_s: Floats) -> Floats:
         """Pressure (Pa) at the sensor, all (N,)."""

@@ -1,0 +1,61 @@
+"""What the inertial filters share: the calibrated reading of one sample, and the limits of a usable step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.filters._vector import Vec, compiled
+from linkpose.sensors.rig import Imu
+from linkpose.wire.messages import SampleFlags
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.80665  # m/s²
+# The slowest sampling is 50 Hz. After a longer step the rotation in between is a guess, and its doubt is GAP_RATE.
+LONGEST_STEP_S = 0.025
+GAP_RATE_RAD_S = 1.0
+LONGEST_GAP_S = 2.0  # beyond this nothing of the attitude is left to remember
+
+_ACCEL_SATURATED = int(SampleFlags.ACCEL_SATURATED)
+_GYRO_SATURATED = int(SampleFlags.GYRO_SATURATED)
+
+
+class ImuCalibration(NamedTuple):
+    """The rig's [imu] as the compiled steps read it: numbers only, since an array costs a reference count a call."""
+
+    gyro_bias: Vec  # rad/s
+    accel_offset: Vec  # m/s²
+    accel_gain: Vec  # 1/scale
+    gyro_variance: float  # (rad/s)² of one sample
+    accel_variance: float  # (m/s²)² of one sample
+
+    @staticmethod
+    def of(imu: Imu) -> ImuCalibration:
+        x, y, z = imu.accel_scale
+        return ImuCalibration(
+            imu.gyro_bias_rad_s,
+            imu.accel_offset_m_s2,
+            (1 / x, 1 / y, 1 / z),
+            imu.gyro_noise_rad_s**2,
+            imu.accel_noise_m_s2**2,
+        )
+
+
+@compiled
+def read_accel(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
+    """Whether a sample's specific force can be used, and the calibrated force (m/s²)."""
+    o, k = imu.accel_offset, imu.accel_gain
+    force = ((raw[0] - o[0]) * k[0], (raw[1] - o[1]) * k[1], (raw[2] - o[2]) * k[2])
+    return math.isfinite(force[0] + force[1] + force[2]) and not flags & _ACCEL_SATURATED, force
+
+
+@compiled
+def read_gyro(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
+    """Whether a sample's angular rate can be used, and the rate less its bias (rad/s)."""
+    b = imu.gyro_bias
+    rate = (raw[0] - b[0], raw[1] - b[1], raw[2] - b[2])
+    return math.isfinite(rate[0] + rate[1] + rate[2]) and not flags & _GYRO_SATURATED, rate

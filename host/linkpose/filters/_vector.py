@@ -1,0 +1,176 @@
+"""Vectors and symmetric matrices of three, as tuples that the compiler keeps in registers.
+
+A vector is (x, y, z); a symmetric matrix is (xx, xy, xz, yy, yz, zz). All are compiled into the filters that use them.
+Numba's cache does not see a change of this file from there: after editing it, delete the filters' `__pycache__`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+# Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
+compiled = njit(cache=True, error_model="numpy")
+# For the parts of a step that are long: put into the caller before it is compiled, else they stay calls.
+inlined = njit(cache=True, error_model="numpy", inline="always")
+
+Floats = NDArray[np.float64]
+Vec = tuple[float, float, float]
+Sym = tuple[float, float, float, float, float, float]
+
+
+@compiled
+def cross(a: Vec, b: Vec) -> Vec:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@compiled
+def dot(a: Vec, b: Vec) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
+def unit(a: Vec) -> Vec:
+    inverse = 1.0 / math.sqrt(dot(a, a))
+    return (a[0] * inverse, a[1] * inverse, a[2] * inverse)
+
+
+@compiled
+def apply(s: Sym, v: Vec) -> Vec:
+    """s v"""
+    return (
+        s[0] * v[0] + s[1] * v[1] + s[2] * v[2],
+        s[1] * v[0] + s[3] * v[1] + s[4] * v[2],
+        s[2] * v[0] + s[4] * v[1] + s[5] * v[2],
+    )
+
+
+@compiled
+def plus_diagonal(s: Sym, value: float) -> Sym:
+    """s + value · I"""
+    return (s[0] + value, s[1], s[2], s[3] + value, s[4], s[5] + value)
+
+
+@compiled
+def add(a: Sym, scale: float, b: Sym) -> Sym:
+    """a + scale · b"""
+    return (
+        a[0] + scale * b[0],
+        a[1] + scale * b[1],
+        a[2] + scale * b[2],
+        a[3] + scale * b[3],
+        a[4] + scale * b[4],
+        a[5] + scale * b[5],
+    )
+
+
+@compiled
+def scaled(scale: float, s: Sym) -> Sym:
+    """scale · s"""
+    return (scale * s[0], scale * s[1], scale * s[2], scale * s[3], scale * s[4], scale * s[5])
+
+
+@compiled
+def inverse(s: Sym) -> Sym:
+    """Inverse of a positive definite matrix, by cofactors."""
+    c00 = s[3] * s[5] - s[4] * s[4]
+    c01 = s[2] * s[4] - s[1] * s[5]
+    c02 = s[1] * s[4] - s[2] * s[3]
+    scale = 1.0 / (s[0] * c00 + s[1] * c01 + s[2] * c02)
+    return (
+        c00 * scale,
+        c01 * scale,
+        c02 * scale,
+        (s[0] * s[5] - s[2] * s[2]) * scale,
+        (s[1] * s[2] - s[0] * s[4]) * scale,
+        (s[0] * s[3] - s[1] * s[1]) * scale,
+    )
+
+
+@compiled
+def quadratic(s: Sym, v: Vec) -> float:
+    """vᵀ s v"""
+    return dot(v, apply(s, v))
+
+
+@compiled
+def load(a: Floats) -> Vec:
+    """The vector that an array of three holds."""
+    return (a[0], a[1], a[2])
+
+
+@compiled
+def load_sym(a: Floats) -> Sym:
+    """The symmetric matrix that an array of six holds."""
+    return (a[0], a[1], a[2], a[3], a[4], a[5])
+
+
+@compiled
+def cross_square(v: Vec, scale: float) -> Sym:
+    """scale · [v×][v×]ᵀ = scale · (‖v‖² I − v vᵀ)"""
+    xx, yy, zz = v[0] * v[0], v[1] * v[1], v[2] * v[2]
+    return (
+        scale * (yy + zz),
+        -scale * v[0] * v[1],
+        -scale * v[0] * v[2],
+        scale * (xx + zz),
+        -scale * v[1] * v[2],
+        scale * (xx + yy),
+    )
+
+
+@compiled
+def parallel(a: Sym, b: Sym, a_plus_b_inverse: Sym) -> Sym:
+    """a (a + b)⁻¹ b, symmetric, and positive where a and b are: a covariance corrected without a subtraction."""
+    i = a_plus_b_inverse
+    c0 = apply(i, (b[0], b[1], b[2]))
+    c1 = apply(i, (b[1], b[3], b[4]))
+    c2 = apply(i, (b[2], b[4], b[5]))
+    r0, r1, r2 = (a[0], a[1], a[2]), (a[1], a[3], a[4]), (a[2], a[4], a[5])
+    return (
+        dot(r0, c0),
+        0.5 * (dot(r0, c1) + dot(r1, c0)),
+        0.5 * (dot(r0, c2) + dot(r2, c0)),
+        dot(r1, c1),
+        0.5 * (dot(r1, c2) + dot(r2, c1)),
+        dot(r2, c2),
+    )
+
+
+@compiled
+def turn_back(rotation: Vec, v: Vec) -> Vec:
+    """exp(−[rotation×]) v: a fixed vector as seen after the frame has turned by `rotation` (rad)."""
+    square = dot(rotation, rotation)
+    if square < 0.01:  # series: relative error below 1e-10
+        sine = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
+        cosine = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0))
+    else:
+        angle = math.sqrt(square)
+        sine = math.sin(angle) / angle
+        cosine = (1.0 - math.cos(angle)) / square
+    first = cross(rotation, v)
+    second = cross(rotation, first)
+    return (
+        v[0] - sine * first[0] + cosine * second[0],
+        v[1] - sine * first[1] + cosine * second[1],
+        v[2] - sine * first[2] + cosine * second[2],
+    )
+
+
+@compiled
+def turn_back_sym(r: Vec, s: Sym) -> Sym:
+    """(I − [r×]) s (I − [r×])ᵀ: a covariance after a small turn r (rad), to first order and positive all the same."""
+    m00, m01, m02 = s[0] + r[2] * s[1] - r[1] * s[2], s[1] + r[2] * s[3] - r[1] * s[4], s[2] + r[2] * s[4] - r[1] * s[5]
+    m10, m11, m12 = s[1] - r[2] * s[0] + r[0] * s[2], s[3] - r[2] * s[1] + r[0] * s[4], s[4] - r[2] * s[2] + r[0] * s[5]
+    m20, m21, m22 = s[2] + r[1] * s[0] - r[0] * s[1], s[4] + r[1] * s[1] - r[0] * s[3], s[5] + r[1] * s[2] - r[0] * s[4]
+    return (
+        m00 + r[2] * m01 - r[1] * m02,
+        m01 - r[2] * m00 + r[0] * m02,
+        m02 + r[1] * m00 - r[0] * m01,
+        m11 - r[2] * m10 + r[0] * m12,
+        m12 + r[1] * m10 - r[0] * m11,
+        m22 + r[1] * m20 - r[0] * m21,
+    )

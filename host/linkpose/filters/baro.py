@@ -1,0 +1,138 @@
+"""`baro`: height from the barometer alone, the paper's Method D.
+
+    h = 44330.77 (1 − (p / p₀)^0.190263)   (m)
+
+over the mean pressure p₀ of the first second, when the link is expected to be at rest. With J2S the height is over the
+joint's centre like that of the other filters: the tilt of that first second, from the mean accelerometer, says how high
+the sensor stood. Without J2S the height is relative to the start.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import Floats, ImuCalibration, read_accel
+from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+
+HEIGHT_SCALE_M = 44330.77
+HEIGHT_EXPONENT = 0.190263
+START_S = 1.0  # over which the start's pressure and tilt are averaged
+
+
+class StartState(NamedTuple):
+    """What the first second said, and the last reading; changed in place."""
+
+    time: Floats  # (1,) of the first sample (s), NaN before it
+    force: Floats  # (3,) sum of the usable forces (m/s²)
+    pressure: Floats  # (2,) sum of the usable pressures (Pa), and how many
+    height: Floats  # (1,) last height (m), NaN before the first pressure
+    rejected: NDArray[np.int64]  # (1,) fresh pressures that could not be used
+
+    @staticmethod
+    def fresh() -> StartState:
+        return StartState(np.full(1, np.nan), np.zeros(3), np.zeros(2), np.full(1, np.nan), np.zeros(1, np.int64))
+
+
+class BaroFilter:
+    """Method D over blocks of samples."""
+
+    name = "baro"
+    columns = ("baro_height_m", "baro_height_std_m")
+
+    def __init__(self, rig: Rig) -> None:
+        self.state = StartState.fresh()
+        self._imu = ImuCalibration.of(rig.imu)
+        self._j2s = rig.joint.j2s_m or (0.0, 0.0, 0.0)
+        self._noise_Pa = rig.baro.pressure_noise_Pa
+
+    @property
+    def rejected(self) -> int:
+        """Fresh pressures so far that could not be used."""
+        return int(self.state.rejected[0])
+
+    def process(self, block: Measurements) -> Floats:
+        """Height and its standard deviation (m) at each of the N samples: (N, 2), NaN before the first pressure.
+
+        The standard deviation is that of the sensor's noise; the weather's drift is not in it.
+        """
+        out = np.empty((len(block), 2))
+        _process(
+            block.time_s, block.accel_m_s2, block.flags, block.pressure_Pa, block.baro_fresh,
+            self._imu, self._j2s, self._noise_Pa, self.state, out,
+        )  # fmt: skip
+        return out
+
+
+@inlined
+def listen(
+    time_s: float, raw_accel: Vec, flags: int, pressure: float, fresh: bool, imu: ImuCalibration, state: StartState
+) -> bool:
+    """Takes one sample into the start's means while it lasts; whether there is a usable fresh pressure."""
+    if math.isnan(state.time[0]):
+        state.time[0] = time_s
+    good = fresh and pressure > 0.0  # NaN is not
+    if fresh and not good:
+        state.rejected[0] += 1
+    if time_s - state.time[0] <= START_S:
+        has_force, force = read_accel(raw_accel, flags, imu)
+        if has_force:
+            for j in range(3):
+                state.force[j] += force[j]
+    elif state.pressure[1] > 0.0:
+        return good
+    if good:
+        state.pressure[0] += pressure
+        state.pressure[1] += 1.0
+    return good
+
+
+@inlined
+def start_height(state: StartState, j2s: Vec) -> float:
+    """Height (m) of the sensor over the joint's centre at the start, 0 where no tilt is known."""
+    force = vec.load(state.force)
+    length = math.sqrt(vec.dot(force, force))
+    return float(vec.dot(force, j2s) / length) if length > 0.0 else 0.0
+
+
+@inlined
+def barometric_height(pressure: float, state: StartState) -> float:
+    """Height (m) over the start's mean pressure."""
+    ratio: float = pressure * state.pressure[1] / state.pressure[0]
+    return float(HEIGHT_SCALE_M * (1.0 - ratio**HEIGHT_EXPONENT))
+
+
+@inlined
+def metres_per_pascal(state: StartState) -> float:
+    """|dh/dp| at the start's mean pressure."""
+    return float(HEIGHT_SCALE_M * HEIGHT_EXPONENT * state.pressure[1] / state.pressure[0])
+
+
+@compiled
+def _process(
+    time_s: Floats,
+    accel: Floats,
+    flags: NDArray[np.uint16],
+    pressure_Pa: Floats,
+    fresh: NDArray[np.bool_],
+    imu: ImuCalibration,
+    j2s: Vec,
+    noise_Pa: float,
+    state: StartState,
+    out: Floats,
+) -> None:
+    for i in range(len(time_s)):
+        a = (accel[i, 0], accel[i, 1], accel[i, 2])
+        if listen(time_s[i], a, flags[i], pressure_Pa[i], fresh[i], imu, state):
+            state.height[0] = start_height(state, j2s) + barometric_height(pressure_Pa[i], state)
+        out[i, 0] = state.height[0]
+        if math.isnan(state.height[0]):
+            out[i, 1] = np.nan
+        else:
+            out[i, 1] = noise_Pa * metres_per_pascal(state) * math.sqrt(1.0 + 1.0 / state.pressure[1])

@@ -1,0 +1,175 @@
+"""`joint`: the tilt filter with the joint's constraint as a second measurement, the paper's Method A.
+
+The socket is fixed to the ground, so the sensor's acceleration follows from its angular motion alone (9):
+a = ([ω̇×] + [ω×][ω×]) d, with d = J2S. With ω = s_G − n_G and [n×][n×] = 0 that becomes a second reference for gravity,
+
+    z_c = s_A − ([ṡ_G×] + [s_G×][s_G×]) d = g Z + ε_c + n_A                               (10), (12)
+    ε_c = [d×] ṅ_G + G n_G,   G = [(s_G×d)×] + [s_G×][d×]                                  (11)
+
+applied after Method B's correction: K = gP(g²P + B)⁻¹, Z ← Z + K(z_c − gZ), P ← (I − gK)P (13), (14).
+
+ṡ_G is the backward difference of second order over the last three samples, c₀ s_k + c₁ s_k−1 + c₂ s_k−2: the one of
+first order belongs to the middle of the step and lags by half a sample. The noise of its three readings is independent,
+
+    B = (c₀D + G) Σ_G (c₀D + G)ᵀ + (c₁² + c₂²) D Σ_G Dᵀ + Σ_A,   D = [d×]
+
+where the paper takes ṅ_G as white of its own. The displacement is Zᵀd (15), the height of the sensor over the joint's
+centre.
+
+Source: the link paper, equations (9)-(15).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
+from linkpose.filters._vector import Sym, Vec, compiled, inlined
+from linkpose.filters.tilt import TiltParameters, TiltState, acceleration, advance, describe, keep, recall
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+
+
+class History(NamedTuple):
+    """The two samples before the present one, for the derivative of the rate; changed in place."""
+
+    time: Floats  # (2,) s: one and two samples ago, NaN where there is none next to the present
+    rate: Floats  # (2, 3) rad/s
+
+    @staticmethod
+    def fresh() -> History:
+        return History(np.full(2, np.nan), np.zeros((2, 3)))
+
+
+class JointFilter:
+    """Method A over blocks of samples."""
+
+    name = "joint"
+    columns = ("joint_height_m", "joint_height_std_m", "joint_roll_deg", "joint_pitch_deg")
+
+    def __init__(self, rig: Rig, parameters: TiltParameters | None = None) -> None:
+        """The rig must know J2S."""
+        assert rig.joint.j2s_m is not None
+        self.parameters = parameters or TiltParameters()
+        self.state = TiltState.fresh()
+        self._history = History.fresh()
+        self._imu = ImuCalibration.of(rig.imu)
+        self._j2s = rig.joint.j2s_m
+
+    @property
+    def rejected(self) -> int:
+        """Samples so far whose accelerometer, gyro or time could not be used."""
+        return int(self.state.rejected[0])
+
+    def process(self, block: Measurements) -> Floats:
+        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
+
+        The standard deviation is that of the modelled noise; a bias that the calibration left is not in it.
+        """
+        out = np.empty((len(block), 4))
+        _process(
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
+            self._imu, self.parameters, self._j2s, self.state, self._history, out,
+        )  # fmt: skip
+        return out
+
+
+@inlined
+def correct(tilt: Vec, covariance: Sym, reference: Vec, noise: Sym) -> tuple[Vec, Sym]:
+    """(13), (14) with reference = g Z + noise; `noise` is the reference's covariance divided by g²."""
+    inverse = vec.inverse(vec.add(covariance, 1.0, noise))
+    innovation = (
+        reference[0] / GRAVITY - tilt[0],
+        reference[1] / GRAVITY - tilt[1],
+        reference[2] / GRAVITY - tilt[2],
+    )
+    change = vec.apply(covariance, vec.apply(inverse, innovation))
+    tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
+    return tilt, vec.parallel(covariance, noise, inverse)
+
+
+@inlined
+def weights(h1: float, h2: float) -> Vec:
+    """c₀, c₁, c₂ (1/s) of the derivative at the last of three samples h2 and h1 apart (s)."""
+    return ((2.0 * h1 + h2) / (h1 * (h1 + h2)), -(h1 + h2) / (h1 * h2), h1 / (h2 * (h1 + h2)))
+
+
+@inlined
+def gravity_reference(force: Vec, rate: Vec, derivative: Vec, d: Vec) -> Vec:
+    """z_c of (12): the force less the acceleration that the angular motion gives the sensor."""
+    tangential = vec.cross(derivative, d)
+    inward = vec.cross(rate, vec.cross(rate, d))
+    return (
+        force[0] - tangential[0] - inward[0],
+        force[1] - tangential[1] - inward[1],
+        force[2] - tangential[2] - inward[2],
+    )
+
+
+@inlined
+def reference_noise(rate: Vec, c: Vec, d: Vec, imu: ImuCalibration) -> Sym:
+    """B / g². With [w×][d×] = d wᵀ − (w·d) I and [(w×d)×] = d wᵀ − w dᵀ, G = 2 d wᵀ − w dᵀ − (w·d) I."""
+    wd = vec.dot(rate, d)
+    tx, ty, tz = 2.0 * d[0], 2.0 * d[1], 2.0 * d[2]
+    cx, cy, cz = c[0] * d[0], c[0] * d[1], c[0] * d[2]
+    r0 = (tx * rate[0] - rate[0] * d[0] - wd, tx * rate[1] - rate[0] * d[1] - cz, tx * rate[2] - rate[0] * d[2] + cy)
+    r1 = (ty * rate[0] - rate[1] * d[0] + cz, ty * rate[1] - rate[1] * d[1] - wd, ty * rate[2] - rate[1] * d[2] - cx)
+    r2 = (tz * rate[0] - rate[2] * d[0] - cy, tz * rate[1] - rate[2] * d[1] + cx, tz * rate[2] - rate[2] * d[2] - wd)
+    present = (vec.dot(r0, r0), vec.dot(r0, r1), vec.dot(r0, r2), vec.dot(r1, r1), vec.dot(r1, r2), vec.dot(r2, r2))
+    past = vec.cross_square(d, c[1] * c[1] + c[2] * c[2])
+    gyro = vec.scaled(imu.gyro_variance / GRAVITY**2, vec.add(present, 1.0, past))
+    return vec.plus_diagonal(gyro, imu.accel_variance / GRAVITY**2)
+
+
+@compiled
+def _process(
+    time_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint16],
+    imu: ImuCalibration,
+    parameters: TiltParameters,
+    d: Vec,
+    state: TiltState,
+    history: History,
+    out: Floats,
+) -> None:
+    now = recall(state)
+    t1, t2 = history.time[0], history.time[1]
+    w1, w2 = vec.load(history.rate[0]), vec.load(history.rate[1])
+    rejected = 0
+    for i in range(len(time_s)):
+        a = (accel[i, 0], accel[i, 1], accel[i, 2])
+        w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
+        now, has_force, force, has_rate = advance(time_s[i], a, w, flags[i], imu, parameters.accel_memory, now)
+        rejected += not (has_force and has_rate)
+        time, rate, tilt, covariance, modelled = now
+        # A comparison with NaN is False: no derivative across a gap or a reading that could not be used.
+        if has_force and has_rate and time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S:
+            c = weights(time - t1, t1 - t2)
+            derivative = (
+                c[0] * rate[0] + c[1] * w1[0] + c[2] * w2[0],
+                c[0] * rate[1] + c[1] * w1[1] + c[2] * w2[1],
+                c[0] * rate[2] + c[1] * w1[2] + c[2] * w2[2],
+            )
+            reference = gravity_reference(force, rate, derivative, d)
+            tilt, covariance = correct(tilt, covariance, reference, reference_noise(rate, c, d, imu))
+            modelled = acceleration(force, tilt)
+            now = (time, rate, tilt, covariance, modelled)
+        if time != t1:  # a repeated stamp brings nothing new
+            t2, w2 = t1, w1
+            t1, w1 = (time if has_rate else math.nan), rate
+        if math.isnan(time):
+            out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
+        else:
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(tilt, covariance, d)
+    state.rejected[0] += rejected
+    keep(state, now)
+    history.time[0], history.time[1] = t1, t2
+    for j in range(3):
+        history.rate[0, j], history.rate[1, j] = w1[j], w2[j]

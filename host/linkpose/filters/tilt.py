@@ -1,0 +1,250 @@
+"""`tilt`: the unconstrained tilt Kalman filter with an acceleration model, the paper's Method B.
+
+Frames: n is fixed, Z up; s is the sensor's. The state is the tilt Z = Zˢ, n's Z axis seen in s (unit vector).
+
+    accelerometer  s_A = g Z + a + n_A       gyro  s_G = ω + n_G                          (2), (3)
+    acceleration   a_k = c_a a_k−1 + ε                                                    (4)
+    process        Z_k = exp(−Ts [s_G ×]) Z_k−1 + w,   Q = −Ts² [Z×] Σ_G [Z×]              (5), (7)
+    measurement    z_k = s_A,k − c_a a⁺_k−1 = g Z_k + v,   M = ⅓ c_a² ‖a⁺_k−1‖² I + Σ_A    (6), (8)
+
+with a⁺_k = s_A,k − g Z⁺_k. Two refinements over the paper's (5): the rate over a step is the mean of the rates at its
+ends, and the rotation is exact, where I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
+
+Sources: the link paper, equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and
+external acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas.
+61(8), 2012.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import (
+    GAP_RATE_RAD_S,
+    GRAVITY,
+    LONGEST_GAP_S,
+    LONGEST_STEP_S,
+    Floats,
+    ImuCalibration,
+    read_accel,
+    read_gyro,
+)
+from linkpose.filters._vector import Sym, Vec, compiled, inlined
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+
+# Unknown lever arm and rhythm of a start in motion: acceleration (m/s²) to a rate of 1 rad/s.
+_START_ACCEL_PER_RATE = 5.0
+
+
+# The state in registers: time (s), last usable rate, tilt, its covariance, a⁺.
+Now = tuple[float, Vec, Vec, Sym, Vec]
+
+
+class TiltParameters(NamedTuple):
+    """What the filter assumes."""
+
+    accel_memory: float = 0.1  # c_a: how much of the last sample's acceleration is still there
+
+
+class TiltState(NamedTuple):
+    """What the filter remembers from one block to the next; changed in place."""
+
+    time: Floats  # (1,) of the last sample (s), NaN before the first
+    rate: Floats  # (3,) last usable rate (rad/s)
+    tilt: Floats  # (3,) Z
+    covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
+    accel: Floats  # (3,) a⁺ (m/s²)
+    rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time could not be used
+
+    @staticmethod
+    def fresh() -> TiltState:
+        return TiltState(
+            np.full(1, np.nan), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(6), np.zeros(3), np.zeros(1, np.int64)
+        )
+
+
+class TiltFilter:
+    """Method B over blocks of samples. Without J2S there is no height, and its columns are NaN."""
+
+    name = "tilt"
+    columns = ("tilt_height_m", "tilt_height_std_m", "tilt_roll_deg", "tilt_pitch_deg")
+
+    def __init__(self, rig: Rig, parameters: TiltParameters | None = None) -> None:
+        self.parameters = parameters or TiltParameters()
+        self.state = TiltState.fresh()
+        self._imu = ImuCalibration.of(rig.imu)
+        self._j2s = rig.joint.j2s_m or (math.nan, math.nan, math.nan)
+
+    @property
+    def rejected(self) -> int:
+        """Samples so far whose accelerometer, gyro or time could not be used."""
+        return int(self.state.rejected[0])
+
+    def process(self, block: Measurements) -> Floats:
+        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
+
+        The standard deviation is that of the modelled noise; a bias that the calibration left is not in it.
+        """
+        out = np.empty((len(block), 4))
+        _process(
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
+            self._imu, self.parameters, self._j2s, self.state, out,
+        )  # fmt: skip
+        return out
+
+
+@inlined
+def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
+    """Tilt and its covariance from one sample: the direction of the force, with the doubt that a motion brings."""
+    magnitude = math.sqrt(vec.dot(force, force))
+    moving = _START_ACCEL_PER_RATE**2 * vec.dot(rate, rate)
+    variance = (imu.accel_variance + (magnitude - GRAVITY) ** 2 + moving) / GRAVITY**2
+    tilt = vec.unit(force) if magnitude > 0.0 else (0.0, 0.0, 1.0)
+    return tilt, vec.cross_square(tilt, min(variance, 1.0))
+
+
+@inlined
+def predict(
+    tilt: Vec, covariance: Sym, rate: Vec, before: Vec, step_s: float, known: bool, imu: ImuCalibration
+) -> tuple[Vec, Sym]:
+    """(5) over `step_s`, from the rates at its ends; `known` False where the gyro did not see the whole step."""
+    half = 0.5 * step_s
+    rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
+    tilt = vec.turn_back(rotation, tilt)
+    covariance = vec.turn_back_sym(rotation, covariance)
+    doubt = step_s * step_s * (imu.gyro_variance if known else GAP_RATE_RAD_S**2)
+    return tilt, vec.add(covariance, doubt, vec.cross_square(tilt, 1.0))
+
+
+@inlined
+def correct_by_accel(
+    tilt: Vec, covariance: Sym, force: Vec, accel: Vec, memory: float, imu: ImuCalibration
+) -> tuple[Vec, Sym]:
+    """(6), (8): the force less the acceleration that the model (4) expects after `accel`."""
+    expected = (memory * accel[0], memory * accel[1], memory * accel[2])
+    variance = (vec.dot(expected, expected) / 3.0 + imu.accel_variance) / GRAVITY**2
+    i = vec.inverse(vec.plus_diagonal(covariance, variance))
+    # Equal noise on all axes commutes with the covariance: the gain is symmetric, and P⁺ = (M/g²) K.
+    p = covariance
+    gain = (
+        p[0] * i[0] + p[1] * i[1] + p[2] * i[2],
+        p[0] * i[1] + p[1] * i[3] + p[2] * i[4],
+        p[0] * i[2] + p[1] * i[4] + p[2] * i[5],
+        p[1] * i[1] + p[3] * i[3] + p[4] * i[4],
+        p[1] * i[2] + p[3] * i[4] + p[4] * i[5],
+        p[2] * i[2] + p[4] * i[4] + p[5] * i[5],
+    )
+    innovation = (
+        (force[0] - expected[0]) / GRAVITY - tilt[0],
+        (force[1] - expected[1]) / GRAVITY - tilt[1],
+        (force[2] - expected[2]) / GRAVITY - tilt[2],
+    )
+    change = vec.apply(gain, innovation)
+    tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
+    return tilt, vec.scaled(variance, gain)
+
+
+@inlined
+def acceleration(force: Vec, tilt: Vec) -> Vec:
+    """a⁺ = s_A − g Z⁺"""
+    return (force[0] - GRAVITY * tilt[0], force[1] - GRAVITY * tilt[1], force[2] - GRAVITY * tilt[2])
+
+
+@inlined
+def step_between(now: float, last: float) -> tuple[bool, float]:
+    """Whether time has gone on, and by how much (s), at most LONGEST_GAP_S."""
+    step = now - last
+    return step > 0.0, min(step, LONGEST_GAP_S)
+
+
+@inlined
+def describe(tilt: Vec, covariance: Sym, j2s: Vec) -> tuple[float, float, float, float]:
+    """Height Zᵀd (15) and its standard deviation (m), roll and pitch (°)."""
+    return (
+        vec.dot(tilt, j2s),
+        math.sqrt(max(vec.quadratic(covariance, j2s), 0.0)),
+        math.degrees(math.atan2(tilt[1], tilt[2])),
+        math.degrees(math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))),
+    )
+
+
+@inlined
+def recall(state: TiltState) -> Now:
+    """The state in registers."""
+    return (
+        state.time[0],
+        vec.load(state.rate),
+        vec.load(state.tilt),
+        vec.load_sym(state.covariance),
+        vec.load(state.accel),
+    )
+
+
+@inlined
+def keep(state: TiltState, now: Now) -> None:
+    """The registers back into the state."""
+    state.time[0] = now[0]
+    for j in range(3):
+        state.rate[j] = now[1][j]
+        state.tilt[j] = now[2][j]
+        state.accel[j] = now[4][j]
+    for j in range(6):
+        state.covariance[j] = now[3][j]
+
+
+@inlined
+def advance(
+    time_s: float, raw_accel: Vec, raw_gyro: Vec, flags: int, imu: ImuCalibration, memory: float, now: Now
+) -> tuple[Now, bool, Vec, bool]:
+    """One sample of Method B: the new state, whether the force could be used, the force, whether the rate could."""
+    last, before, tilt, covariance, modelled = now
+    has_force, force = read_accel(raw_accel, flags, imu)
+    has_rate, rate = read_gyro(raw_gyro, flags, imu)
+    if math.isnan(last):
+        if not (has_force and has_rate):
+            return now, False, force, False
+        tilt, covariance = start(force, rate, imu)
+        return (time_s, rate, tilt, covariance, acceleration(force, tilt)), True, force, True
+    goes_on, step_s = step_between(time_s, last)
+    if not goes_on:
+        return now, False, force, False
+    if not has_rate:
+        rate = before
+    tilt, covariance = predict(tilt, covariance, rate, before, step_s, has_rate and step_s <= LONGEST_STEP_S, imu)
+    if has_force:
+        tilt, covariance = correct_by_accel(tilt, covariance, force, modelled, memory, imu)
+        modelled = acceleration(force, tilt)
+    return (time_s, rate, tilt, covariance, modelled), has_force, force, has_rate
+
+
+@compiled
+def _process(
+    time_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint16],
+    imu: ImuCalibration,
+    parameters: TiltParameters,
+    j2s: Vec,
+    state: TiltState,
+    out: Floats,
+) -> None:
+    now = recall(state)
+    rejected = 0
+    for i in range(len(time_s)):
+        a = (accel[i, 0], accel[i, 1], accel[i, 2])
+        w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
+        now, has_force, _, has_rate = advance(time_s[i], a, w, flags[i], imu, parameters.accel_memory, now)
+        rejected += not (has_force and has_rate)
+        if math.isnan(now[0]):
+            out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
+        else:
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now[2], now[3], j2s)
+    state.rejected[0] += rejected
+    keep(state, now)
