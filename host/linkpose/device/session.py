@@ -84,7 +84,7 @@ class Session:
         self._capture = capture
         self._link = Link(port, capture)
         self._clock = DeviceClock()
-        self._timeline: Timeline | None = None
+        self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
@@ -224,7 +224,7 @@ class Session:
         A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
         was reset or unplugged is waited for, and goes on in the same timeline with the gap marked.
         """
-        timeline = self._timeline = Timeline(self.hello.sample_rate_hz)
+        timeline = self.timeline = Timeline(self.hello.sample_rate_hz)
         end_s = None if duration_s is None else duration_s - 0.5 / self.hello.sample_rate_hz
         self._begin()
         while True:
@@ -321,7 +321,7 @@ class Session:
 
     def health(self) -> Health:
         """Counts so far."""
-        timeline = self._timeline or Timeline(self.hello.sample_rate_hz)
+        timeline = self.timeline
         now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
         duration = timeline.duration_s
         return Health(

@@ -33,7 +33,7 @@ class Settings:
     dlpf: int
     baro_oversampling: int
     bmp180: bmp180.Calibration
-    mouse_ports: int  # columns of a recording; 0 where no mouse was found
+    mouse_ports: int  # up to the last at which a mouse was found
 
     @staticmethod
     def of(hello: Hello) -> Settings:
@@ -67,8 +67,10 @@ class Row(NamedTuple):
 class Converter:
     """Reads samples of one board with one set of settings; remembers the last pressure."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, mouse_ports: int | None = None) -> None:
+        """`mouse_ports` gives the rows more room than for the mice that were found."""
         self.settings = settings
+        self._mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
         self._accel = mpu6050.accel_scale(settings.accel_range_g)
         self._gyro = mpu6050.gyro_scale(settings.gyro_range_deg_s)
         self._has_baro = bmp180.is_sound(settings.bmp180)
@@ -90,7 +92,7 @@ class Converter:
                 round(mpu6050.temperature(sample.imu_temp), mpu6050.TEMPERATURE_DECIMALS),
             )
         fresh = self._read_baro(sample, flags)
-        mice = self._mice(sample, flags) if self.settings.mouse_ports else ()
+        mice = self._mice(sample, flags) if self._mouse_ports else ()
         return Row(round(time_s, TIME_DECIMALS), seq, imu, *self._baro, fresh, mice, flags)
 
     def _read_baro(self, sample: Sample, flags: int) -> int:
@@ -113,7 +115,7 @@ class Converter:
 
     def _mice(self, sample: Sample, flags: int) -> tuple[float, ...]:
         values: list[float] = []
-        for port in range(self.settings.mouse_ports):
+        for port in range(self._mouse_ports):
             if port < len(sample.mice) and flags & MOUSE_VALID[port]:
                 values += sample.mice[port]
             else:

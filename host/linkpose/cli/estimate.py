@@ -1,0 +1,213 @@
+"""linkpose estimate"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from linkpose.cli import options
+from linkpose.errors import LinkposeError
+from linkpose.sensors.rig import Vector
+
+if TYPE_CHECKING:
+    from linkpose.cli.live import Console
+    from linkpose.device.session import Placement
+    from linkpose.estimation import EstimateWriter, Estimator
+
+COMPILER_PATIENCE_S = 0.7  # before the user is told what is going on
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the user asked for, live or not."""
+
+    output: Path | None
+    filter_names: tuple[str, ...]
+    rig_file: Path | None
+    j2s: Vector | None
+    json_lines: bool
+    force: bool
+
+
+@click.command(name="estimate")
+@click.argument("recording", type=options.FILE, required=False)
+@click.option("--live", "is_live", is_flag=True, help="From the board, as it measures.")
+@options.port
+@options.duration
+@click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimates here.")
+@click.option("--record", type=options.FILE, metavar="REC.csv", help="Keep the live measurements as a recording.")
+@click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
+@click.option("--filter", "filter_names", multiple=True, metavar="NAME", help="Run this filter; may be repeated.")
+@options.rig_and_j2s
+@options.force
+@options.as_json
+@options.verbosity
+def command(
+    recording: Path | None,
+    is_live: bool,
+    port: str | None,
+    duration: float | None,
+    output: Path | None,
+    record: Path | None,
+    raw: Path | None,
+    filter_names: tuple[str, ...],
+    rig_file: Path | None,
+    j2s: Vector | None,
+    force: bool,
+    json_lines: bool,
+    verbose: bool,
+    quiet: bool,
+) -> None:
+    """Run the filters, live from the board or over RECORDING (a .csv or a raw .bin).
+
+    Without --filter, all that the sensors and the rig allow run side by side. Without -o the estimates go to stdout
+    (live on a terminal they are shown there).
+    """
+    from linkpose.cli.live import Console, refuse_same_file
+
+    if is_live == (recording is not None):
+        raise click.UsageError("name a RECORDING, or add --live to estimate from the board")
+    if recording is not None and (port or duration or record or raw):
+        raise click.UsageError("--port, --duration, --record and --raw go with --live")
+    refuse_same_file(recording, output, record, raw)
+    request = Request(output, filter_names, rig_file, j2s, json_lines, force)
+    console = Console(quiet, verbose)
+    if recording is not None:
+        _replay(recording, request, console)
+    else:
+        _live(port, duration, record, raw, request, console)
+
+
+def _replay(path: Path, request: Request, console: Console) -> None:
+    """Estimates over a recording, as fast as it goes."""
+    from linkpose.estimation import Estimator, sensors_of
+    from linkpose.recording.reader import load_recording
+
+    recording = load_recording(path)
+    for remark in recording.remarks:
+        console.say(remark)
+    rig = options.resolve_rig(request.rig_file, request.j2s, recording.rig)
+    with _patience(console):
+        estimator = Estimator(request.filter_names, rig, sensors_of(recording.measurements))
+        _tell_left_out(estimator, console)
+        estimates = estimator.process(recording.measurements)
+    head = {"recording": str(path), "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
+    with _sink(estimator, request, head) as sink:
+        sink.write(estimates)
+        sink.close({"rows": len(estimates), **_rejected(estimator)})
+    if request.output:
+        console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
+
+
+def _live(
+    port: str | None, duration: float | None, record: Path | None, raw: Path | None, request: Request, console: Console
+) -> None:
+    """Estimates as the board measures."""
+    with _patience(console):  # compile before the board is started: no sample waits for a compiler
+        from linkpose.estimation import Estimator, warm_up
+
+        warm_up(request.filter_names)
+    from linkpose.cli import live
+    from linkpose.cli.view import View
+    from linkpose.device.ports import choose_port
+    from linkpose.device.session import Session
+    from linkpose.sensors.measurements import Measurements
+    from linkpose.wire.messages import Sensors
+
+    with contextlib.ExitStack() as stack:
+        capture = stack.enter_context(live.raw_capture(raw, request.force))
+        session = stack.enter_context(Session(port or choose_port(), console.say, capture))
+        rig = options.resolve_rig(request.rig_file, request.j2s, session.rig)
+        estimator = Estimator(request.filter_names, rig, Sensors(session.hello.sensors))
+        _tell_left_out(estimator, console)
+        recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
+        head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
+        sink = stack.enter_context(_sink(estimator, request, head))
+        view = stack.enter_context(View(estimator.columns, console.shows_progress))
+
+        def handle(placements: list[Placement]) -> None:
+            rows = recorder.take(placements)
+            if rows:
+                estimates = estimator.process(Measurements.of(rows))
+                sink.write(estimates)
+                view.show(estimates[-1], session.health)
+
+        ended = live.run(session, duration, handle)
+        view.close()
+        recorder.close(ended)
+        health = session.health()
+        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_rejected(estimator)})
+        live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+
+
+def _tell_left_out(estimator: Estimator, console: Console) -> None:
+    for name, reason in estimator.left_out.items():
+        console.say(f"without {name}: {reason}")
+
+
+def _rejected(estimator: Estimator) -> dict[str, Any]:
+    return {"rejected": {f.name: f.rejected for f in estimator.filters}}
+
+
+@contextlib.contextmanager
+def _patience(console: Console) -> Iterator[None]:
+    """Says that the filters are being compiled when that takes long enough to be wondered at: the first time."""
+    timer = threading.Timer(COMPILER_PATIENCE_S, console.say, ["compiling the filters, this once (some seconds) ..."])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+class _Sink:
+    """Where estimates go: a file, stdout as CSV, or stdout as JSON; file and JSON go together."""
+
+    def __init__(self, estimator: Estimator, request: Request, head: dict[str, Any]) -> None:
+        from linkpose.estimation import EstimateWriter
+        from linkpose.recording.csvfile import head as csv_head
+
+        self._estimator = estimator
+        self._json = request.json_lines
+        self._file: EstimateWriter | None = None
+        if request.output is not None:
+            self._file = EstimateWriter(request.output, head, estimator.columns, request.force)
+        self._prints = self._file is None and not self._json and not sys.stdout.isatty()
+        if self._prints:
+            sys.stdout.write(csv_head("estimate", head, estimator.columns))
+
+    def write(self, estimates: Any) -> None:
+        if self._file is not None:
+            self._file.write(self._estimator.text(estimates))
+        if self._prints:
+            sys.stdout.write(self._estimator.text(estimates))
+            sys.stdout.flush()
+        if self._json:
+            click.echo("\n".join(json.dumps(row) for row in self._estimator.objects(estimates)))
+
+    def close(self, closing: dict[str, Any]) -> None:
+        if self._file is not None:
+            self._file.close(closing)
+
+    def __enter__(self) -> _Sink:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.__exit__()
+
+
+def _sink(estimator: Estimator, request: Request, head: dict[str, Any]) -> _Sink:
+    try:
+        return _Sink(estimator, request, head)
+    except OSError as error:
+        raise LinkposeError(f"cannot write the estimates: {error.strerror}") from error

@@ -1,0 +1,86 @@
+"""Options that several commands share, and how they are read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from linkpose.sensors.rig import Rig, Vector
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+class VectorType(click.ParamType[Vector]):
+    """Three numbers, X,Y,Z."""
+
+    name = "X,Y,Z"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Vector:
+        words = str(value).split(",")
+        try:
+            x, y, z = (float(word) for word in words)
+        except ValueError:
+            self.fail(f"{value!r} is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)", param, ctx)
+        if not all(map(math.isfinite, (x, y, z))):
+            self.fail(f"{value!r} is not finite", param, ctx)
+        return x, y, z
+
+
+class SecondsType(click.ParamType[float]):
+    """A time of more than 0 s."""
+
+    name = "S"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        try:
+            seconds = float(value)
+        except ValueError:
+            seconds = math.nan
+        if not 0 < seconds < math.inf:
+            self.fail(f"{value!r} is not a number of seconds above 0", param, ctx)
+        return seconds
+
+
+FILE = click.Path(path_type=Path)
+
+
+def port(function: Function) -> Function:
+    return click.option(
+        "--port", metavar="PORT", help="Device, pyserial URL or sim://link. Default: the only UNO connected."
+    )(function)
+
+
+def duration(function: Function) -> Function:
+    return click.option("--duration", type=SecondsType(), help="Stop after so many seconds. Default: Ctrl-C ends.")(
+        function
+    )
+
+
+def rig_and_j2s(function: Function) -> Function:
+    function = click.option(
+        "--j2s", type=VectorType(), help="Vector from the joint centre to the sensor, in its axes (m)."
+    )(function)
+    return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
+
+
+def as_json(function: Function) -> Function:
+    return click.option("--json", "json_lines", is_flag=True, help="One JSON object a line on stdout.")(function)
+
+
+def force(function: Function) -> Function:
+    return click.option("--force", is_flag=True, help="Replace an existing file.")(function)
+
+
+def verbosity(function: Function) -> Function:
+    function = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")(function)
+    return click.option("-v", "--verbose", is_flag=True, help="Say more.")(function)
+
+
+def resolve_rig(rig_file: Path | None, j2s: Vector | None, brought: Rig | None) -> Rig:
+    """The rig file where one is named, or else the one that came along; `--j2s` goes before either's."""
+    rig = Rig.load(rig_file) if rig_file else brought or Rig()
+    return rig.with_j2s(j2s) if j2s else rig

@@ -1,0 +1,86 @@
+"""Measurements in, estimates out: the filters side by side, live and over a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from linkpose import filters
+from linkpose.errors import LinkposeError
+from linkpose.recording.csvfile import CsvFile
+from linkpose.recording.fixedpoint import format_rows
+from linkpose.sensors.conversion import TIME_DECIMALS
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Rig
+from linkpose.wire.messages import Sensors
+
+_DECIMALS = 6  # a micrometre, a microdegree
+
+
+def sensors_of(measurements: Measurements) -> Sensors:
+    """Those that ever gave a value in these measurements."""
+    imu = Sensors.MPU6050 if np.isfinite(measurements.gyro_rad_s).any() else Sensors(0)
+    return imu | (Sensors.BMP180 if measurements.baro_fresh.any() else Sensors(0))
+
+
+def warm_up(names: Sequence[str]) -> None:
+    """Compiles all that an estimate needs, or loads it compiled: `names` as for `Estimator`."""
+    filters.warm_up(names or filters.NAMES)
+    format_rows(np.zeros((1, 1)), np.zeros(1, np.int64))
+
+
+class Estimator:
+    """Runs filters over consecutive blocks of measurements."""
+
+    def __init__(self, names: Sequence[str], rig: Rig, sensors: Sensors) -> None:
+        """The filters of these names, or all that can run when there is none.
+
+        Raises LinkposeError when a named one cannot run, or none at all; `left_out` tells why others do not.
+        """
+        self.left_out: dict[str, str] = {}
+        self.filters: list[filters.Filter] = []
+        for name in dict.fromkeys(names or filters.NAMES):
+            try:
+                self.filters.append(filters.create(name, rig, sensors))
+            except filters.CannotRun as reason:
+                if names:
+                    raise LinkposeError(f"the filter {name} cannot run: {reason}") from None
+                self.left_out[name] = str(reason)
+        if not self.filters:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
+            raise LinkposeError(f"no filter can run on this ({reasons})")
+        self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
+        self._decimals = np.array([TIME_DECIMALS, *(_decimals(name) for name in self.columns[1:])], dtype=np.int64)
+
+    def process(self, block: Measurements) -> Floats:
+        """The estimates (N, columns) at the next N samples."""
+        return np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+
+    def text(self, estimates: Floats) -> str:
+        """Estimates as lines of CSV."""
+        return format_rows(estimates, self._decimals)
+
+    def objects(self, estimates: Floats) -> list[dict[str, float | None]]:
+        """Estimates as objects with the CSV's keys and digits; a missing value is None."""
+        places = self._decimals.tolist()
+        return [
+            {
+                name: round(value, digits) if value == value else None
+                for name, value, digits in zip(self.columns, row, places, strict=True)
+            }
+            for row in estimates.tolist()
+        ]
+
+
+def _decimals(column: str) -> int:
+    return 0 if column.endswith("_excluded") else _DECIMALS
+
+
+class EstimateWriter(CsvFile):
+    """An estimate CSV under way. Raises LinkposeError as `CsvFile` does."""
+
+    def __init__(self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool) -> None:
+        super().__init__(path, "estimate", head, columns, force)
