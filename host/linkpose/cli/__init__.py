@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
+from typing import Any
 
 import click
 
 from linkpose import __version__
 from linkpose.errors import LinkposeError
 
-# Command -> what it does. The module `linkpose.cli.<command>` holds its click command under the name `command`.
+# Command -> what it does.
 COMMANDS = {
     "ports": "List the serial ports and say which is the board.",
     "info": "Show the board's versions, sensors, settings and link health.",
@@ -18,28 +20,39 @@ COMMANDS = {
     "estimate": "Run the filters, live or over a recording.",
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
+    "localize": "Find where a robot was, in a map or among beacons.",
 }
 
 
 class LazyGroup(click.Group):
     """A group that knows its commands by name and imports a command only to run it or to show its help."""
 
+    def __init__(self, *args: Any, table: Mapping[str, str], modules: str, **more: Any) -> None:
+        """`table` is command -> what it does; `modules` begins the name of the module that holds it, as `command`."""
+        super().__init__(*args, **more)
+        self._table, self._modules = table, modules
+
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return list(self._table)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
+        if cmd_name not in self._table:
             return None
-        command = importlib.import_module(f"linkpose.cli.{cmd_name}").command
+        command = importlib.import_module(self._modules + cmd_name).command
         assert isinstance(command, click.Command)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl(list(self._table.items()))
 
 
-@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120})
+@click.group(
+    cls=LazyGroup,
+    table=COMMANDS,
+    modules="linkpose.cli.",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
+)
 @click.version_option(__version__, prog_name="linkpose")
 def group() -> None:
     """Measure how a joint-connected link or a small robot moves, with an Arduino UNO for a motion-capture room."""

@@ -105,7 +105,7 @@ class SimulatedBoard:
     def _answer(self, message: Message | OtherProtocol, now_us: int) -> list[Message]:
         match message:
             case GetInfo():
-                return [self._hello()]
+                return [hello(self._settings, self._samples is not None)]
             case Ping(token):
                 return [Pong(token, now_us & 0xFFFFFFFF)]
             case Start():
@@ -137,29 +137,6 @@ class SimulatedBoard:
         self._run = self._make_run(settings)
         return Ack(Command.CONFIGURE)
 
-    def _hello(self) -> Hello:
-        major, minor, patch = map(int, VERSION.split("."))
-        settings = self._settings
-        return Hello(
-            protocol_major=PROTOCOL_MAJOR,
-            protocol_minor=PROTOCOL_MINOR,
-            schema_crc=SCHEMA_CRC,
-            firmware_major=major,
-            firmware_minor=minor,
-            firmware_patch=patch,
-            source_revision=0,
-            reset_cause=int(ResetCause.POWER_ON),
-            streaming=int(self._samples is not None),
-            sample_rate_hz=settings.sample_rate_hz,
-            sensors=int(Sensors.MPU6050 | Sensors.BMP180),
-            imu_id=0x68,
-            accel_range_g=settings.accel_range_g,
-            gyro_range_deg_s=settings.gyro_range_deg_s,
-            dlpf=settings.dlpf,
-            baro_oversampling=settings.baro_oversampling,
-            **DATASHEET_WORDS._asdict(),
-        )
-
     def _status(self, now_us: int) -> Status:
         """A board whose every counter is 0: a simulated one has no bus, no stack and no load."""
         zero = dict.fromkeys(Status._fields, 0)
@@ -176,3 +153,27 @@ class SimulatedBoard:
         plain = (0, 0, 4096, 0, 0, 0)
         excited = (accel, accel, 4096 + accel, gyro, -gyro, gyro)
         return [Ack(Command.SELF_TEST), SelfTestResult(*trims, *plain, *excited, baro_id=0x55)]
+
+
+def hello(settings: Configure, streaming: bool = False) -> Hello:
+    """What a simulated board with these settings says of itself."""
+    major, minor, patch = map(int, VERSION.split("."))
+    return Hello(
+        protocol_major=PROTOCOL_MAJOR,
+        protocol_minor=PROTOCOL_MINOR,
+        schema_crc=SCHEMA_CRC,
+        firmware_major=major,
+        firmware_minor=minor,
+        firmware_patch=patch,
+        source_revision=0,
+        reset_cause=int(ResetCause.POWER_ON),
+        streaming=int(streaming),
+        sample_rate_hz=settings.sample_rate_hz,
+        sensors=int(Sensors.MPU6050 | Sensors.BMP180),
+        imu_id=0x68,
+        accel_range_g=settings.accel_range_g,
+        gyro_range_deg_s=settings.gyro_range_deg_s,
+        dlpf=settings.dlpf,
+        baro_oversampling=settings.baro_oversampling,
+        **DATASHEET_WORDS._asdict(),
+    )

@@ -1,0 +1,19 @@
+"""`linkpose simulate`: recordings of simulated rigs, with their truth. Each rig is a module `simulate_<rig>`."""
+
+from __future__ import annotations
+
+import click
+
+from linkpose.cli import LazyGroup
+
+# Rig -> what it is.
+RIGS = {
+    "link": "A link on a ball joint, moved by hand: Tests 1 to 3 of the link paper.",
+    "indoor": "A robot with a laser scanner in an office floor.",
+    "underwater": "A vehicle with Doppler log, attitude sensor, depth and ranges to four beacons.",
+}
+
+
+@click.group("simulate", cls=LazyGroup, table=RIGS, modules="linkpose.cli.simulate_")
+def command() -> None:
+    """Make a recording and its truth from a simulated rig. The same seed gives the same recording."""
