@@ -1,0 +1,125 @@
+"""Signals over time with gaps: reading one at another's instants, and finding the offset between two clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors.measurements import Floats
+
+# A reference is interpolated over at most so many of its usual intervals; a longer hole is a gap.
+_LONGEST_HOLE = 3.5
+# An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
+_CLEARLY_BETTER = 0.7
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A signal; NaN where there is none."""
+
+    time_s: Floats  # (N,) not decreasing
+    value: Floats  # (N,) angles in radians
+    is_angle: bool = False
+
+    def at(self, time_s: Floats) -> Floats:
+        """Linear interpolation, NaN outside, next to a NaN, and within a gap."""
+        good = np.isfinite(self.value)
+        if good.sum() < 2:
+            return np.full(len(time_s), np.nan)
+        t, value = self.time_s[good], self.value[good]
+        if self.is_angle:
+            value = np.unwrap(value)
+        found = np.interp(time_s, t, value, left=np.nan, right=np.nan)
+        after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
+        hole = t[after] - t[after - 1] > _LONGEST_HOLE * interval(self.time_s)
+        return np.where(hole, np.nan, found)
+
+
+def interval(time_s: Floats) -> float:
+    """The usual step between two stamps (s)."""
+    steps = np.diff(time_s)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def difference(estimate: Series, reference: Series, offset_s: float) -> Floats:
+    """estimate − reference at the estimate's instants, reference clock = estimate clock + `offset_s`; angles in ±π."""
+    error = estimate.value - reference.at(estimate.time_s + offset_s)
+    if estimate.is_angle:
+        error = (error + np.pi) % (2 * np.pi) - np.pi
+    return error
+
+
+def find_offset(pairs: Sequence[tuple[Series, Series]]) -> tuple[float, float]:
+    """Offset (s) to add to the estimate's clock to have the reference's, and the residual that it leaves.
+
+    `pairs` are (estimate, reference) of one filter. 0 unless another offset fits clearly better. The residual is the
+    RMS of the differences less their means, each over the reference's standard deviation; inf without an overlap.
+    """
+    here = _residual(pairs, 0.0)
+    step = max(interval(pairs[0][0].time_s), interval(pairs[0][1].time_s))
+    if step == 0.0:
+        return 0.0, here
+    coarse = _strongest_lag(pairs, step)
+    offset = _refine(pairs, coarse - 2 * step, coarse + 2 * step)
+    there = _residual(pairs, offset)
+    if abs(offset) > 0.5 * step and there < _CLEARLY_BETTER * here:
+        return offset, there
+    return 0.0, here
+
+
+def _residual(pairs: Sequence[tuple[Series, Series]], offset_s: float) -> float:
+    squares: list[float] = []
+    for estimate, reference in pairs:
+        error = difference(estimate, reference, offset_s)
+        error = error[np.isfinite(error)]
+        spread = np.nanstd(reference.value)
+        if len(error) < 10 or not spread > 0:
+            continue
+        squares.append(float(np.var(error) / spread**2))
+    return float(np.sqrt(np.mean(squares))) if squares else float("inf")
+
+
+def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> float:
+    """The lag (s) with the largest sum of cross-correlations on a common grid."""
+    estimate_from, estimate_to = pairs[0][0].time_s[[0, -1]]
+    reference_from, reference_to = pairs[0][1].time_s[[0, -1]]
+    grid = np.arange(0.0, max(estimate_to - estimate_from, reference_to - reference_from), step)
+    size = 1 << (2 * len(grid)).bit_length()
+    spectrum: NDArray[np.complex128] = np.zeros(size // 2 + 1, np.complex128)
+    for estimate, reference in pairs:
+        ours = _standard(estimate.at(estimate_from + grid))
+        theirs = _standard(reference.at(reference_from + grid))
+        spectrum += np.fft.rfft(theirs, size) * np.conj(np.fft.rfft(ours, size))
+    lag = int(np.argmax(np.fft.irfft(spectrum, size)))
+    lag = lag - size if lag > size // 2 else lag
+    return float(reference_from - estimate_from + lag * step)
+
+
+def _standard(value: Floats) -> Floats:
+    """Zero mean, unit variance, 0 in gaps."""
+    good = np.isfinite(value)
+    if not good.any() or not np.std(value[good]) > 0:
+        return np.zeros(len(value))
+    return np.where(good, (value - np.mean(value[good])) / np.std(value[good]), 0.0)
+
+
+def _refine(pairs: Sequence[tuple[Series, Series]], low: float, high: float) -> float:
+    """The offset with the least residual within the bracket, by golden section to 10 µs."""
+    a, b = low, high
+    c, d = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
+    at_c, at_d = _residual(pairs, c), _residual(pairs, d)
+    while b - a > 1e-5:
+        if at_c < at_d:
+            b, d, at_d = d, c, at_c
+            c = b - _GOLDEN * (b - a)
+            at_c = _residual(pairs, c)
+        else:
+            a, c, at_c = c, d, at_d
+            d = a + _GOLDEN * (b - a)
+            at_d = _residual(pairs, d)
+    return 0.5 * (a + b)
