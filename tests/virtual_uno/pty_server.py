@@ -54,6 +54,7 @@ class PtyServer:
         self.uno, self.link = uno, link
         self.statistics = PtyStatistics()
         self.to_host = self.to_board = Faults()
+        self.waits_for_host = not paced  # rather than losing what the host does not read in time
         self._paced, self._reset_on_open = paced, reset_on_open
         self._on_slice, self._on_open = on_slice, on_open
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
@@ -70,9 +71,9 @@ class PtyServer:
     def pull_cable(self) -> None:
         """The port vanishes under whoever has it open. The board goes on (it has its own supply)."""
         if self._master is not None:
+            self.link.unlink(missing_ok=True)
             os.close(self._master)
             self._master = None
-            self.link.unlink(missing_ok=True)
 
     def put_cable_back(self) -> None:
         """The port is there again, at the same link."""
@@ -103,6 +104,11 @@ class PtyServer:
         if self._failure is not None:
             raise self._failure
         return self.statistics
+
+    @property
+    def host_present(self) -> bool:
+        """Whether a host has the port open."""
+        return self._opened
 
     def __enter__(self) -> PtyServer:
         return self.start()
@@ -205,13 +211,13 @@ class PtyServer:
         self.uno.send(sent)
 
     def _write(self, data: bytes) -> None:
-        """To the host; a paced board cannot wait for a host that does not read, and what has no room is lost."""
+        """To the host; a board in real time cannot wait for a host that does not read, and what has no room is lost."""
         assert self._master is not None
         while data:
             try:
                 count = os.write(self._master, data)
             except BlockingIOError:
-                if self._paced or self._stop.is_set():
+                if not self.waits_for_host or self._stop.is_set():
                     self.statistics.bytes_dropped += len(data)
                     return
                 select.select([], [self._master], [], 0.1)

@@ -156,6 +156,10 @@ class VirtualUno:
         """The reset line, as DTR pulls it when a host opens the port."""
         self.request("reset")
 
+    def hang(self) -> None:
+        """The program gets stuck, with interrupts off."""
+        self.request("hang")
+
     # --- the serial line ---
 
     def send(self, data: bytes) -> None:

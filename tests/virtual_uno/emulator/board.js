@@ -15,6 +15,8 @@ const { Twi } = require("./twi");
 const { Usart } = require("./usart");
 const { Watchdog } = require("./watchdog");
 
+const OPCODE_CLI = 0x94f8;
+const OPCODE_JUMP_TO_ITSELF = 0xcfff;
 const START_UP_S = 0.065; // the UNO's fuses: 16K clocks and 65 ms after every reset
 
 class Board {
@@ -47,6 +49,15 @@ class Board {
 
   reset(cause) {
     this.cpu.restart(cause, this.startUpCycles);
+  }
+
+  /** The program stops for ever: in the loop with interrupts off that the C library puts behind main(). */
+  hang() {
+    const { progMem } = this.cpu;
+    const loop = progMem.findIndex((word, at) => word === OPCODE_CLI && progMem[at + 1] === OPCODE_JUMP_TO_ITSELF);
+    if (loop < 0) throw new Error("the program has no loop behind main()");
+    this.cpu.pc = loop;
+    this.cpu.asleep = false;
   }
 
   run(cycles) {

@@ -24,6 +24,10 @@ const OPERATIONS = {
     board.reset(RESET_CAUSE.external);
     return {};
   },
+  hang() {
+    board.hang();
+    return {};
+  },
   feed({ sensor, times, values, interpolated }) {
     board[sensor].signal = new Table(floats(times), floats(values), interpolated);
     return {};

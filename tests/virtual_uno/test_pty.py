@@ -1,0 +1,193 @@
+"""The emulated board behind a pseudo-terminal, as a host program meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import serial
+from pty_server import PtyServer
+from wire_link import WireLink
+
+from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.messages import BAUD, Ack, Configure, Hello, Message, Sample, Start
+
+MakeBoard = Callable[..., WireLink]
+LIMIT_S = 20.0  # of waiting for anything
+
+
+class Host:
+    """A host that has the port open."""
+
+    def __init__(self, link: Path, baud: int = BAUD) -> None:
+        self.port = serial.Serial(str(link), baud, timeout=0.02)
+        self.decoder = StreamDecoder()
+        self.messages: list[Message] = []
+
+    def read_until(self, enough: Callable[[], bool]) -> None:
+        end = time.monotonic() + LIMIT_S
+        while not enough():
+            assert time.monotonic() < end, f"came: {self.messages[-3:]}, {self.decoder.corrupt}"
+            self.messages += self.decoder.feed(self.port.read(self.port.in_waiting or 1))
+
+    def expect(self, kind: type) -> Message:
+        self.read_until(lambda: any(isinstance(message, kind) for message in self.messages))
+        index = next(i for i, message in enumerate(self.messages) if isinstance(message, kind))
+        message = self.messages[index]
+        del self.messages[: index + 1]
+        return message
+
+    def start(self) -> None:
+        self.expect(Hello)
+        self.port.write(encode(Start()))
+        self.expect(Ack)
+
+    @property
+    def samples(self) -> list[Sample]:
+        return [message for message in self.messages if isinstance(message, Sample)]
+
+
+def whole(samples: list[Sample]) -> bool:
+    return all(after.seq - before.seq == 1 for before, after in pairwise(samples))
+
+
+def test_a_host_opens_the_port_and_reads_the_stream(board: MakeBoard, tmp_path: Path) -> None:
+    """Flat out: a minute of the board's time in a few seconds, complete."""
+    with PtyServer(board().uno, tmp_path / "port", paced=False):
+        host = Host(tmp_path / "port")
+        host.start()
+        host.read_until(lambda: len(host.samples) >= 6000)
+        assert whole(host.samples)
+        assert host.decoder.corrupt.total == 0
+        host.port.close()
+
+
+def test_paced_bytes_never_come_before_their_time(board: MakeBoard, tmp_path: Path) -> None:
+    with PtyServer(board().uno, tmp_path / "port") as server:
+        host = Host(tmp_path / "port")
+        host.start()
+        host.read_until(lambda: len(host.samples) >= 1)
+        first, begin = host.samples[0], time.monotonic()
+        host.read_until(lambda: len(host.samples) >= 100)
+        wall_s, board_s = time.monotonic() - begin, (host.samples[-1].t_us - first.t_us) / 1e6
+        host.port.close()
+    statistics = server.stop()
+    assert wall_s > board_s - 0.05  # the first byte itself may have come late
+    assert whole(host.samples)
+    assert statistics.bytes_dropped == 0
+
+
+def test_opening_the_port_resets_the_board(board: MakeBoard, tmp_path: Path) -> None:
+    with PtyServer(board().uno, tmp_path / "port", paced=False) as server:
+        for _ in range(3):
+            host = Host(tmp_path / "port")
+            host.start()
+            host.read_until(lambda host=host: len(host.samples) >= 10)
+            assert host.samples[0].seq == 0
+            host.port.close()
+            end = time.monotonic() + LIMIT_S
+            while server.host_present and time.monotonic() < end:
+                time.sleep(0.001)
+    assert server.stop().opens == 3
+
+
+def test_a_pulled_cable_takes_the_port_away_and_gives_it_back(board: MakeBoard, tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    with PtyServer(board().uno, link, paced=False, reset_on_open=False) as server:
+        host = Host(link)
+        host.start()
+        host.read_until(lambda: len(host.samples) >= 10)
+        server.call(server.pull_cable)
+        with pytest.raises(serial.SerialException):
+            host.read_until(lambda: False)
+        host.port.close()
+        assert not link.is_symlink()
+        server.call(server.put_cable_back)
+        end = time.monotonic() + LIMIT_S
+        while not link.exists() and time.monotonic() < end:
+            time.sleep(0.001)
+        again = Host(link)
+        again.read_until(lambda: len(again.samples) >= 10)
+        assert again.samples[0].seq > host.samples[-1].seq  # it went on with its own supply
+        assert whole(again.samples)
+        again.port.close()
+
+
+def test_a_host_at_another_rate_reads_garbage(board: MakeBoard, tmp_path: Path) -> None:
+    with PtyServer(board().uno, tmp_path / "port", paced=False):
+        host = Host(tmp_path / "port", baud=115200)
+        host.port.timeout = LIMIT_S
+        garbage = host.port.read(10)
+        assert len(garbage) == 10
+        assert host.decoder.feed(garbage + b"\0") == []
+        assert host.decoder.corrupt.total > 0
+        host.port.close()
+
+
+def test_a_host_that_stalls_is_in_step_again(board: MakeBoard, tmp_path: Path) -> None:
+    """Ten seconds at 500 Hz without reading: more than the system keeps. What it kept and what comes later is sound."""
+    with PtyServer(board().uno, tmp_path / "port", paced=False) as server:
+        host = Host(tmp_path / "port")
+        host.expect(Hello)
+        host.port.write(encode(Configure(500, 8, 1000, 3, 1, 8)))
+        host.expect(Ack)
+        host.port.write(encode(Start()))
+        host.expect(Ack)
+        server.waits_for_host = False
+        begin = server.statistics.board_s
+        end = time.monotonic() + LIMIT_S
+        while server.statistics.board_s < begin + 10 and time.monotonic() < end:
+            time.sleep(0.01)
+        server.waits_for_host = True
+        kept = 0
+
+        def resumed() -> bool:
+            nonlocal kept
+            gaps = [i for i, (before, after) in enumerate(pairwise(host.samples)) if after.seq != before.seq + 1]
+            kept = gaps[-1] + 1 if gaps else 0
+            return kept > 0 and len(host.samples) > kept + 100
+
+        host.read_until(resumed)
+        host.port.close()
+    assert server.stop().bytes_dropped > 0
+    assert host.decoder.corrupt.total <= kept // 100 + 2
+    assert whole(host.samples[kept:])
+
+
+def test_the_command_serves_and_reports(firmware_hex: Path, tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    command = [sys.executable, Path(__file__).with_name("serve.py"), "--hex", firmware_hex, "--link", link]
+    options = ["--flat-out", "--duration", "20", "--test", "2", "--fault", "5:imu-unplug", "--fault", "6:imu-plug"]
+    with subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdout
+        assert json.loads(served.stdout.readline())["event"] == "ready"
+        host = Host(link)
+        host.start()
+        with pytest.raises(serial.SerialException):  # the port goes with the command
+            host.read_until(lambda: False)
+        report = json.loads(served.stdout.readline())
+    assert served.returncode == 0
+    assert report["event"] == "end"
+    assert report["board_s"] == pytest.approx(20, abs=0.1)
+    assert whole(host.samples)
+    invalid = sum(not sample.flags & 1 for sample in host.samples)
+    assert 100 <= invalid <= 110
+    assert len({sample.accel_x for sample in host.samples}) > 500  # the link moves
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"), [(["--hex", "no.hex"], "no.hex"), (["--fault", "0:fire"], "there is no fault 'fire'")]
+)
+def test_the_command_says_what_is_wrong(firmware_hex: Path, tmp_path: Path, arguments: list[str], says: str) -> None:
+    script = Path(__file__).with_name("serve.py")
+    command = [sys.executable, script, "--hex", firmware_hex, "--link", tmp_path / "port", "--duration", "1"]
+    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert "Traceback" not in done.stderr
