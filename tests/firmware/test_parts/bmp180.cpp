@@ -1,0 +1,158 @@
+#include <Bmp180.h>
+#include <doctest/doctest.h>
+
+#include "support.h"
+
+namespace {
+
+// The registers of a BMP180 with the datasheet's calibration and readings, and the time its conversions take.
+class FakeSensor {
+ public:
+  bool answers = true;
+  uint8_t control = 0;
+  uint16_t ut = 27898;
+  uint32_t up = 23843;
+  Bytes calibration = {0x01, 0x98, 0xFF, 0xB8, 0xC7, 0xD1, 0x7F, 0xE5, 0x7F, 0xF5, 0x5A,
+                       0x71, 0x18, 0x2E, 0x00, 0x04, 0x80, 0x00, 0xDD, 0xF9, 0x0B, 0x34};
+  int temperatures = 0, pressures = 0;
+  uint32_t ready_us = 0;
+  bool read_early = false;
+
+  // Carries the request out; false when nobody answers.
+  bool carry_out(const I2cRequest& request, uint32_t now_us, uint8_t* data) {
+    if (!answers || request.address != 0x77) return false;
+    if (request.write_count == 2) {
+      if (request.write[0] != 0xF4) FAIL("unexpected register");
+      control = request.write[1];
+      const bool temperature = control == 0x2E;
+      (temperature ? temperatures : pressures)++;
+      ready_us = now_us + (temperature ? 4500 : Bmp180::pressure_time_us(control >> 6));
+      return true;
+    }
+    switch (request.write[0]) {
+      case 0xD0: data[0] = 0x55; break;
+      case 0xAA: std::copy(calibration.begin(), calibration.end(), data); break;
+      case 0xF4: result(now_us, data); break;
+      default: FAIL("unexpected register");
+    }
+    return true;
+  }
+
+ private:
+  void result(uint32_t now_us, uint8_t* data) {
+    read_early = read_early || now_us < ready_us;
+    const uint32_t raw = control == 0x2E ? static_cast<uint32_t>(ut) << 8 : up << (8 - (control >> 6));
+    const uint8_t bytes[] = {static_cast<uint8_t>(control & 0xDF), 0, static_cast<uint8_t>(raw >> 16),
+                             static_cast<uint8_t>(raw >> 8), static_cast<uint8_t>(raw)};
+    std::copy(bytes, bytes + 5, data);
+  }
+};
+
+// One tick: the driver gets the bus until it wants it no more.
+void tick(Bmp180& driver, FakeSensor& sensor, uint32_t now_us) {
+  uint8_t data[I2cRequest::kMaxRead];
+  I2cRequest request;
+  for (int i = 0; driver.next(now_us, request); i++) {
+    if (i >= 10) FAIL("never done");
+    const bool ok = sensor.carry_out(request, now_us, data);
+    driver.finish(ok, data, now_us);
+  }
+}
+
+}  // namespace
+
+TEST_CASE("BMP180: the datasheet's readings at 100 Hz, one temperature for nine pressures") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  for (uint32_t n = 0; n < 1001; n++) tick(driver, sensor, n * 10000);
+  CHECK(driver.valid());
+  CHECK(driver.temperature() == 27898);
+  CHECK(driver.pressure() == 23843);
+  CHECK(driver.calibration()[0] == 408);
+  CHECK(static_cast<int16_t>(driver.calibration()[10]) == 2868);
+  CHECK(sensor.temperatures == 101);
+  CHECK(sensor.pressures == 900);
+  CHECK(driver.count() == 900 % 256);
+  CHECK_FALSE(sensor.read_early);
+  CHECK(driver.restarts() == 0);
+}
+
+TEST_CASE("BMP180: valid two conversions after power-on") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  for (uint32_t n = 0; n < 2; n++) tick(driver, sensor, n * 10000);
+  CHECK_FALSE(driver.valid());
+  tick(driver, sensor, 20000);
+  CHECK(driver.valid());
+}
+
+TEST_CASE("BMP180: every oversampling is read no sooner than it is ready, at every rate") {
+  for (uint8_t oversampling = 0; oversampling < 4; oversampling++) {
+    for (uint32_t rate : {50, 100, 125, 200, 500}) {
+      Bmp180 driver(oversampling);
+      FakeSensor sensor;
+      for (uint32_t n = 0; n < 4 * rate; n++) tick(driver, sensor, n * (1000000 / rate));
+      CAPTURE(oversampling);
+      CAPTURE(rate);
+      CHECK_FALSE(sensor.read_early);
+      CHECK(driver.pressure() == 23843);
+      CHECK(sensor.pressures > 50);
+    }
+  }
+}
+
+TEST_CASE("BMP180: a sensor that is pulled and put back is valid again within 30 ms") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  uint32_t now = 0;
+  for (; now < 500000; now += 10000) tick(driver, sensor, now);
+  sensor.answers = false;
+  for (; now < 700000; now += 10000) tick(driver, sensor, now);
+  CHECK_FALSE(driver.present());
+  CHECK_FALSE(driver.valid());
+  sensor.answers = true;
+  sensor.control = 0;
+  for (; now < 720000; now += 10000) tick(driver, sensor, now);
+  CHECK(driver.valid());
+  CHECK(driver.restarts() == 1);
+}
+
+TEST_CASE("BMP180: a sensor that lost its supply unseen is set up again") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  uint32_t now = 0;
+  for (; now < 500000; now += 10000) tick(driver, sensor, now);
+  const uint8_t before = driver.count();
+  sensor.control = 0;
+  tick(driver, sensor, now);
+  CHECK(driver.count() == before);
+  CHECK_FALSE(driver.valid());
+  for (now += 10000; now < 550000; now += 10000) tick(driver, sensor, now);
+  CHECK(driver.valid());
+  CHECK(driver.restarts() == 1);
+}
+
+TEST_CASE("BMP180: another sensor in its place starts with a temperature of its own") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  uint32_t now = 0;
+  for (; now < 500000; now += 10000) tick(driver, sensor, now);
+  sensor.answers = false;
+  tick(driver, sensor, now);
+  sensor.answers = true;
+  sensor.calibration[1] ^= 1;
+  const int before = sensor.temperatures;
+  for (now += 10000; now < 530000; now += 10000) tick(driver, sensor, now);
+  CHECK(sensor.temperatures == before + 1);
+}
+
+TEST_CASE("BMP180: calibration words of 0 or 0xFFFF, or another chip's id, are not believed") {
+  for (uint8_t rubbish : {0x00, 0xFF}) {
+    Bmp180 driver(1);
+    FakeSensor sensor;
+    sensor.calibration[4] = sensor.calibration[5] = rubbish;
+    for (uint32_t n = 0; n < 10; n++) tick(driver, sensor, n * 10000);
+    CHECK_FALSE(driver.present());
+    CHECK(driver.settled());
+  }
+}

@@ -1,0 +1,207 @@
+#include <Mpu6050.h>
+#include <doctest/doctest.h>
+
+#include <cstring>
+
+#include "support.h"
+
+namespace {
+
+constexpr Mpu6050::Settings kSettings = {8, 1000, 3};
+
+class FakeSensor {
+ public:
+  bool answers = true;
+  uint8_t registers[128] = {};
+  int resets = 0;
+
+  FakeSensor() { lose_power(); }
+
+  void lose_power() {
+    std::memset(registers, 0, sizeof registers);
+    registers[0x6B] = 0x40;
+    registers[0x75] = 0x68;
+    for (uint8_t i = 0; i < 4; i++) registers[0x0D + i] = static_cast<uint8_t>(0x11 * (i + 1));
+  }
+  bool carry_out(const I2cRequest& request, uint8_t* data) {
+    if (!answers || request.address != 0x68) return false;
+    if (request.write_count == 2) {
+      if (request.write[0] == 0x6B && request.write[1] & 0x80) {
+        lose_power();
+        resets++;
+      } else {
+        registers[request.write[0]] = request.write[1];
+      }
+    }
+    std::copy(registers + request.write[0], registers + request.write[0] + request.read_count, data);
+    return true;
+  }
+  // Asleep, it reads all zeros; with its self-test on, the axes read more.
+  bool burst(uint8_t* data) {
+    const bool asleep = registers[0x6B] & 0x40;
+    for (uint8_t i = 0; i < 14; i++) {
+      const uint8_t excited = registers[i < 6 ? 0x1C : 0x1B] & 0xE0 ? 0x10 : 0;
+      data[i] = asleep ? 0 : static_cast<uint8_t>(i + excited);
+    }
+    return answers;
+  }
+};
+
+class Rig {
+ public:
+  FakeSensor sensor;
+  Mpu6050 driver{kSettings};
+  Mpu6050::Reading reading = {};
+  uint32_t now = 0;
+
+  void tick() {
+    uint8_t data[I2cRequest::kMaxRead];
+    reading.valid = false;
+    if (driver.wants_burst()) {
+      const bool ok = sensor.burst(data);
+      driver.accept_burst(ok, data, now, reading);
+    }
+    I2cRequest request;
+    for (int i = 0; driver.next(now, request); i++) {
+      if (i >= 20) FAIL("never done");
+      const bool ok = sensor.carry_out(request, data);
+      driver.finish(ok, data, now);
+    }
+    now += 10000;
+  }
+  // Ticks until the reading is valid.
+  int ticks_to_valid(int limit) {
+    for (int ticks = 1; ticks <= limit; ticks++) {
+      tick();
+      if (reading.valid) return ticks;
+    }
+    return -1;
+  }
+};
+
+}  // namespace
+
+TEST_CASE("MPU-6050: reset once, set up, and valid within 200 ms of power-on") {
+  Rig rig;
+  const int ticks = rig.ticks_to_valid(20);
+  CHECK(ticks > 10);  // 100 ms for the reset, 30 ms for the gyro
+  CHECK(rig.sensor.resets == 1);
+  CHECK(rig.driver.present());
+  CHECK(rig.driver.id() == 0x68);
+  CHECK(rig.sensor.registers[0x6B] == 0x01);
+  CHECK(rig.sensor.registers[0x19] == 0);
+  CHECK(rig.sensor.registers[0x1A] == 3);
+  CHECK(rig.sensor.registers[0x1B] == 0x10);
+  CHECK(rig.sensor.registers[0x1C] == 0x10);
+  CHECK(rig.reading.accel[0] == 0x0001);
+  CHECK(rig.reading.temperature == 0x0607);
+  CHECK(rig.reading.gyro[2] == 0x0C0D);
+  CHECK(rig.driver.restarts() == 0);
+}
+
+TEST_CASE("MPU-6050: every range and filter stands in the registers as the register map says") {
+  const struct {
+    Mpu6050::Settings settings;
+    uint8_t divider, config, gyro, accel;
+  } cases[] = {{{2, 250, 0}, 7, 0, 0x00, 0x00}, {{4, 500, 1}, 0, 1, 0x08, 0x08}, {{16, 2000, 6}, 0, 6, 0x18, 0x18}};
+  Rig rig;
+  rig.ticks_to_valid(20);
+  for (const auto& expected : cases) {
+    rig.driver.configure(expected.settings);
+    CHECK(rig.ticks_to_valid(10) == 5);
+    CHECK(rig.sensor.registers[0x19] == expected.divider);
+    CHECK(rig.sensor.registers[0x1A] == expected.config);
+    CHECK(rig.sensor.registers[0x1B] == expected.gyro);
+    CHECK(rig.sensor.registers[0x1C] == expected.accel);
+  }
+  CHECK(rig.driver.restarts() == 0);
+}
+
+TEST_CASE("MPU-6050: a missed answer costs that reading and no set-up") {
+  Rig rig;
+  rig.ticks_to_valid(20);
+  rig.sensor.answers = false;
+  for (int i = 0; i < 10; i++) rig.tick();
+  CHECK_FALSE(rig.reading.valid);
+  CHECK_FALSE(rig.driver.present());
+  rig.sensor.answers = true;
+  CHECK(rig.ticks_to_valid(10) <= 3);
+  CHECK(rig.driver.restarts() == 0);
+}
+
+TEST_CASE("MPU-6050: a sensor that lost its supply is set up again, and believed when its gyro has settled") {
+  Rig rig;
+  rig.ticks_to_valid(20);
+  SUBCASE("asleep, all zeros") { rig.sensor.lose_power(); }
+  SUBCASE("pulled and put back") {
+    rig.sensor.answers = false;
+    for (int i = 0; i < 50; i++) rig.tick();
+    rig.sensor.lose_power();
+    rig.sensor.answers = true;
+  }
+  const int ticks = rig.ticks_to_valid(20);
+  CHECK(ticks >= 4);
+  CHECK(ticks <= 7);
+  CHECK(rig.driver.restarts() == 1);
+}
+
+TEST_CASE("MPU-6050: a changed range is found within 100 ms") {
+  Rig rig;
+  rig.ticks_to_valid(20);
+  rig.sensor.registers[0x1C] = 0;
+  for (int i = 0; i < 12; i++) rig.tick();
+  CHECK(rig.sensor.registers[0x1C] == 0x10);
+  CHECK(rig.driver.restarts() == 1);
+}
+
+TEST_CASE("MPU-6050: an unknown chip is not taken for one") {
+  Rig rig;
+  for (int i = 0; i < 12; i++) {
+    rig.sensor.registers[0x75] = 0x12;
+    rig.tick();
+  }
+  CHECK_FALSE(rig.driver.present());
+  CHECK(rig.driver.settled());
+  CHECK_FALSE(rig.driver.wants_burst());
+}
+
+TEST_CASE("MPU-6050: an axis at the end of its range is marked") {
+  const auto saturated = [](uint8_t word, uint8_t high, uint8_t low) {
+    Rig rig;
+    rig.ticks_to_valid(20);
+    uint8_t data[14] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14};
+    data[2 * word] = high;
+    data[2 * word + 1] = low;
+    rig.driver.accept_burst(true, data, rig.now, rig.reading);
+    CHECK(rig.reading.valid);
+    return (rig.reading.accel_saturated ? 1 : 0) + (rig.reading.gyro_saturated ? 2 : 0);
+  };
+  CHECK(saturated(0, 0x7F, 0xFF) == 1);
+  CHECK(saturated(2, 0x80, 0x00) == 1);
+  CHECK(saturated(3, 0x7F, 0xFF) == 0);  // the temperature
+  CHECK(saturated(4, 0x80, 0x00) == 2);
+  CHECK(saturated(6, 0x7F, 0xFF) == 2);
+  CHECK(saturated(6, 0x7F, 0xFE) == 0);
+}
+
+TEST_CASE("MPU-6050: self-test, plain and excited at 8 g and 250 deg/s, then the settings of before") {
+  Rig rig;
+  rig.ticks_to_valid(20);
+  Mpu6050::SelfTest result;
+  rig.driver.start_self_test();
+  int ticks = 0;
+  for (; ticks < 100 && !rig.driver.take_self_test(result); ticks++) {
+    rig.tick();
+    CHECK_FALSE(rig.reading.valid);
+  }
+  CHECK(ticks < 60);
+  for (uint8_t i = 0; i < 4; i++) CHECK(result.trim[i] == 0x11 * (i + 1));
+  CHECK(result.plain[0] == 0x0001);
+  CHECK(result.plain[5] == 0x0C0D);
+  CHECK(result.excited[0] == 0x1011);
+  CHECK(result.excited[5] == 0x1C1D);
+  CHECK(rig.ticks_to_valid(10) > 0);
+  CHECK(rig.sensor.registers[0x1B] == 0x10);
+  CHECK(rig.sensor.registers[0x1C] == 0x10);
+  CHECK_FALSE(rig.driver.take_self_test(result));
+}
