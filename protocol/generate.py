@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Makes both sides of the wire from messages.toml.
 
-    python protocol/generate.py            writes the C++ header, the Python module and vectors.json
+    python protocol/generate.py            writes the C++ header, the Python module, vectors.json and
+                                           the tables of README.md
     python protocol/generate.py --check    writes nothing; status 1 and the names of the stale files
 
 Needs nothing but Python 3.11. The golden frames are encoded here by the plainest code there is, so that the
@@ -21,6 +22,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 SCHEMA = ROOT / "protocol" / "messages.toml"
 VECTORS = ROOT / "protocol" / "vectors.json"
+README = ROOT / "protocol" / "README.md"
+TABLES_HEADING = "## Messages\n"
 CPP_HEADER = ROOT / "firmware" / "lib" / "Protocol" / "src" / "Messages.h"
 PYTHON_MODULE = ROOT / "host" / "linkpose" / "wire" / "messages.py"
 
@@ -410,6 +413,44 @@ def vectors(schema: dict) -> str:
     return json.dumps(document, indent=1) + "\n"
 
 
+# ---- the page for a person -------------------------------------------------------------------------------------------
+
+
+def readme(schema: dict) -> str:
+    """protocol/README.md as it is written by hand, with the tables after its last heading made anew."""
+    text = README.read_text(encoding="utf-8")
+    lines = [text[: text.index(TABLES_HEADING)] + TABLES_HEADING, f"<!-- {NOTE} -->"]
+    for message in schema["message"]:
+        way = "board → host" if message["direction"] == "board_to_host" else "host → board"
+        lines += ["", f"### {message['name']} `{message['id']:#04x}` {way}", "", message["doc"]]
+        if message["fields"]:
+            lines += ["", *field_table(message["fields"], 0)]
+        if repeat := message.get("repeat"):
+            start = size_of(message["fields"])
+            lines += ["", f"Then 0 to {repeat['max']} times `{repeat['name']}`: {repeat['doc']}.", ""]
+            lines += field_table(repeat["fields"], start)
+    for name, table in schema["enum"].items():
+        kind = "bits" if table.get("flags") else "values"
+        lines += ["", f"### `{name}` ({kind})", "", table["doc"], "", "| value | name |", "|---|---|"]
+        lines += [f"| {value:#06x} | {key} |" for key, value in enum_values(table).items()]
+    return "\n".join([*lines, ""])
+
+
+def field_table(fields: list[dict], start: int) -> list[str]:
+    """Where in the body (counted from after the type byte) each field lies, and how it is read."""
+    rows = ["| at | field | type | unit | |", "|---|---|---|---|---|"]
+    for field in fields:
+        how = field.get("unit", "")
+        if "scale" in field:
+            by = f" × {field['scale_by']}" if "scale_by" in field else ""
+            offset = f" + {field['offset']}" if "offset" in field else ""
+            how = f"{how} = raw × {field['scale']}{by}{offset}"
+        note = "; ".join(n for n in (f"see `{field['enum']}`" if "enum" in field else "", field.get("doc", "")) if n)
+        rows.append(f"| {start} | {field['name']} | {field['type']} | {how} | {note} |")
+        start += size_of([field])
+    return rows
+
+
 # ---- main -----------------------------------------------------------------------------------------------------------
 
 
@@ -427,6 +468,7 @@ def main() -> int:
         (CPP_HEADER, cpp_header(schema)),
         (PYTHON_MODULE, python_module(schema)),
         (VECTORS, vectors(schema)),
+        (README, readme(schema)),
     ):
         if path.exists() and path.read_text(encoding="utf-8") == text:
             continue

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from linkpose.wire import messages
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
 from linkpose.wire.messages import Hello, Ping, Pong, Sample, SampleMouse
