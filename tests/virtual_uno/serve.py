@@ -24,6 +24,8 @@ from virtual_uno import VirtualUno, VirtualUnoError  # noqa: E402
 
 DEFAULT_HEX = HERE.parents[1] / ".pio" / "build" / "uno_distro" / "firmware.hex"
 
+MICE = [{"clockHz": clock_hz} for clock_hz in (12_500, 10_200, 16_600, 14_000)]  # no two alike
+
 FAULTS_HELP = """\
 faults, at a time in seconds of the board (--fault 5:imu-unplug) or as lines on standard input (imu-unplug):
   imu-unplug imu-plug imu-nack imu-ok       the MPU-6050 loses its power, gets it back, NACKs, answers again
@@ -32,6 +34,8 @@ faults, at a time in seconds of the board (--fault 5:imu-unplug) or as lines on 
   i2c-corrupt=P                             each byte read has a wrong bit with probability P
   cable-pull cable-back                     the port vanishes and returns
   flip-to-host=P drop-to-host=P insert-to-host=P   each byte of the line, and the same with to-board
+  mouse1-unplug mouse1-plug                 and so for every mouse
+  mouse1-parity=S                           one byte every S seconds has wrong parity (0: none)
   reset                                     the reset line
 """
 
@@ -44,7 +48,8 @@ def main() -> int:
     for stop_signal in (signal.SIGTERM, signal.SIGINT):
         signal.signal(stop_signal, lambda *_: sys.exit(0))
     try:
-        with VirtualUno(options.hex, seed=options.seed, bmp180={"disturbancePa": options.disturbance}) as uno:
+        disturbed = {"disturbancePa": options.disturbance}
+        with VirtualUno(options.hex, seed=options.seed, bmp180=disturbed, mice=MICE[: options.mice]) as uno:
             statistics = _serve(uno, options)
     except VirtualUnoError as error:
         print(error, file=sys.stderr)
@@ -62,6 +67,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--test", type=int, default=1, help="Test of the simulated rig: 1, 2 or 3")
     parser.add_argument("--seed", type=int, default=0, help="of the rig and of everything random on the board")
     parser.add_argument("--errors", default="calibrated", help="of the sensors: calibrated, datasheet or none")
+    parser.add_argument("--mice", type=int, choices=range(5), default=0, help="how many are plugged in (default 0)")
     parser.add_argument("--duration", type=float, default=None, help="seconds of the board's time; else endless")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
@@ -126,6 +132,10 @@ class Faulty:
             "sda-hold": lambda value: uno.hold_sda(int(value) if value else None),
             "i2c-corrupt": lambda value: uno.corrupt_i2c(float(value)),
         }
+        for number, mouse in enumerate(uno.mice, start=1):
+            self._named[f"mouse{number}-unplug"] = mouse.unplug
+            self._named[f"mouse{number}-plug"] = mouse.plug
+            self._valued[f"mouse{number}-parity"] = lambda value, mouse=mouse: mouse.spoil_parity_every(float(value))
         for kind in ("flip", "drop", "insert"):
             for way in ("to_host", "to_board"):
                 name = f"{kind}-{way.replace('_', '-')}"

@@ -9,7 +9,7 @@ import base64
 import json
 import shutil
 import subprocess
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,6 +71,61 @@ class Sensor:
         self._uno.request("slave", sensor=self._name, set={"nackAddress": address, "nackData": data})
 
 
+class Mouse:
+    """A PS/2 mouse at one of the ports: its movement, and what goes wrong with it."""
+
+    def __init__(self, uno: VirtualUno, index: int) -> None:
+        self._uno, self._index = uno, index
+
+    def feed(self, time_s: ArrayLike, path_mm: ArrayLike, *, start_s: float = 0.0) -> None:
+        """Where the mouse is along its own x and y, (N, 2) in mm, at times (N,) from `start_s` after power-on.
+
+        Between the rows it moves on a straight line. A new path goes on from where the mouse is.
+        """
+        times = np.atleast_1d(np.asarray(time_s, dtype="<f8")) + start_s
+        rows = np.atleast_2d(np.asarray(path_mm, dtype="<f8"))
+        if rows.shape != (len(times), 2) or np.any(np.diff(times) <= 0):
+            raise ValueError(f"a mouse needs rising times (N,) and a path (N, 2), not {rows.shape}")
+        self._request("feed_mouse", times=_text(times), values=_text(rows))
+
+    def unplug(self) -> None:
+        """At once, in the middle of a bit if it comes so."""
+        self._request("plug_mouse", present=False)
+
+    def plug(self) -> None:
+        self._request("plug_mouse", present=True)
+
+    def spoil_parity(self, count: int) -> None:
+        """The next bytes go out with wrong parity."""
+        self.set(badParityBytes=count)
+
+    def spoil_parity_every(self, seconds: float) -> None:
+        """One byte every so many seconds goes out with wrong parity; 0 ends it."""
+        self._request("spoil_mouse", seconds=seconds)
+
+    def lose_clocks(self, count: int) -> None:
+        """The next bytes go out with one clock pulse missing."""
+        self.set(lostClocks=count)
+
+    def set(self, **options: Any) -> None:
+        """Options of emulator/ps2mouse.js, such as `ignores` and `refuses`."""
+        self._request("set_mouse", set=options)
+
+    def state(self) -> dict[str, Any]:
+        """`reported`: counts x, y that went into packets; `discarded`: counts that commands and overflows threw away;
+        `counters`, `packets`, `reporting`, `mode`, `report_rate_hz`, `resolution` (the code: 2**code counts/mm)."""
+        return self._request("mouse_state")
+
+    def host(self, *, send: int | None = None, inhibit_us: float = 0.0) -> list[dict[str, Any]]:
+        """A host at the port in place of the program: what it received so far (byte, sound, cycle); a byte that it
+        sends or an inhibit begins with the next run."""
+        received: list[dict[str, Any]] = self._request("ps2_host", send=send, inhibit_us=inhibit_us)["received"]
+        return received
+
+    def _request(self, op: str, **arguments: Any) -> dict[str, Any]:
+        return self._uno.request(op, mouse=self._index, **arguments)
+
+
 class VirtualUno:
     """The board. A context manager; `request` is the door to the emulator's process."""
 
@@ -81,17 +136,20 @@ class VirtualUno:
         seed: int = 0,
         mpu6050: dict[str, Any] | None = None,
         bmp180: dict[str, Any] | None = None,
+        mice: Sequence[dict[str, Any]] = (),
         start_up_s: float | None = None,
     ) -> None:
-        """`mpu6050` and `bmp180` are the options of emulator/mpu6050.js and bmp180.js, `start_up_s` the time from a
-        reset to the first instruction (65 ms as fused). Raises VirtualUnoError when something is not installed."""
+        """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
+        these names, `start_up_s` the time from a reset to the first instruction (65 ms as fused).
+        Raises VirtualUnoError when something is not installed."""
         self._process = subprocess.Popen([_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._to_send = bytearray()
         self._received = bytearray()
         self.cycle = 0
         self.imu = Sensor(self, "mpu6050", 7)
         self.baro = Sensor(self, "bmp180", 2)
-        options: dict[str, Any] = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}}
+        self.mice = [Mouse(self, index) for index in range(len(mice))]
+        options: dict[str, Any] = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
         if start_up_s is not None:
             options["startUpS"] = start_up_s
         try:

@@ -8,6 +8,8 @@ const { I2cBus } = require("./i2c_bus");
 const { readHex } = require("./hex");
 const { Log } = require("./log");
 const { Mpu6050 } = require("./mpu6050");
+const { Ps2Host } = require("./ps2host");
+const { Ps2Mouse } = require("./ps2mouse");
 const { seededRandom } = require("./random");
 const { SerialLine } = require("./serial_line");
 const { Timer } = require("./timer");
@@ -17,6 +19,13 @@ const { Watchdog } = require("./watchdog");
 
 const OPCODE_CLI = 0x94f8;
 const OPCODE_JUMP_TO_ITSELF = 0xcfff;
+// Clock and data of each mouse port: Arduino pins D2/D3, D4/D5, D6/D7, D8/D9.
+const MOUSE_PORTS = [
+  ["D", 0x04, 0x08],
+  ["D", 0x10, 0x20],
+  ["D", 0x40, 0x80],
+  ["B", 0x01, 0x02],
+];
 const START_UP_S = 0.065; // the UNO's fuses: 16K clocks and 65 ms after every reset
 
 class Board {
@@ -25,8 +34,9 @@ class Board {
    *  @param {number} options.seed of everything random: SRAM at power-on, faults
    *  @param {object} [options.mpu6050] see Mpu6050
    *  @param {object} [options.bmp180] see Bmp180
+   *  @param {object[]} [options.mice] see Ps2Mouse; one for each port from the first on
    *  @param {number} [options.startUpS] from a reset to the first instruction */
-  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, startUpS = START_UP_S }) {
+  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S }) {
     const random = seededRandom(seed);
     this.startUpCycles = startUpS * CLOCK_HZ;
     this.log = new Log();
@@ -44,11 +54,23 @@ class Board {
     this.mpu6050 = new Mpu6050(cpu, mpu6050);
     this.bmp180 = new Bmp180(cpu, () => this.bus.traffic, random, bmp180);
     this.bus.slaves.push(this.mpu6050, this.bmp180);
+    this.mice = mice.map((mouse, index) => {
+      const [name, clock, data] = MOUSE_PORTS[index];
+      return new Ps2Mouse(cpu, this.ports[name], [clock, data], index + 1, mouse);
+    });
     this.reset(RESET_CAUSE.powerOn);
   }
 
   reset(cause) {
     this.cpu.restart(cause, this.startUpCycles);
+  }
+
+  /** Bit-bangs the host's side of a mouse port in place of the program. */
+  ps2Host(mouse) {
+    this.hosts ??= [];
+    const { port, clock, data } = this.mice[mouse];
+    this.hosts[mouse] ??= new Ps2Host(this.cpu, port, clock, data);
+    return this.hosts[mouse];
   }
 
   /** The program stops for ever: in the loop with interrupts off that the C library puts behind main(). */

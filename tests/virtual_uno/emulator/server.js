@@ -66,6 +66,33 @@ const OPERATIONS = {
     board.line.faults = { toHost, toBoard };
     return {};
   },
+  feed_mouse({ mouse, times, values }) {
+    board.mice[mouse].follow(new Table(floats(times), floats(values), true));
+    return {};
+  },
+  set_mouse({ mouse, set }) {
+    Object.assign(board.mice[mouse], set);
+    return {};
+  },
+  spoil_mouse({ mouse, seconds }) {
+    board.mice[mouse].spoilParityEvery(seconds);
+    return {};
+  },
+  plug_mouse({ mouse, present }) {
+    board.mice[mouse].plug(present);
+    return {};
+  },
+  mouse_state({ mouse }) {
+    const { reported, discarded, counters, packets, reporting, mode, reportRateHz, resolution } = board.mice[mouse];
+    return { reported, discarded, counters, packets, reporting, mode, report_rate_hz: reportRateHz, resolution };
+  },
+  /** A host at a mouse port in place of the program: for tests of the mouse. */
+  ps2_host({ mouse, send, inhibit_us: inhibitUs }) {
+    const host = board.ps2Host(mouse);
+    if (inhibitUs) host.inhibit(inhibitUs);
+    if (send !== null) host.send(send);
+    return { received: host.take() };
+  },
   log({ kinds }) {
     board.log.choose(kinds);
     return {};
