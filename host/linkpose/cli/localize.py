@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from linkpose import __version__
+from linkpose.cli import options
 
 if TYPE_CHECKING:
     from linkpose.localization.localizer import Settings, Track
     from linkpose.localization.tables import Score
 
-FilePath = click.Path(path_type=Path)
 RANGE_STD_M = 0.1
 POSITIVE = click.FloatRange(min=0, min_open=True)
 
@@ -54,14 +54,18 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 
 
 @click.command("localize")
-@click.argument("log", type=FilePath)
+@click.argument("log", type=options.FILE)
 @click.option(
-    "--map", "map_path", type=FilePath, metavar="MAP.yaml", help="Grid map of map_server, for a log with laser scans."
+    "--map",
+    "map_path",
+    type=options.FILE,
+    metavar="MAP.yaml",
+    help="Grid map of map_server, for a log with laser scans.",
 )
 @click.option(
     "--beacons",
     "beacons_path",
-    type=FilePath,
+    type=options.FILE,
     metavar="BEACONS.csv",
     help="Places of beacons or landmarks: id,x_m,y_m[,z_m].",
 )
@@ -77,7 +81,7 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 @click.option(
     "--noise",
     type=click.Choice(["fixed", "adaptive", "affine"]),
-    default="fixed",
+    default="affine",
     show_default=True,
     help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)².",
 )
@@ -136,12 +140,12 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 )
 @click.option("--beta", type=click.FloatRange(min=0), default=2.0, show_default=True, help="β of --transform scaled.")
 @click.option("--kappa", type=click.FloatRange(min=0), default=0.0, show_default=True, help="κ of either transform.")
-@click.option("-o", "--output", type=FilePath, metavar="OUT.csv", help="Write the estimated path.")
+@click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
-    "--truth", "truth_path", type=FilePath, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
+    "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
-@click.option("--force", is_flag=True, help="Replace OUT.csv if it exists.")
-@click.option("--json", "as_json", is_flag=True, help="One object a filter.")
+@options.force
+@options.as_json
 def command(
     log: Path,
     map_path: Path | None,
@@ -150,8 +154,8 @@ def command(
     output: Path | None,
     truth_path: Path | None,
     force: bool,
-    as_json: bool,
-    **options: Any,
+    json_lines: bool,
+    **settings: Any,
 ) -> None:
     """Estimate a robot's path from a LOG with an extended or an unscented Kalman filter.
 
@@ -170,39 +174,39 @@ def command(
     beacons = read_beacons(beacons_path) if beacons_path else None
     truth = read_truth(truth_path) if truth_path else None
     events, own_start = read_carmen(log) if is_carmen(log) else (read_events(log), None)
-    settings = _settings(options, own_start)
-    tracks = {name: localize(events, name, settings, grid, beacons) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
+    chosen = _settings(settings, own_start)
+    tracks = {name: localize(events, name, chosen, grid, beacons) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
     for name, track in tracks.items():
         result = score(track.time_s, track.position_m, track.heading_rad, truth) if truth else None
-        click.echo(json.dumps(_summary(name, track, result)) if as_json else _sentence(name, track, result))
+        click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
     if output is not None:
         write_tracks(output, tracks, log, force)
 
 
-def _settings(options: dict[str, Any], own_start: tuple[float, float, float] | None) -> Settings:
+def _settings(given: dict[str, Any], own_start: tuple[float, float, float] | None) -> Settings:
     from linkpose.localization.kalman import Transform
     from linkpose.localization.localizer import Settings
     from linkpose.localization.noise import RangeNoise
 
-    scaled = options["transform"] == "scaled"
+    scaled = given["transform"] == "scaled"
     return Settings(
         ranges=RangeNoise(
-            options["noise"], options["range_std"], options["eta"], options["range_growth"], options["correlation"]
+            given["noise"], given["range_std"], given["eta"], given["range_growth"], given["correlation"]
         ),
-        bearing_std_rad=options["bearing_std"],
-        depth_std_m=options["depth_std"],
-        attitude_std_rad=options["attitude_std"],
-        speed_std_m_s=options["speed_std"],
-        turn_std_rad_s=options["turn_std"],
-        motion_correlation=options["motion_correlation"],
-        velocity_std_m_s=options["velocity_std"],
-        gate=options["gate"],
-        transform=Transform(options["alpha"], options["beta"], options["kappa"])
+        bearing_std_rad=given["bearing_std"],
+        depth_std_m=given["depth_std"],
+        attitude_std_rad=given["attitude_std"],
+        speed_std_m_s=given["speed_std"],
+        turn_std_rad_s=given["turn_std"],
+        motion_correlation=given["motion_correlation"],
+        velocity_std_m_s=given["velocity_std"],
+        gate=given["gate"],
+        transform=Transform(given["alpha"], given["beta"], given["kappa"])
         if scaled
-        else Transform(kappa=options["kappa"]),
-        estimate=tuple(dict.fromkeys(options["estimate"])),
-        start=options["start"] or own_start,
-        start_std=options["start_std"],
+        else Transform(kappa=given["kappa"]),
+        estimate=tuple(dict.fromkeys(given["estimate"])),
+        start=given["start"] or own_start,
+        start_std=given["start_std"],
     )
 
 

@@ -30,10 +30,19 @@ Pose = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class _Line:
+class Reading:
+    """One line: the odometry's pose, and with a laser its n ranges (m) along n angles (rad) from `laser`.
+
+    Both poses are in the odometry's frame.
+    """
+
     time_s: float
     odometry: Pose
-    scan: Scan | None
+    ranges_m: Floats | None = None
+    angles_rad: Floats | None = None
+    laser: Pose = (0.0, 0.0, 0.0)
+    max_range_m: float = FLASER_MAX_RANGE_M
+    line: int = 0
 
 
 def is_carmen(path: Path) -> bool:
@@ -55,44 +64,57 @@ def read_carmen(path: Path) -> tuple[Log, Pose]:
 
     Lines of other sensors are passed over. Raises LinkposeError with file, line and cure for a damaged line.
     """
-    lines: list[_Line] = []
+    readings: list[Reading] = []
     try:
         with path.open(encoding="utf-8") as file:
             for number, text in enumerate(file, 1):
                 words = text.split()
                 if words and words[0] in KEYWORDS:
-                    lines.append(_read_line(path, number, words))
-                    if len(lines) > 1 and lines[-1].time_s < lines[-2].time_s:
-                        raise LinkposeError(
-                            f"{path} line {number}: time runs backwards, from {lines[-2].time_s:.6f} "
-                            f"to {lines[-1].time_s:.6f} s; sort the lines by their time"
-                        )
+                    readings.append(_read_line(path, number, words))
+                    _check_order(path, readings[-2:])
     except UnicodeDecodeError as error:
         raise LinkposeError(f"{path} is not a CARMEN log: {error}") from error
     except OSError as error:
         raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
-    if not lines:
+    if not readings:
         raise LinkposeError(
             f"{path} holds no {', '.join(KEYWORDS[:-1])} or {KEYWORDS[-1]} lines; give a CARMEN log or a CSV log"
         )
-    return _events(lines), lines[0].odometry
+    return as_log(readings), readings[0].odometry
 
 
-def _events(lines: list[_Line]) -> Log:
+def _check_order(path: Path, pair: list[Reading]) -> None:
+    if len(pair) == 2 and pair[1].time_s < pair[0].time_s:
+        raise LinkposeError(
+            f"{path} line {pair[1].line}: time runs backwards, from {pair[0].time_s:.6f} to {pair[1].time_s:.6f} s; "
+            "sort the lines by their time"
+        )
+
+
+def as_log(readings: list[Reading]) -> Log:
     """Controls between the odometry's poses, and the scans, on a clock that starts at 0."""
-    start = lines[0].time_s
     log: Log = []
-    for i, line in enumerate(lines):
-        time = line.time_s - start
-        if i == len(lines) - 1:
+    for i, reading in enumerate(readings):
+        time = reading.time_s - readings[0].time_s
+        if i == len(readings) - 1:
             log.append(Event(time, "odometry", (0.0, 0.0)))
-        elif lines[i + 1].time_s > line.time_s:  # of two lines at one instant the second has the control
-            later = lines[i + 1]
-            log.append(Event(time, "odometry", _arc(line.odometry, later.odometry, later.time_s - line.time_s)))
-        if line.scan is not None:
-            scan = line.scan
-            log.append(Scan(time, scan.ranges_m, scan.angles_rad, scan.mount, scan.max_range_m, scan.line))
+        elif readings[i + 1].time_s > reading.time_s:  # of two lines at one instant the second has the control
+            later = readings[i + 1]
+            arc = _arc(reading.odometry, later.odometry, later.time_s - reading.time_s)
+            log.append(Event(time, "odometry", arc))
+        if reading.ranges_m is not None and reading.angles_rad is not None:
+            log.append(_scan(time, reading, reading.ranges_m, reading.angles_rad))
     return log
+
+
+def format_reading(reading: Reading) -> str:
+    """The ODOM or FLASER line of a reading, without its end. The angles of a FLASER are implied by their number."""
+    odometry, time = " ".join(f"{value:.6f}" for value in reading.odometry), f"{reading.time_s:.6f}"
+    if reading.ranges_m is None:
+        return f"ODOM {odometry} 0 0 0 {time} linkpose {time}"
+    ranges = " ".join(f"{value:.3f}" for value in reading.ranges_m)
+    laser = " ".join(f"{value:.6f}" for value in reading.laser)
+    return f"FLASER {len(reading.ranges_m)} {ranges} {laser} {odometry} {time} linkpose {time}"
 
 
 def _arc(before: Pose, after: Pose, interval_s: float) -> tuple[float, float]:
@@ -105,69 +127,74 @@ def _arc(before: Pose, after: Pose, interval_s: float) -> tuple[float, float]:
     return chord / sinc(0.5 * turn) / interval_s, turn / interval_s
 
 
-def _read_line(path: Path, number: int, words: list[str]) -> _Line:
-    def cut(needed: int) -> None:
-        if len(words) < needed:
+def _read_line(path: Path, number: int, words: list[str]) -> Reading:
+    line = _Words(path, number, words)
+    if words[0] == "ODOM":
+        line.require(8)
+        return Reading(line.number(7), line.pose(1), line=number)
+    if words[0] == "FLASER":
+        n = line.count(1)
+        line.require(n + 9)
+        angles = flaser_angles(n)
+        return Reading(line.number(n + 8), line.pose(n + 5), line.numbers(2, n), angles, line.pose(n + 2), line=number)
+    n = line.count(8)
+    after = 10 + n + line.count(9 + n)
+    line.require(after + 12)
+    angles = line.number(2) + line.number(4) * np.arange(n, dtype=np.float64)
+    ranges, longest = line.numbers(9, n), line.number(5)
+    return Reading(line.number(after + 11), line.pose(after + 3), ranges, angles, line.pose(after), longest, number)
+
+
+@dataclass(frozen=True, slots=True)
+class _Words:
+    """One line as numbers. Raises LinkposeError with file and line for what is missing or is none."""
+
+    path: Path
+    line: int
+    words: list[str]
+
+    def require(self, count: int) -> None:
+        if len(self.words) < count:
             raise LinkposeError(
-                f"{path} line {number}: {words[0]} is cut short, {len(words)} of {needed} words; "
+                f"{self.path} line {self.line}: {self.words[0]} is cut short, {len(self.words)} of {count} words; "
                 "complete or delete the line"
             )
 
-    def numbers(first: int, count: int) -> list[float]:
-        return [read_number(word, path, number) for word in words[first : first + count]]
+    def number(self, index: int) -> float:
+        return read_number(self.words[index], self.path, self.line)
 
-    def size(index: int) -> int:
-        cut(index + 1)
-        value = read_number(words[index], path, number)
+    def numbers(self, first: int, count: int) -> Floats:
+        return np.array([self.number(index) for index in range(first, first + count)])
+
+    def pose(self, first: int) -> Pose:
+        return self.number(first), self.number(first + 1), self.number(first + 2)
+
+    def count(self, index: int) -> int:
+        self.require(index + 1)
+        value = self.number(index)
         if value < 0 or not value.is_integer():
             raise LinkposeError(
-                f"{path} line {number}: {words[index]!r} is no number of readings; correct or delete the line"
+                f"{self.path} line {self.line}: {self.words[index]!r} is no number of readings; "
+                "correct or delete the line"
             )
         return int(value)
 
-    if words[0] == "ODOM":
-        cut(8)
-        x, y, heading = numbers(1, 3)
-        return _Line(numbers(7, 1)[0], (x, y, heading), None)
-    if words[0] == "FLASER":
-        n = size(1)
-        cut(n + 9)
-        laser, odometry = numbers(n + 2, 3), numbers(n + 5, 3)
-        time = numbers(n + 8, 1)[0]
-        scan = _scan(time, np.array(numbers(2, n)), _flaser_angles(n), laser, odometry, FLASER_MAX_RANGE_M, number)
-        return _Line(time, (odometry[0], odometry[1], odometry[2]), scan)
-    n = size(8)
-    k = size(9 + n)
-    after = 10 + n + k
-    cut(after + 12)
-    start, step, longest = numbers(2, 1)[0], numbers(4, 1)[0], numbers(5, 1)[0]
-    laser, odometry = numbers(after, 3), numbers(after + 3, 3)
-    time = numbers(after + 11, 1)[0]
-    scan = _scan(
-        time, np.array(numbers(9, n)), start + step * np.arange(n, dtype=np.float64), laser, odometry, longest, number
-    )
-    return _Line(time, (odometry[0], odometry[1], odometry[2]), scan)
 
-
-def _flaser_angles(count: int) -> Floats:
+def flaser_angles(count: int) -> Floats:
     """A FLASER line gives no angles: it begins at -90 degrees and spans 180, or a step less."""
     step_deg = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5}.get(count, 180.0 / max(count - 1, 1))
     return np.radians(step_deg * np.arange(count, dtype=np.float64) - 90.0)
 
 
-def _scan(
-    time_s: float, ranges: Floats, angles: Floats, laser: list[float], robot: list[float], longest: float, line: int
-) -> Scan:
+def _scan(time_s: float, reading: Reading, ranges: Floats, angles: Floats) -> Scan:
     """The readings nearest to the 19 beams that lie within the scanner's field, and the laser's place on the robot."""
-    step = abs(angles[1] - angles[0]) if len(angles) > 1 else 0.0
-    wanted = (
-        BEAM_ANGLES_RAD[(angles[0] - step - 1e-6 <= BEAM_ANGLES_RAD) & (angles[-1] + step + 1e-6 >= BEAM_ANGLES_RAD)]
-        if len(angles)
-        else []
-    )
-    chosen = sorted({int(np.argmin(np.abs(angles - angle))) for angle in wanted})
-    echo = np.where((ranges[chosen] > 0.0) & (ranges[chosen] < longest), ranges[chosen], np.nan)
-    dx, dy = laser[0] - robot[0], laser[1] - robot[1]
-    c, s = math.cos(robot[2]), math.sin(robot[2])
-    mount = (c * dx + s * dy, c * dy - s * dx, wrap_angle(laser[2] - robot[2]))
-    return Scan(time_s, echo, angles[chosen], mount, longest, line)
+    chosen: list[int] = []
+    if len(angles):
+        step = abs(angles[1] - angles[0]) if len(angles) > 1 else 0.0
+        seen = (angles.min() - 1.5 * step < BEAM_ANGLES_RAD) & (angles.max() + 1.5 * step > BEAM_ANGLES_RAD)
+        chosen = sorted({int(np.argmin(np.abs(angles - angle))) for angle in BEAM_ANGLES_RAD[seen]})
+    echo = np.where((ranges[chosen] > 0.0) & (ranges[chosen] < reading.max_range_m), ranges[chosen], np.nan)
+    dx, dy = reading.laser[0] - reading.odometry[0], reading.laser[1] - reading.odometry[1]
+    c, s = math.cos(reading.odometry[2]), math.sin(reading.odometry[2])
+    mount = (c * dx + s * dy, c * dy - s * dx, wrap_angle(reading.laser[2] - reading.odometry[2]))
+    return Scan(time_s, echo, angles[chosen], mount, reading.max_range_m, reading.line)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
+from linkpose.recording.csvfile import create, write_all
 
 HEADER = ("time_s", "kind", "a", "b", "c")
 # kind -> what its columns a, b, c hold; the first of a kind in NAMED is the name of a beacon or landmark.
@@ -85,6 +87,22 @@ def read_events(path: Path) -> Log:
             f"{path} holds no measurements; a log has the header {','.join(HEADER)} and one row a measurement"
         )
     return log
+
+
+def format_event(event: Event) -> str:
+    """The row of an event, without its end."""
+    cells = [event.beacon] if event.beacon else []
+    cells += [f"{value:.6f}" for value in event.values]
+    return f"{event.time_s:.6f},{event.kind},{','.join(cells)}{',' * (3 - len(cells))}"
+
+
+def write_lines(path: Path, lines: list[str], force: bool) -> None:
+    """Writes a text file. Raises LinkposeError where that cannot be done, or the file exists and `force` is not set."""
+    descriptor = create(path, force)
+    try:
+        write_all(descriptor, path, ("\n".join(lines) + "\n").encode())
+    finally:
+        os.close(descriptor)
 
 
 def _check_header(path: Path, line: int, row: list[str]) -> None:

@@ -130,7 +130,8 @@ def cast_ray(blocked: NDArray[np.uint8], geometry: Floats, x: float, y: float, a
     Exact to the cell's face: the ray steps from one grid line to the next (Amanatides and Woo, A Fast Voxel Traversal
     Algorithm, Eurographics 1987). The map's edge ends a ray like a wall; from inside a blocked cell the distance is 0.
     """
-    cell, yaw = geometry[0], geometry[3]
+    cell: float = geometry[0]
+    yaw: float = geometry[3]
     along_x, along_y = x - geometry[1], y - geometry[2]
     grid_x = (math.cos(yaw) * along_x + math.sin(yaw) * along_y) / cell
     grid_y = (math.cos(yaw) * along_y - math.sin(yaw) * along_x) / cell

@@ -1,5 +1,4 @@
-"""Laser ranges against a grid map: h_i = the distance along beam i from the sensor's pose to the first wall, by ray
-casting.
+"""Laser ranges against a grid map: h_i = the distance along beam i from the sensor's pose to the first wall.
 
 A row of parameters is (beam angle rad, sensor x m, y m, θ rad on the robot, longest range m).
 """
@@ -16,9 +15,12 @@ from linkpose.localization.grid import cast_ray
 from linkpose.localization.linalg import Floats
 
 ID = 0
-TURN_STEP = math.radians(
-    0.5
-)  # of the difference quotient; the step in x and y is one cell, as a smaller one sees only a stair's face
+# Of the difference quotients; in x and y it is one cell, since less would see only a stair's face.
+TURN_STEP = math.radians(0.5)
+# Where the slopes ahead and behind differ by more than this (m/m, m/rad), the beam crosses an edge between them, such
+# as a door frame. Then the gentler one is the slope of the wall that the beam hits, and the other one would throw the
+# estimate.
+EDGE = 20.0
 
 
 @njit(cache=True)
@@ -34,8 +36,9 @@ def predict(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geome
 
 @njit(cache=True)
 def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
-    """Fills ∂h/∂state by central differences: a map has no formula."""
-    above, below = np.empty(out.shape[0]), np.empty(out.shape[0])
+    """Fills ∂h/∂state by central differences, since a map has no formula; at an edge by the difference on one side."""
+    above, below, centre = np.empty(out.shape[0]), np.empty(out.shape[0]), np.empty(out.shape[0])
+    predict(state, parameters, blocked, geometry, centre)
     moved = state.copy()
     for j in range(3):
         step = TURN_STEP if j == 2 else geometry[0]
@@ -45,4 +48,8 @@ def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geom
         predict(moved, parameters, blocked, geometry, below)
         moved[j] = state[j]
         for i in range(out.shape[0]):
-            out[i, j] = (above[i] - below[i]) / (2.0 * step)
+            forward, backward = above[i] - centre[i], centre[i] - below[i]
+            if abs(forward - backward) < EDGE * step:
+                out[i, j] = 0.5 * (forward + backward) / step
+            else:
+                out[i, j] = (forward if abs(forward) < abs(backward) else backward) / step
