@@ -4,6 +4,7 @@
 #include <System.h>
 #include <Twi.h>
 #include <Uart.h>
+#include <avr/pgmspace.h>
 #include <stddef.h>
 #include <string.h>
 
@@ -12,6 +13,28 @@ namespace {
 // HELLO goes out at boot when all sensors are set up or found absent, and after this time at the latest.
 constexpr uint32_t kGreetUs = 300000;
 constexpr uint32_t kStatusUs = 1000000;
+
+// Which firmware this is. It stands in the flash as it goes out in HELLO, behind a mark that `linkpose flash` looks for in
+// a .hex before it writes it. The members are the first of wire::Hello.
+struct __attribute__((packed)) Identity {
+  char mark[8];
+  uint8_t protocol_major;
+  uint8_t protocol_minor;
+  uint32_t schema_crc;
+  uint8_t firmware_major;
+  uint8_t firmware_minor;
+  uint8_t firmware_patch;
+  uint32_t source_revision;
+};
+constexpr size_t kIdentityInHello = sizeof(Identity) - sizeof Identity::mark;
+static_assert(kIdentityInHello == offsetof(wire::Hello, reset_cause), "HELLO begins with the identity");
+
+const Identity kIdentity PROGMEM = {
+    {'l', 'i', 'n', 'k', 'p', 'o', 's', 'e'},
+    wire::kProtocolMajor, wire::kProtocolMinor, wire::kSchemaCrc,
+    wire::kVersionMajor, wire::kVersionMinor, wire::kVersionPatch,
+    LINKPOSE_SOURCE_REVISION,
+};
 
 }  // namespace
 
@@ -48,13 +71,7 @@ void Link::send_hello() {
   const wire::Configure& settings = sampler_.settings();
   const uint16_t* const words = sampler_.baro().calibration();
   wire::Hello hello;
-  hello.protocol_major = wire::kProtocolMajor;
-  hello.protocol_minor = wire::kProtocolMinor;
-  hello.schema_crc = wire::kSchemaCrc;
-  hello.firmware_major = wire::kVersionMajor;
-  hello.firmware_minor = wire::kVersionMinor;
-  hello.firmware_patch = wire::kVersionPatch;
-  hello.source_revision = LINKPOSE_SOURCE_REVISION;
+  memcpy_P(&hello, &kIdentity.protocol_major, kIdentityInHello);
   hello.reset_cause = board::reset_cause();
   hello.streaming = sampler_.streaming();
   hello.sample_rate_hz = settings.sample_rate_hz;
