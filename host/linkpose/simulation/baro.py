@@ -57,6 +57,7 @@ class Schedule:
     """When the firmware converts what: one conversion after each IMU read, one temperature to nine pressures.
 
     Conversions that are longer than the gap take several ticks. Result k is in the SAMPLE of the tick that reads it.
+    The board has measured since it was switched on: the first SAMPLE carries the first pressure already.
     """
 
     tick_s: float
@@ -74,29 +75,34 @@ class Schedule:
     def cycle_ticks(self) -> int:
         return self.temperature_ticks + PRESSURES_PER_TEMPERATURE * self.pressure_ticks
 
+    @property
+    def _lead(self) -> int:
+        """Ticks before the first SAMPLE at which the first conversion was started."""
+        return self.temperature_ticks + self.pressure_ticks
+
     def _ticks(self, oversampling: int) -> int:
         return int(np.ceil((_CONVERSION_S[oversampling] + _SETTLE_S) / self.tick_s - 1e-9))
 
     def pressures_read(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
         """How many pressures have been read when the SAMPLE of each tick is made."""
-        cycle, rest = np.divmod(tick, self.cycle_ticks)
+        cycle, rest = np.divmod(tick + self._lead, self.cycle_ticks)
         within = np.clip((rest - self.temperature_ticks) // self.pressure_ticks, 0, PRESSURES_PER_TEMPERATURE)
         return np.asarray(cycle * PRESSURES_PER_TEMPERATURE + within)
 
     def temperatures_read(self, tick: NDArray[np.int64]) -> NDArray[np.int64]:
         """How many temperatures have been read when the SAMPLE of each tick is made."""
-        cycle, rest = np.divmod(tick, self.cycle_ticks)
+        cycle, rest = np.divmod(tick + self._lead, self.cycle_ticks)
         return np.asarray(cycle + (rest >= self.temperature_ticks))
 
     def pressure_time(self, number: NDArray[np.int64]) -> Floats:
         """Middle of the conversion of pressure `number` (from 0), s."""
         cycle, place = np.divmod(number, PRESSURES_PER_TEMPERATURE)
-        start = cycle * self.cycle_ticks + self.temperature_ticks + place * self.pressure_ticks
+        start = cycle * self.cycle_ticks + self.temperature_ticks + place * self.pressure_ticks - self._lead
         return np.asarray(start * self.tick_s + 0.5 * _CONVERSION_S[self.oversampling])
 
     def temperature_time(self, number: NDArray[np.int64]) -> Floats:
         """Middle of the conversion of temperature `number` (from 0), s."""
-        return np.asarray(number * self.cycle_ticks * self.tick_s + 0.5 * _CONVERSION_S[0])
+        return np.asarray((number * self.cycle_ticks - self._lead) * self.tick_s + 0.5 * _CONVERSION_S[0])
 
 
 def raw_temperature(temp_degC: Floats, words: Calibration = DATASHEET_WORDS) -> NDArray[np.int64]:
