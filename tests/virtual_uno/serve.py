@@ -49,7 +49,9 @@ def main() -> int:
         signal.signal(stop_signal, lambda *_: sys.exit(0))
     try:
         disturbed = {"disturbancePa": options.disturbance}
-        with VirtualUno(options.hex, seed=options.seed, bmp180=disturbed, mice=MICE[: options.mice]) as uno:
+        with VirtualUno(
+            options.hex, seed=options.seed, bmp180=disturbed, mice=MICE[: options.mice], bootloader_s=options.bootloader
+        ) as uno:
             statistics = _serve(uno, options)
     except VirtualUnoError as error:
         print(error, file=sys.stderr)
@@ -73,6 +75,7 @@ def _parse() -> argparse.Namespace:
     pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
     pace.add_argument("--flat-out", dest="paced", action="store_false", help="as fast as the host reads")
     parser.add_argument("--no-reset-on-open", dest="reset_on_open", action="store_false", help="as without DTR")
+    parser.add_argument("--bootloader", type=float, default=0.0, metavar="S", help="its wait after a reset (an UNO: 1)")
     parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="what traffic adds to the BMP180")
     parser.add_argument("--fault", action="append", default=[], metavar="SECONDS:FAULT", help="see below")
     return parser.parse_args()

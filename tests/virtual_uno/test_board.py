@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,17 @@ def test_reset_by_the_host_is_told(board: MakeBoard) -> None:
     link.boot()
     link.uno.reset()
     assert link.boot().reset_cause & ResetCause.EXTERNAL
+
+
+def test_starts_behind_a_bootloader(board: MakeBoard) -> None:
+    """An UNO's bootloader waits for a second and leaves no cause of the reset behind."""
+    link = board(bootloader_s=1.0)
+    link.boot()
+    link.uno.reset()
+    link.run_ms(1000)
+    assert link.messages == []
+    assert link.boot().reset_cause == 0
+    link.carry_out(Start())
 
 
 @pytest.mark.parametrize(
@@ -326,6 +338,12 @@ def test_resources(board: MakeBoard) -> None:
     assert load <= 0.40
     assert link.status.cpu_load / 1000 == pytest.approx(load, abs=0.05)
     assert link.status.stack_free >= 250
+    assert longest_run(link.uno.peek(0x100, 2048)) == pytest.approx(link.status.stack_free, abs=2)
+
+
+def longest_run(memory: bytes) -> int:
+    """The longest stretch of one byte other than 0: the paint on the stack that was never touched."""
+    return max(len(list(group)) for byte, group in groupby(memory) if byte != 0)
 
 
 def test_a_full_transmitter_drops_whole_frames(board: MakeBoard) -> None:

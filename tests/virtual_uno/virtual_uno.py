@@ -137,10 +137,10 @@ class VirtualUno:
         mpu6050: dict[str, Any] | None = None,
         bmp180: dict[str, Any] | None = None,
         mice: Sequence[dict[str, Any]] = (),
-        start_up_s: float | None = None,
+        bootloader_s: float = 0.0,
     ) -> None:
         """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
-        these names, `start_up_s` the time from a reset to the first instruction (65 ms as fused).
+        these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none).
         Raises VirtualUnoError when something is not installed."""
         self._process = subprocess.Popen([_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._to_send = bytearray()
@@ -149,9 +149,8 @@ class VirtualUno:
         self.imu = Sensor(self, "mpu6050", 7)
         self.baro = Sensor(self, "bmp180", 2)
         self.mice = [Mouse(self, index) for index in range(len(mice))]
-        options: dict[str, Any] = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
-        if start_up_s is not None:
-            options["startUpS"] = start_up_s
+        options = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
+        options["bootloaderS"] = bootloader_s
         try:
             self._kinds = np.array(self.request("create", hex=str(Path(hex_path).resolve()), options=options)["kinds"])
         except Exception:

@@ -35,10 +35,13 @@ class Board {
    *  @param {object} [options.mpu6050] see Mpu6050
    *  @param {object} [options.bmp180] see Bmp180
    *  @param {object[]} [options.mice] see Ps2Mouse; one for each port from the first on
-   *  @param {number} [options.startUpS] from a reset to the first instruction */
-  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S }) {
+   *  @param {number} [options.startUpS] from a reset to the first instruction
+   *  @param {number} [options.bootloaderS] how long the UNO's bootloader waits for a program after a reset from outside;
+   *    it clears MCUSR before it starts the one that is there. 0: no bootloader */
+  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S, bootloaderS = 0 }) {
     const random = seededRandom(seed);
     this.startUpCycles = startUpS * CLOCK_HZ;
+    this.bootloaderCycles = bootloaderS * CLOCK_HZ;
     this.log = new Log();
     this.cpu = new Cpu(readHex(hex), this.log);
     const { cpu } = this;
@@ -62,7 +65,8 @@ class Board {
   }
 
   reset(cause) {
-    this.cpu.restart(cause, this.startUpCycles);
+    const waiting = cause === RESET_CAUSE.external ? this.bootloaderCycles : 0;
+    this.cpu.restart(cause, this.startUpCycles + waiting, this.bootloaderCycles === 0);
   }
 
   /** Bit-bangs the host's side of a mouse port in place of the program. */

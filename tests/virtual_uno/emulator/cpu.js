@@ -69,11 +69,12 @@ class Cpu extends CPU {
     peripheral.reset();
   }
 
-  /** A reset: registers to their initial values, SRAM kept, the core still for the start-up time. */
-  restart(cause, startUpCycles) {
+  /** A reset: registers to their initial values, SRAM kept, the core still for the start-up time.
+   *  @param {boolean} causeKept whether MCUSR still tells when the program starts */
+  restart(cause, startUpCycles, causeKept) {
     const flags = this.data[MCUSR];
     this.data.fill(0, 0, FIRST_SRAM);
-    this.data[MCUSR] = cause === RESET_CAUSE.powerOn ? cause : flags | cause;
+    if (causeKept) this.data[MCUSR] = cause === RESET_CAUSE.powerOn ? cause : flags | cause;
     this.pendingInterrupts.fill(null);
     this.nextInterrupt = -1;
     this.pc = 0;
