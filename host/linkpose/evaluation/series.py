@@ -35,7 +35,7 @@ class Series:
             value = np.unwrap(value)
         found = np.interp(time_s, t, value, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
-        hole = t[after] - t[after - 1] > _LONGEST_HOLE * interval(self.time_s)
+        hole = (t[after] - t[after - 1] > _LONGEST_HOLE * interval(self.time_s)) & (t[after] != time_s)
         return np.where(hole, np.nan, found)
 
 

@@ -15,10 +15,12 @@ from linkpose.wire.messages import SampleFlags
 Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665  # m/s²
-# The slowest sampling is 50 Hz. After a longer step the rotation in between is a guess, and its doubt is GAP_RATE.
+# The slowest sampling is 50 Hz. Over a longer step, or where the gyro is of no use, the rotation is partly a guess.
 LONGEST_STEP_S = 0.025
-GAP_RATE_RAD_S = 1.0
 LONGEST_GAP_S = 2.0  # beyond this nothing of the attitude is left to remember
+_JERK_RAD_S3 = 50.0  # of a hand's motion: between two known rates Ts apart the angle is wrong by Ts³/12 of it
+_ACCEL_RAD_S2 = 5.0  # a rate that is held grows wrong by this
+_GUESS_RAD_S = 1.0  # the most that a rate is thought to be wrong
 
 _ACCEL_SATURATED = int(SampleFlags.ACCEL_SATURATED)
 _GYRO_SATURATED = int(SampleFlags.GYRO_SATURATED)
@@ -43,6 +45,15 @@ class ImuCalibration(NamedTuple):
             imu.gyro_noise_rad_s**2,
             imu.accel_noise_m_s2**2,
         )
+
+
+@compiled
+def rotation_variance(step_s: float, held_s: float, imu: ImuCalibration) -> float:
+    """Variance (rad²) about each axis of the rotation over a step, with a rate that has been held for `held_s`."""
+    if held_s == 0.0 and step_s <= LONGEST_STEP_S:
+        return step_s * step_s * imu.gyro_variance
+    wrong = _JERK_RAD_S3 / 12.0 * step_s * step_s + _ACCEL_RAD_S2 * held_s
+    return step_s * step_s * (imu.gyro_variance + min(wrong, _GUESS_RAD_S) ** 2)
 
 
 @compiled

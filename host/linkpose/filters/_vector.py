@@ -74,6 +74,11 @@ def scaled(scale: float, s: Sym) -> Sym:
 
 
 @compiled
+def trace(s: Sym) -> float:
+    return s[0] + s[3] + s[5]
+
+
+@compiled
 def inverse(s: Sym) -> Sym:
     """Inverse of a positive definite matrix, by cofactors."""
     c00 = s[3] * s[5] - s[4] * s[4]

@@ -21,7 +21,7 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec, compiled, inlined
 from linkpose.filters.baro import START_S, StartState, barometric_height, listen, metres_per_pascal, start_height
-from linkpose.filters.tilt import TiltParameters, TiltState, advance, describe, keep, recall
+from linkpose.filters.tilt import TiltParameters, TiltState, advance, correct_by_accel, describe, keep, recall
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -154,9 +154,11 @@ def _process(
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
         w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        before = now[0]
-        now, has_force, force, has_rate = advance(time_s[i], a, w, flags[i], imu, tilt_parameters.accel_memory, now)
+        before = now.time
+        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
         rejected += not (has_force and has_rate)
+        if has_force:
+            now = correct_by_accel(now, force, tilt_parameters.accel_memory, imu)
         measured = listen(time_s[i], a, flags[i], pressure_Pa[i], fresh[i], imu, start)
         known = start.pressure[1] > 0.0
         if known and not vertical.started[0]:
@@ -166,9 +168,9 @@ def _process(
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
             vertical.started[0] = time_s[i] - start.time[0] > START_S
         elif known:
-            if now[0] > before:
-                step_s = now[0] - before
-                lifted = vec.dot(now[2], force) - GRAVITY
+            if now.time > before:
+                step_s = now.time - before
+                lifted = vec.dot(now.tilt, force) - GRAVITY
                 seen = has_force and step_s <= LONGEST_STEP_S
                 mean, covariance = propagate(mean, covariance, lifted, seen, step_s, q)
             if measured:
@@ -177,12 +179,11 @@ def _process(
                 mean, covariance = correct(mean, covariance, height, variance)
         out[i, 0] = mean[0] if known else np.nan
         out[i, 1] = math.sqrt(covariance[0]) if known else np.nan
-        if math.isnan(now[0]):
+        if math.isnan(now.time):
             out[i, 2] = out[i, 3] = np.nan
         else:
-            _, _, out[i, 2], out[i, 3] = describe(now[2], now[3], j2s)
-    tilt_state.rejected[0] += rejected
-    keep(tilt_state, now)
+            _, _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+    keep(tilt_state, now, rejected)
     for j in range(3):
         vertical.mean[j] = mean[j]
     for j in range(6):

@@ -30,9 +30,23 @@ from numpy.typing import NDArray
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec, compiled, inlined
-from linkpose.filters.tilt import TiltParameters, TiltState, acceleration, advance, describe, keep, recall
+from linkpose.filters.tilt import (
+    Now,
+    TiltParameters,
+    TiltState,
+    acceleration,
+    advance,
+    correct_by_accel,
+    describe,
+    keep,
+    recall,
+)
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
+
+# Method B's correction takes a part only in a tilt known to about a milliradian: its model reads the acceleration off
+# the tilt, and one that is a guess (a start in motion, a gap) would be confirmed by it for a minute.
+_UNSETTLED_RAD2 = 2e-6
 
 
 class History(NamedTuple):
@@ -80,20 +94,6 @@ class JointFilter:
 
 
 @inlined
-def correct(tilt: Vec, covariance: Sym, reference: Vec, noise: Sym) -> tuple[Vec, Sym]:
-    """(13), (14) with reference = g Z + noise; `noise` is the reference's covariance divided by g²."""
-    inverse = vec.inverse(vec.add(covariance, 1.0, noise))
-    innovation = (
-        reference[0] / GRAVITY - tilt[0],
-        reference[1] / GRAVITY - tilt[1],
-        reference[2] / GRAVITY - tilt[2],
-    )
-    change = vec.apply(covariance, vec.apply(inverse, innovation))
-    tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
-    return tilt, vec.parallel(covariance, noise, inverse)
-
-
-@inlined
 def weights(h1: float, h2: float) -> Vec:
     """c₀, c₁, c₂ (1/s) of the derivative at the last of three samples h2 and h1 apart (s)."""
     return ((2.0 * h1 + h2) / (h1 * (h1 + h2)), -(h1 + h2) / (h1 * h2), h1 / (h2 * (h1 + h2)))
@@ -126,6 +126,29 @@ def reference_noise(rate: Vec, c: Vec, d: Vec, imu: ImuCalibration) -> Sym:
     return vec.plus_diagonal(gyro, imu.accel_variance / GRAVITY**2)
 
 
+@inlined
+def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu: ImuCalibration) -> Now:
+    """(12)-(14), with the rate's derivative from the present and the two last rates by the weights `c`."""
+    rate, tilt = now.rate, now.tilt
+    derivative = (
+        c[0] * rate[0] + c[1] * w1[0] + c[2] * w2[0],
+        c[0] * rate[1] + c[1] * w1[1] + c[2] * w2[1],
+        c[0] * rate[2] + c[1] * w1[2] + c[2] * w2[2],
+    )
+    reference = gravity_reference(force, rate, derivative, d)
+    innovation = (
+        reference[0] / GRAVITY - tilt[0],
+        reference[1] / GRAVITY - tilt[1],
+        reference[2] / GRAVITY - tilt[2],
+    )
+    noise = reference_noise(rate, c, d, imu)
+    inverse = vec.inverse(vec.add(now.covariance, 1.0, noise))
+    change = vec.apply(now.covariance, vec.apply(inverse, innovation))
+    tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
+    covariance = vec.parallel(now.covariance, noise, inverse)
+    return Now(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt))
+
+
 @compiled
 def _process(
     time_s: Floats,
@@ -146,30 +169,23 @@ def _process(
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
         w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        now, has_force, force, has_rate = advance(time_s[i], a, w, flags[i], imu, parameters.accel_memory, now)
+        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
         rejected += not (has_force and has_rate)
-        time, rate, tilt, covariance, modelled = now
         # A comparison with NaN is False: no derivative across a gap or a reading that could not be used.
-        if has_force and has_rate and time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S:
-            c = weights(time - t1, t1 - t2)
-            derivative = (
-                c[0] * rate[0] + c[1] * w1[0] + c[2] * w2[0],
-                c[0] * rate[1] + c[1] * w1[1] + c[2] * w2[1],
-                c[0] * rate[2] + c[1] * w1[2] + c[2] * w2[2],
-            )
-            reference = gravity_reference(force, rate, derivative, d)
-            tilt, covariance = correct(tilt, covariance, reference, reference_noise(rate, c, d, imu))
-            modelled = acceleration(force, tilt)
-            now = (time, rate, tilt, covariance, modelled)
-        if time != t1:  # a repeated stamp brings nothing new
+        derivable = has_force and has_rate and now.time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S
+        if has_force and not (derivable and vec.trace(now.covariance) > _UNSETTLED_RAD2):
+            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+        if derivable:
+            c = weights(now.time - t1, t1 - t2)
+            now = correct_by_joint(now, force, c, w1, w2, d, imu)
+        if now.time != t1:  # a repeated stamp brings nothing new
             t2, w2 = t1, w1
-            t1, w1 = (time if has_rate else math.nan), rate
-        if math.isnan(time):
+            t1, w1 = (now.time if has_rate else math.nan), now.rate
+        if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(tilt, covariance, d)
-    state.rejected[0] += rejected
-    keep(state, now)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, d)
+    keep(state, now, rejected)
     history.time[0], history.time[1] = t1, t2
     for j in range(3):
         history.rate[0, j], history.rate[1, j] = w1[j], w2[j]

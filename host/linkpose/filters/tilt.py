@@ -25,14 +25,13 @@ from numpy.typing import NDArray
 
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
-    GAP_RATE_RAD_S,
     GRAVITY,
     LONGEST_GAP_S,
-    LONGEST_STEP_S,
     Floats,
     ImuCalibration,
     read_accel,
     read_gyro,
+    rotation_variance,
 )
 from linkpose.filters._vector import Sym, Vec, compiled, inlined
 from linkpose.sensors.measurements import Measurements
@@ -40,10 +39,19 @@ from linkpose.sensors.rig import Rig
 
 # Unknown lever arm and rhythm of a start in motion: acceleration (m/s²) to a rate of 1 rad/s.
 _START_ACCEL_PER_RATE = 5.0
+_GUESS_RAD2 = 0.005  # a tilt whose variances sum to more is a guess: 3° either way
+_SWING_SAMPLES = 30.0  # that an acceleration lasts
 
 
-# The state in registers: time (s), last usable rate, tilt, its covariance, a⁺.
-Now = tuple[float, Vec, Vec, Sym, Vec]
+class Now(NamedTuple):
+    """The state in registers, while a block is worked through."""
+
+    time: float  # of the last sample (s), NaN before the first
+    rate: Vec  # last usable rate (rad/s)
+    held: float  # for how long that rate has had to do (s)
+    tilt: Vec  # Z
+    covariance: Sym  # of Z
+    accel: Vec  # a⁺ (m/s²)
 
 
 class TiltParameters(NamedTuple):
@@ -55,7 +63,7 @@ class TiltParameters(NamedTuple):
 class TiltState(NamedTuple):
     """What the filter remembers from one block to the next; changed in place."""
 
-    time: Floats  # (1,) of the last sample (s), NaN before the first
+    time: Floats  # (2,) of the last sample, NaN before the first; how long the rate has been held (s)
     rate: Floats  # (3,) last usable rate (rad/s)
     tilt: Floats  # (3,) Z
     covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
@@ -64,9 +72,8 @@ class TiltState(NamedTuple):
 
     @staticmethod
     def fresh() -> TiltState:
-        return TiltState(
-            np.full(1, np.nan), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(6), np.zeros(3), np.zeros(1, np.int64)
-        )
+        time, upward = np.array([np.nan, 0.0]), np.array([0.0, 0.0, 1.0])
+        return TiltState(time, np.zeros(3), upward, np.zeros(6), np.zeros(3), np.zeros(1, np.int64))
 
 
 class TiltFilter:
@@ -100,38 +107,53 @@ class TiltFilter:
 
 
 @inlined
+def unknown_accel(force: Vec, rate: Vec) -> float:
+    """Square of the acceleration (m/s²)² that a sample of unknown history may hold: 0 at rest."""
+    excess = math.sqrt(vec.dot(force, force)) - GRAVITY
+    return excess * excess + _START_ACCEL_PER_RATE**2 * vec.dot(rate, rate)
+
+
+@inlined
 def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
     """Tilt and its covariance from one sample: the direction of the force, with the doubt that a motion brings."""
-    magnitude = math.sqrt(vec.dot(force, force))
-    moving = _START_ACCEL_PER_RATE**2 * vec.dot(rate, rate)
-    variance = (imu.accel_variance + (magnitude - GRAVITY) ** 2 + moving) / GRAVITY**2
-    tilt = vec.unit(force) if magnitude > 0.0 else (0.0, 0.0, 1.0)
+    variance = (imu.accel_variance + unknown_accel(force, rate)) / GRAVITY**2
+    tilt = vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0)
     return tilt, vec.cross_square(tilt, min(variance, 1.0))
 
 
 @inlined
 def predict(
-    tilt: Vec, covariance: Sym, rate: Vec, before: Vec, step_s: float, known: bool, imu: ImuCalibration
+    tilt: Vec, covariance: Sym, rate: Vec, before: Vec, step_s: float, held_s: float, imu: ImuCalibration
 ) -> tuple[Vec, Sym]:
-    """(5) over `step_s`, from the rates at its ends; `known` False where the gyro did not see the whole step."""
+    """(5) over `step_s`, from the rates at its ends, the last of which has been held for `held_s`."""
     half = 0.5 * step_s
     rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
     tilt = vec.turn_back(rotation, tilt)
     covariance = vec.turn_back_sym(rotation, covariance)
-    doubt = step_s * step_s * (imu.gyro_variance if known else GAP_RATE_RAD_S**2)
-    return tilt, vec.add(covariance, doubt, vec.cross_square(tilt, 1.0))
+    return tilt, vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
 
 
 @inlined
-def correct_by_accel(
-    tilt: Vec, covariance: Sym, force: Vec, accel: Vec, memory: float, imu: ImuCalibration
-) -> tuple[Vec, Sym]:
-    """(6), (8): the force less the acceleration that the model (4) expects after `accel`."""
-    expected = (memory * accel[0], memory * accel[1], memory * accel[2])
-    variance = (vec.dot(expected, expected) / 3.0 + imu.accel_variance) / GRAVITY**2
-    i = vec.inverse(vec.plus_diagonal(covariance, variance))
+def acceleration(force: Vec, tilt: Vec) -> Vec:
+    """a⁺ = s_A − g Z⁺"""
+    return (force[0] - GRAVITY * tilt[0], force[1] - GRAVITY * tilt[1], force[2] - GRAVITY * tilt[2])
+
+
+@inlined
+def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -> Now:
+    """(6), (8): the force less the acceleration that the model (4) expects.
+
+    The model presumes a tilt that is known: a⁺ = s_A − gZ⁺ says nothing where Z⁺ is a guess (a start in motion, a gap).
+    Then the acceleration is unknown, and so is that of the samples around: M is that of an average over them.
+    """
+    tilt, p = now.tilt, now.covariance
+    expected = (memory * now.accel[0], memory * now.accel[1], memory * now.accel[2])
+    variance = vec.dot(expected, expected) / 3.0 + imu.accel_variance
+    if vec.trace(p) > _GUESS_RAD2:
+        variance += _SWING_SAMPLES * unknown_accel(force, now.rate) / 3.0
+    variance /= GRAVITY**2
+    i = vec.inverse(vec.plus_diagonal(p, variance))
     # Equal noise on all axes commutes with the covariance: the gain is symmetric, and P⁺ = (M/g²) K.
-    p = covariance
     gain = (
         p[0] * i[0] + p[1] * i[1] + p[2] * i[2],
         p[0] * i[1] + p[1] * i[3] + p[2] * i[4],
@@ -147,13 +169,7 @@ def correct_by_accel(
     )
     change = vec.apply(gain, innovation)
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
-    return tilt, vec.scaled(variance, gain)
-
-
-@inlined
-def acceleration(force: Vec, tilt: Vec) -> Vec:
-    """a⁺ = s_A − g Z⁺"""
-    return (force[0] - GRAVITY * tilt[0], force[1] - GRAVITY * tilt[1], force[2] - GRAVITY * tilt[2])
+    return Now(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), acceleration(force, tilt))
 
 
 @inlined
@@ -177,9 +193,10 @@ def describe(tilt: Vec, covariance: Sym, j2s: Vec) -> tuple[float, float, float,
 @inlined
 def recall(state: TiltState) -> Now:
     """The state in registers."""
-    return (
+    return Now(
         state.time[0],
         vec.load(state.rate),
+        state.time[1],
         vec.load(state.tilt),
         vec.load_sym(state.covariance),
         vec.load(state.accel),
@@ -187,40 +204,38 @@ def recall(state: TiltState) -> Now:
 
 
 @inlined
-def keep(state: TiltState, now: Now) -> None:
-    """The registers back into the state."""
-    state.time[0] = now[0]
+def keep(state: TiltState, now: Now, rejected: int) -> None:
+    """The registers back into the state, and more rejected samples."""
+    state.time[0], state.time[1] = now.time, now.held
     for j in range(3):
-        state.rate[j] = now[1][j]
-        state.tilt[j] = now[2][j]
-        state.accel[j] = now[4][j]
+        state.rate[j] = now.rate[j]
+        state.tilt[j] = now.tilt[j]
+        state.accel[j] = now.accel[j]
     for j in range(6):
-        state.covariance[j] = now[3][j]
+        state.covariance[j] = now.covariance[j]
+    state.rejected[0] += rejected
 
 
 @inlined
 def advance(
-    time_s: float, raw_accel: Vec, raw_gyro: Vec, flags: int, imu: ImuCalibration, memory: float, now: Now
+    now: Now, time_s: float, raw_accel: Vec, raw_gyro: Vec, flags: int, imu: ImuCalibration
 ) -> tuple[Now, bool, Vec, bool]:
-    """One sample of Method B: the new state, whether the force could be used, the force, whether the rate could."""
-    last, before, tilt, covariance, modelled = now
+    """Predicts up to a sample, or starts: the state, whether the force can be used, the force, whether the rate can."""
     has_force, force = read_accel(raw_accel, flags, imu)
     has_rate, rate = read_gyro(raw_gyro, flags, imu)
-    if math.isnan(last):
-        if not (has_force and has_rate):
+    if math.isnan(now.time):
+        if not (has_force and has_rate and math.isfinite(time_s)):
             return now, False, force, False
         tilt, covariance = start(force, rate, imu)
-        return (time_s, rate, tilt, covariance, acceleration(force, tilt)), True, force, True
-    goes_on, step_s = step_between(time_s, last)
+        return Now(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt)), True, force, True
+    goes_on, step_s = step_between(time_s, now.time)
     if not goes_on:
         return now, False, force, False
+    held = 0.0 if has_rate else now.held + step_s
     if not has_rate:
-        rate = before
-    tilt, covariance = predict(tilt, covariance, rate, before, step_s, has_rate and step_s <= LONGEST_STEP_S, imu)
-    if has_force:
-        tilt, covariance = correct_by_accel(tilt, covariance, force, modelled, memory, imu)
-        modelled = acceleration(force, tilt)
-    return (time_s, rate, tilt, covariance, modelled), has_force, force, has_rate
+        rate = now.rate
+    tilt, covariance = predict(now.tilt, now.covariance, rate, now.rate, step_s, held, imu)
+    return Now(time_s, rate, held, tilt, covariance, now.accel), has_force, force, has_rate
 
 
 @compiled
@@ -240,11 +255,12 @@ def _process(
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
         w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        now, has_force, _, has_rate = advance(time_s[i], a, w, flags[i], imu, parameters.accel_memory, now)
+        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
         rejected += not (has_force and has_rate)
-        if math.isnan(now[0]):
+        if has_force:
+            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+        if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now[2], now[3], j2s)
-    state.rejected[0] += rejected
-    keep(state, now)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+    keep(state, now, rejected)

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Joint, Rig, Vector
 from linkpose.simulation import baro, imu
@@ -202,10 +204,9 @@ class LinkRun:
         pressures = self._schedule.pressures_read(tick)
         ut, up = self._baro_of(tick, pressures)
         full = (counts == -32768) | (counts == 32767)
-        flags = np.full(count, int(SampleFlags.IMU_VALID), dtype=np.int64)
+        flags = np.full(count, int(SampleFlags.IMU_VALID | SampleFlags.BARO_VALID), dtype=np.int64)
         flags |= np.where(full[:, :3].any(axis=1), int(SampleFlags.ACCEL_SATURATED), 0)
         flags |= np.where(full[:, 4:].any(axis=1), int(SampleFlags.GYRO_SATURATED), 0)
-        flags |= np.where(pressures > 0, int(SampleFlags.BARO_VALID), 0)
         t_us = np.rint(time_s * 1e6).astype(np.int64)
         return RawBlock(tick, t_us, counts[:, :3], counts[:, 3], counts[:, 4:], ut, up, pressures, flags)
 
@@ -222,17 +223,31 @@ class LinkRun:
         for block in self.blocks():
             yield from block.samples()
 
+    def measurements(self) -> Measurements:
+        """The whole run as a recording of it would be read. Only of a run that ends."""
+        settings = Settings(
+            round(self.rate_hz),
+            self.accel_range_g,
+            self.gyro_range_deg_s,
+            dlpf=0,
+            baro_oversampling=self.oversampling,
+            bmp180=baro.DATASHEET_WORDS,
+            mouse_ports=0,
+        )
+        if self.count is None:
+            raise LinkposeError("a run without an end has no whole recording: give it a duration")
+        converter = Converter(settings)
+        return Measurements.of(
+            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
+        )
+
     def _baro_of(self, tick: Integers, pressures: Integers) -> tuple[Integers, Integers]:
-        """UT and UP that the SAMPLEs of these ticks carry: the last ones read, 0 before the first pressure."""
-        if pressures[-1] == 0:
-            return np.zeros_like(tick), np.zeros_like(tick)
+        """UT and UP that the SAMPLEs of these ticks carry: the last ones read."""
         temperatures = self._schedule.temperatures_read(tick)
-        oldest_ut, oldest_up = max(0, int(temperatures[0]) - 1), max(0, int(pressures[0]) - 1)
+        oldest_ut, oldest_up = int(temperatures[0]) - 1, int(pressures[0]) - 1
         uts = self.baro_temperature(self._schedule.temperature_time(np.arange(oldest_ut, temperatures[-1])))
         ups = self.baro_pressure(self._schedule.pressure_time(np.arange(oldest_up, pressures[-1])), oldest_up)
-        known = pressures > 0
-        ut = np.where(known, uts[np.maximum(temperatures - 1 - oldest_ut, 0)], 0)
-        return ut, np.where(known, ups[np.maximum(pressures - 1 - oldest_up, 0)], 0)
+        return uts[temperatures - 1 - oldest_ut], ups[pressures - 1 - oldest_up]
 
 
 def simulate(

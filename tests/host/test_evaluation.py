@@ -1,0 +1,143 @@
+"""evaluate: errors that are known beforehand, clocks that differ, gaps, and files that are not what they should be."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from linkpose.cli.evaluate import command
+from linkpose.errors import LinkposeError
+
+T = np.arange(0, 30, 0.01)
+
+
+def height(t):
+    return 1.5 + 0.1 * np.sin(2 * np.pi * 0.6 * t) + 0.05 * np.sin(2 * np.pi * 0.23 * t + 1)
+
+
+def write(path, columns, kind=None):
+    head = f"# linkpose {kind} 1\n# {{}}\n" if kind else ""
+    rows = np.column_stack(list(columns.values()))
+    text = "\n".join(",".join("" if np.isnan(v) else f"{v:.9f}" for v in row) for row in rows)
+    path.write_text(f"{head}{','.join(columns)}\n{text}\n")
+    return str(path)
+
+
+def scores(*paths):
+    result = CliRunner().invoke(command, [*paths, "--json"], catch_exceptions=False)
+    return {row["filter"]: row for row in map(json.loads, result.output.splitlines())}
+
+
+@pytest.fixture
+def reference(tmp_path):
+    return write(
+        tmp_path / "truth.csv",
+        {"time_s": T, "height_m": height(T), "roll_deg": 10 * np.sin(T), "pitch_deg": 5 * np.cos(T)},
+        "truth",
+    )
+
+
+def estimate(tmp_path, **more):
+    columns = {"time_s": T, "joint_height_m": height(T) + 0.02, "joint_roll_deg": 10 * np.sin(T) - 3}
+    return write(tmp_path / "estimate.csv", columns | more, "estimate")
+
+
+def test_known_errors(tmp_path, reference):
+    noisy = height(T) + 0.05 * np.sqrt(2) * np.sin(2 * np.pi * T)
+    path = estimate(tmp_path, imu_baro_height_m=noisy, imu_baro_height_std_m=np.ones(len(T)))
+    found = scores(path, reference)
+    assert list(found) == ["joint", "imu-baro"]
+    assert found["joint"] == {
+        "filter": "joint", "rows": 3000, "height_rmse_cm": pytest.approx(2.0), "roll_rmse_deg": pytest.approx(3.0),
+        "time_offset_s": 0.0,
+    }  # fmt: skip
+    assert found["imu-baro"]["height_rmse_cm"] == pytest.approx(5.0, rel=0.01)
+    assert "roll_rmse_deg" not in found["imu-baro"]
+
+
+@pytest.mark.parametrize("offset_s", [0.237, -3.1234, 0.0162, 12345.678])
+def test_clocks_that_differ_are_aligned_to_a_fraction_of_a_sample(tmp_path, offset_s):
+    reference = write(tmp_path / "truth.csv", {"time_s": T + offset_s, "height_m": height(T)})
+    found = scores(estimate(tmp_path), reference)["joint"]
+    assert found["time_offset_s"] == pytest.approx(offset_s, abs=5e-4)
+    assert found["height_rmse_cm"] == pytest.approx(2.0, abs=0.01)
+
+
+def test_another_rate_and_an_offset(tmp_path):
+    t = np.arange(-4, 40, 1 / 120)
+    reference = write(tmp_path / "truth.csv", {"time_s": t + 7.5, "height_m": height(t)})
+    assert scores(estimate(tmp_path), reference)["joint"]["time_offset_s"] == pytest.approx(7.5, abs=5e-4)
+
+
+def test_a_lag_of_the_filter_is_its_own_fault(tmp_path, reference):
+    """Half a sample is not taken for a clock's offset."""
+    path = write(tmp_path / "late.csv", {"time_s": T, "joint_height_m": height(T - 0.004)})
+    found = scores(path, reference)["joint"]
+    assert found["time_offset_s"] == 0
+    assert found["height_rmse_cm"] == pytest.approx(100 * np.std(height(T - 0.004) - height(T)), rel=0.01)
+
+
+def test_gaps_and_missing_values_are_left_out(tmp_path):
+    h = height(T)
+    h[1000:1100] = np.nan
+    kept = np.ones(len(T), bool)
+    kept[2000:2200] = False
+    reference = write(tmp_path / "truth.csv", {"time_s": T[kept], "height_m": h[kept]})
+    ours = height(T) + 0.02
+    ours[:50] = np.nan
+    path = write(tmp_path / "estimate.csv", {"time_s": T, "tilt_height_m": ours})
+    found = scores(path, reference)["tilt"]
+    assert found["rows"] == 3000 - 50 - 100 - 200
+    assert found["height_rmse_cm"] == pytest.approx(2.0)
+
+
+def test_angles_are_compared_on_the_circle(tmp_path):
+    turning = (np.degrees(T) + 180) % 360 - 180
+    ahead = (np.degrees(T) + 182) % 360 - 180
+    reference = write(tmp_path / "truth.csv", {"time_s": T, "roll_deg": turning})
+    path = write(tmp_path / "estimate.csv", {"time_s": T, "tilt_roll_deg": ahead})
+    assert scores(path, reference)["tilt"]["roll_rmse_deg"] == pytest.approx(2.0, abs=1e-3)
+
+
+def test_planar_filters_have_their_own_keys(tmp_path):
+    columns = {"x_m": np.sin(T), "y_m": T, "heading_rad": T, "vx_m_s": np.cos(T), "vy_m_s": np.sin(T)}
+    columns["wz_rad_s"] = np.cos(0.3 * T)
+    reference = write(tmp_path / "truth.csv", {"time_s": T} | columns)
+    off = {f"mice_{name}": value + 0.3 for name, value in columns.items()}
+    path = write(tmp_path / "estimate.csv", {"time_s": T, "mice_excluded": 0 * T} | off)
+    found = scores(path, reference)["mice"]
+    assert found == {
+        "filter": "mice", "rows": 3000, "velocity_rmse_m_s": pytest.approx(0.3 * 2**0.5),
+        "rate_rmse_rad_s": pytest.approx(0.3), "position_rmse_m": pytest.approx(0.3 * 2**0.5),
+        "heading_rmse_rad": pytest.approx(0.3),
+    }  # fmt: skip
+
+
+def test_the_table_for_people(tmp_path, reference):
+    shown = CliRunner().invoke(command, [estimate(tmp_path), reference]).output
+    assert "joint" in shown and "height (cm)" in shown and "pitch" not in shown
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "says"),
+    [
+        ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,temperature\n0,1\n", "is no reference"),
+        ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,roll_deg\n0,1\n1,2\n", "no filter in"),
+        ("time_s,height_m\n0,1\n1,2\n", "time_s,height_m\n0,1\n1,2\n", "holds no estimates"),
+        ("joint_height_m\n0\n", "time_s,height_m\n0,1\n", "no column time_s"),
+        ("time_s,joint_height_m\n0,1\n1,x\n", "time_s,height_m\n0,1\n", "line 3: 'x' is not a number"),
+        ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,height_m\n1,1\n0,2\n", "line 3: time_s runs backwards"),
+        ("time_s,joint_height_m\n0,1\n1,2,3\n", "time_s,height_m\n0,1\n", "3 fields where the header has 2"),
+        ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,height_m\n50,1\n51,2\n", "no instant in common"),
+        ("# linkpose recording 1\n# {}\ntime_s,seq\n0,1\n1,2\n", "time_s,height_m\n0,1\n", "linkpose estimate"),
+    ],
+)
+def test_files_that_do_not_fit_are_refused_by_name(tmp_path, ours, theirs, says):
+    (tmp_path / "ours.csv").write_text(ours)
+    (tmp_path / "theirs.csv").write_text(theirs)
+    with pytest.raises(LinkposeError, match=says) as error:
+        scores(str(tmp_path / "ours.csv"), str(tmp_path / "theirs.csv"))
+    assert str(tmp_path) in str(error.value)

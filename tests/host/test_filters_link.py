@@ -1,0 +1,228 @@
+"""The paper's four filters: known answers, the paper's order on its Tests, and what no input may do to them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from linkpose import filters
+from linkpose.errors import LinkposeError
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
+from linkpose.sensors.rig import Imu, Rig
+from linkpose.simulation.link import LinkRun
+from linkpose.wire.messages import SampleFlags, Sensors
+
+PAPER = ("joint", "tilt", "imu-baro", "baro")
+INERTIAL = ("joint", "tilt")
+
+
+@lru_cache(maxsize=20)
+def recorded(test: int = 1, seed: int = 0, duration_s: float = 65.0) -> tuple[LinkRun, Measurements]:
+    run = LinkRun(test, seed, duration_s)
+    return run, run.measurements()
+
+
+def measurements(time_s, accel, gyro) -> Measurements:
+    n = len(time_s)
+    return Measurements(
+        np.asarray(time_s, float), np.ascontiguousarray(accel, float), np.ascontiguousarray(gyro, float),
+        np.full(n, 25.0), np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, bool), np.empty((n, 0, 2)),
+        np.ones(n, np.uint16),
+    )  # fmt: skip
+
+
+def height_rmse_cm(name: str, test: int, seed: int) -> float:
+    run, block = recorded(test, seed)
+    estimate = filters.create(name, run.rig).process(block)[:, 0]
+    return 100 * float(np.sqrt(np.nanmean((estimate - run.truth().height_m) ** 2)))
+
+
+# ---- known answers ----
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+@pytest.mark.parametrize(("roll", "pitch"), [(0, 0), (30, -20), (-120, 45), (10, 80)])
+def test_static_tilt(name, roll, pitch):
+    r, p = np.radians([roll, pitch])
+    tilt = np.array([-np.sin(p), np.cos(p) * np.sin(r), np.cos(p) * np.cos(r)])
+    block = measurements(np.arange(50) / 100, np.tile(STANDARD_GRAVITY * tilt, (50, 1)), np.zeros((50, 3)))
+    estimate = filters.create(name, Rig().with_j2s((0.2, -0.1, 1.0))).process(block)
+    assert estimate[-1, 2:] == pytest.approx([roll, pitch], abs=1e-6)
+    assert estimate[-1, 0] == pytest.approx(tilt @ [0.2, -0.1, 1.0], abs=1e-9)
+    assert 0 < estimate[-1, 1] < estimate[0, 1]
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+def test_pure_rotation_at_a_constant_rate(name):
+    """A sensor on the joint's axis turns about x at 1 rad/s: roll is the angle turned by."""
+    t = np.arange(300) / 100
+    angle = t
+    tilt = np.column_stack([np.zeros(300), np.sin(angle), np.cos(angle)])
+    block = measurements(t, STANDARD_GRAVITY * tilt, np.tile([1.0, 0, 0], (300, 1)))
+    estimate = filters.create(name, Rig().with_j2s((0.5, 0, 0))).process(block)
+    assert np.abs(estimate[:, 2] - np.degrees(angle)).max() < 1e-6
+    assert np.abs(estimate[:, 3]).max() < 1e-6
+
+
+def test_joint_sees_through_a_constant_centripetal_acceleration():
+    """Turning about the vertical at 3 rad/s, 1 m off: the accelerometer leans by 43°, the constraint knows why."""
+    t, rate = np.arange(3000) / 100, 3.0
+    force = np.tile([-(rate**2), 0, STANDARD_GRAVITY], (3000, 1))
+    block = measurements(t, force, np.tile([0, 0, rate], (3000, 1)))
+    rig = Rig().with_j2s((1.0, 0.0, 0.0))
+    pitch = {name: filters.create(name, rig).process(block)[:, 3] for name in INERTIAL}
+    assert np.abs(pitch["joint"][20:]).max() < 0.5
+    assert np.abs(pitch["tilt"][20]) > 5
+
+
+def test_rig_calibration_is_applied():
+    rig = Rig(imu=Imu((0.1, -0.2, 0.3), (0.5, -0.5, 0.2), (1.02, 0.98, 1.01)))
+    force = np.array([0, 0, STANDARD_GRAVITY]) * rig.imu.accel_scale + rig.imu.accel_offset_m_s2
+    block = measurements(np.arange(500) / 100, np.tile(force, (500, 1)), np.tile(rig.imu.gyro_bias_rad_s, (500, 1)))
+    estimate = filters.create("tilt", rig).process(block)
+    assert np.abs(estimate[:, 2:]).max() < 1e-6
+
+
+def test_baro_follows_the_barometric_formula():
+    n = 400
+    fresh = np.zeros(n, bool)
+    fresh[::2] = True
+    pressure = np.where(np.arange(n) < 200, 101_325.0, 100_129.0)  # the standard atmosphere at 0 m and at 100 m
+    block = replace(
+        measurements(np.arange(n) / 100, np.tile([0, 0, STANDARD_GRAVITY], (n, 1)), np.zeros((n, 3))),
+        pressure_Pa=pressure, baro_fresh=fresh,
+    )  # fmt: skip
+    height = filters.create("baro", Rig()).process(block)[:, 0]
+    assert np.abs(height[:200]).max() == 0
+    assert height[-1] == pytest.approx(100.0, abs=0.2)
+    with_j2s = filters.create("baro", Rig().with_j2s((0.3, 0.0, 1.5))).process(block)[:, 0]
+    assert with_j2s - height == pytest.approx(1.5)
+
+
+# ---- the paper's Tests ----
+
+
+@pytest.mark.parametrize("test", [1, 2, 3])
+def test_methods_stand_in_the_papers_order(test):
+    errors = np.array([[height_rmse_cm(name, test, seed) for name in PAPER] for seed in range(5)])
+    joint, tilt, imu_baro, baro = errors.mean(axis=0)
+    assert joint <= 1.1
+    assert joint < tilt < imu_baro < baro
+    assert (errors[:, 0] < errors[:, 1]).all()
+
+
+def test_test_1_reaches_the_papers_figure():
+    assert np.mean([height_rmse_cm("joint", 1, seed) for seed in range(5)]) <= 0.58
+
+
+# ---- one result, however it is cut ----
+
+
+@pytest.mark.parametrize("name", filters.NAMES)
+def test_blocks_of_any_length_give_the_same_bits(name):
+    run, block = recorded(3, 1)
+    whole = filters.create(name, run.rig).process(block)
+    rng = np.random.default_rng(5)
+    for longest in (1, 7, 900):
+        part, rows, i = filters.create(name, run.rig), [], 0
+        while i < 3000:
+            count = int(rng.integers(1, longest + 1))
+            rows.append(part.process(block[i : min(i + count, 3000)]))
+            i += count
+        assert np.array_equal(np.concatenate(rows), whole[:3000], equal_nan=True)
+
+
+# ---- what no input may do ----
+
+
+def assert_sane(name: str, rig: Rig, block: Measurements) -> np.ndarray:
+    f = filters.create(name, rig)
+    estimate = f.process(block)
+    known = np.isfinite(estimate[:, 0])
+    assert known[20:].all()
+    assert (estimate[known, 1] >= 0).all() and np.isfinite(estimate[known]).all()
+    assert f.rejected > 0
+    return estimate
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_missing_and_saturated_readings_are_passed_by_prediction_and_counted(name):
+    run, block = recorded(2, 0)
+    rng = np.random.default_rng(1)
+    accel, gyro = block.accel_m_s2.copy(), block.gyro_rad_s.copy()
+    pressure, flags = block.pressure_Pa.copy(), block.flags.copy()
+    accel[rng.random(len(block)) < 0.05, 1] = np.nan
+    gyro[rng.random(len(block)) < 0.02] = np.inf
+    pressure[rng.random(len(block)) < 0.05] = np.nan
+    full = rng.random(len(block)) < 0.03
+    accel[full] = 78.4
+    flags[full] |= int(SampleFlags.ACCEL_SATURATED)
+    damaged = replace(block, accel_m_s2=accel, gyro_rad_s=gyro, pressure_Pa=pressure, flags=flags)
+    estimate = assert_sane(name, run.rig, damaged)
+    error = 100 * np.sqrt(np.nanmean((estimate[:, 0] - run.truth().height_m) ** 2))
+    assert error < {"joint": 4, "tilt": 8, "imu-baro": 80, "baro": 80}[name]
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+def test_lost_samples_and_a_hole_of_seconds(name):
+    run, block = recorded(1, 2)
+    kept = np.random.default_rng(2).random(len(block)) > 0.1
+    kept[2000:2400] = False
+    thinned = Measurements(*(np.ascontiguousarray(getattr(block, f)[kept]) for f in block.__slots__))
+    estimate = filters.create(name, run.rig).process(thinned)
+    error = np.abs(estimate[:, 0] - run.truth().height_m[kept])
+    assert np.isfinite(estimate).all()
+    assert np.sqrt(np.mean(error[:1500] ** 2)) < 0.04
+    after = thinned.time_s > 40.0
+    assert np.sqrt(np.mean(error[after] ** 2)) < {"joint": 0.015, "tilt": 0.1}[name]
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+def test_repeated_and_backward_stamps_bring_nothing_new(name):
+    run, block = recorded(1, 0, 20.0)
+    rows = np.sort(np.concatenate([np.arange(len(block)), np.arange(500, 600), [700] * 5]))
+    twice = Measurements(*(np.ascontiguousarray(getattr(block, f)[rows]) for f in block.__slots__))
+    estimate = assert_sane(name, run.rig, twice)
+    plain = filters.create(name, run.rig).process(block)
+    assert np.array_equal(estimate[-1], plain[-1])
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_garbage_leaves_no_trace_of_infinity(name):
+    rng = np.random.default_rng(3)
+    n = 2000
+    wild = np.where(rng.random((n, 3)) < 0.1, np.nan, rng.normal(0, 1e3, (n, 3)))
+    block = replace(
+        measurements(np.cumsum(rng.exponential(0.05, n)), wild, wild[::-1]),
+        pressure_Pa=np.where(rng.random(n) < 0.1, -1.0, rng.uniform(3e4, 1.1e5, n)), baro_fresh=rng.random(n) < 0.5,
+    )  # fmt: skip
+    assert_sane(name, Rig().with_j2s((0.1, 0.2, 0.5)), block)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 500])
+def test_joint_at_other_rates(rate_hz):
+    run = LinkRun(1, 0, 30.0, rate_hz)
+    estimate = filters.create("joint", run.rig).process(run.measurements())
+    assert 100 * np.sqrt(np.mean((estimate[:, 0] - run.truth().height_m) ** 2)) < 1.5
+
+
+# ---- what cannot run says why ----
+
+
+def test_without_j2s_the_reason_and_the_cure_are_named():
+    with pytest.raises(filters.CannotRun, match=r"calibrate joint.*--j2s X,Y,Z"):
+        filters.create("joint", Rig())
+    with pytest.raises(filters.CannotRun, match="BMP180"):
+        filters.create("baro", Rig(), Sensors.MPU6050)
+    with pytest.raises(LinkposeError, match="joint, tilt"):
+        filters.create("jiont", Rig())
+
+
+def test_tilt_without_j2s_gives_the_attitude_but_no_height():
+    _, block = recorded(1, 0, 20.0)
+    estimate = filters.create("tilt", Rig()).process(block)
+    assert np.isnan(estimate[:, :2]).all() and np.isfinite(estimate[:, 2:]).all()
