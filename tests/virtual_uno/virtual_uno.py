@@ -138,9 +138,11 @@ class VirtualUno:
         bmp180: dict[str, Any] | None = None,
         mice: Sequence[dict[str, Any]] = (),
         bootloader_s: float = 0.0,
+        boot_address: int = 0,
     ) -> None:
         """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
-        these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none).
+        these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
+        `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
         self._process = subprocess.Popen([_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._to_send = bytearray()
@@ -150,7 +152,7 @@ class VirtualUno:
         self.baro = Sensor(self, "bmp180", 2)
         self.mice = [Mouse(self, index) for index in range(len(mice))]
         options = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
-        options["bootloaderS"] = bootloader_s
+        options |= {"bootloaderS": bootloader_s, "bootAddress": boot_address}
         try:
             self._kinds = np.array(self.request("create", hex=str(Path(hex_path).resolve()), options=options)["kinds"])
         except Exception:
@@ -268,8 +270,17 @@ class VirtualUno:
         """Data memory: registers below 0x100, SRAM from there to 0x8FF."""
         return base64.b64decode(self.request("peek", address=address, length=length)["bytes"])
 
+    def flash(self, address: int, length: int) -> bytes:
+        """Program memory."""
+        return base64.b64decode(self.request("flash", address=address, length=length)["bytes"])
+
+    def stick_flash(self, address: int, bits: int) -> None:
+        """Bits of a byte of program memory that from now on can only be programmed to 0."""
+        self.request("stick_flash", address=address, bits=bits)
+
     def state(self) -> dict[str, Any]:
-        """Counters of the emulation: cycle, sleep_cycles, conversions, conversions_disturbed, contentions, sda_held."""
+        """Counters of the emulation: cycle, sleep_cycles, conversions, conversions_disturbed, contentions, sda_held,
+        pages_written."""
         return self.request("state")
 
 

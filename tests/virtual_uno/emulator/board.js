@@ -11,6 +11,7 @@ const { Mpu6050 } = require("./mpu6050");
 const { Ps2Host } = require("./ps2host");
 const { Ps2Mouse } = require("./ps2mouse");
 const { seededRandom } = require("./random");
+const { SelfProgramming } = require("./self_programming");
 const { SerialLine } = require("./serial_line");
 const { Timer } = require("./timer");
 const { Twi } = require("./twi");
@@ -37,14 +38,17 @@ class Board {
    *  @param {object[]} [options.mice] see Ps2Mouse; one for each port from the first on
    *  @param {number} [options.startUpS] from a reset to the first instruction
    *  @param {number} [options.bootloaderS] how long the UNO's bootloader waits for a program after a reset from outside;
-   *    it clears MCUSR before it starts the one that is there. 0: no bootloader */
-  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S, bootloaderS = 0 }) {
+   *    it clears MCUSR before it starts the one that is there. 0: no bootloader
+   *  @param {number} [options.bootAddress] where every reset begins: that of a bootloader which is part of the program */
+  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S, bootloaderS = 0, bootAddress = 0 }) {
     const random = seededRandom(seed);
     this.startUpCycles = startUpS * CLOCK_HZ;
     this.bootloaderCycles = bootloaderS * CLOCK_HZ;
     this.log = new Log();
     this.cpu = new Cpu(readHex(hex), this.log);
     const { cpu } = this;
+    cpu.resetVector = bootAddress >> 1;
+    this.selfProgramming = new SelfProgramming(cpu);
     for (let address = 0x100; address < cpu.data.length; address += 1) cpu.data[address] = random() * 256;
     this.ports = makePorts(cpu);
     this.timers = [0, 1, 2].map((number) => new Timer(cpu, number));

@@ -12,6 +12,7 @@ const MCUSR = 0x54;
 const GLOBAL_INTERRUPT_ENABLE = 0x80;
 const SLEEP_ENABLE = 0x01;
 const OPCODE_SLEEP = 0x9588;
+const OPCODE_SPM = 0x95e8;
 const INTERRUPT_CYCLES = 4; // datasheet 7.7.1: until the vector's first instruction
 const WAKE_CYCLES = 4; // datasheet 7.7.1: in addition, out of sleep
 
@@ -32,6 +33,8 @@ class Cpu extends CPU {
     this.asleep = false;
     this.haltedUntil = 0;
     this.sleepCycles = 0;
+    this.resetVector = 0; // a word address, as the fuse BOOTRST chooses it
+    this.selfProgramming = null; // what carries SPM out
   }
 
   /** The present, exact inside an event too (instructions run on over an event's cycle). */
@@ -77,7 +80,7 @@ class Cpu extends CPU {
     if (causeKept) this.data[MCUSR] = cause === RESET_CAUSE.powerOn ? cause : flags | cause;
     this.pendingInterrupts.fill(null);
     this.nextInterrupt = -1;
-    this.pc = 0;
+    this.pc = this.resetVector;
     this.SP = FIRST_SRAM + SRAM_BYTES - 1;
     this.asleep = false;
     this.haltedUntil = this.now + startUpCycles;
@@ -99,6 +102,7 @@ class Cpu extends CPU {
       avrInstruction(this);
       if ((opcode & 0xff00) === 0x9800) this.cycles += 1; // CBI takes 2 cycles, avr8js counts 1
       else if (opcode === OPCODE_SLEEP && data[SMCR] & SLEEP_ENABLE) this.asleep = true;
+      else if (opcode === OPCODE_SPM) this.selfProgramming.execute();
       if (this.nextEventCycle <= this.cycles) this.#runEvents();
       const wanted = this.nextInterrupt >= 0 && !this.asleep;
       if (wanted && enabledBefore && data[SREG] & GLOBAL_INTERRUPT_ENABLE) this.#enterInterrupt();

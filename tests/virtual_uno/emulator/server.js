@@ -103,8 +103,15 @@ const OPERATIONS = {
   peek({ address, length }) {
     return { bytes: Buffer.from(board.cpu.data.subarray(address, address + length)).toString("base64") };
   },
+  flash({ address, length }) {
+    return { bytes: Buffer.from(board.cpu.progBytes.subarray(address, address + length)).toString("base64") };
+  },
+  stick_flash({ address, bits }) {
+    board.selfProgramming.stuck.set(address >> 1, bits << (8 * (address & 1)));
+    return {};
+  },
   state() {
-    const { cpu, bmp180, ports, bus } = board;
+    const { cpu, bmp180, ports, bus, selfProgramming } = board;
     return {
       cycle: cpu.cycles,
       sleep_cycles: cpu.sleepCycles,
@@ -112,6 +119,7 @@ const OPERATIONS = {
       conversions_disturbed: bmp180.disturbed,
       contentions: ports.B.contentions + ports.C.contentions + ports.D.contentions,
       sda_held: bus.sdaHeld,
+      pages_written: selfProgramming.pagesWritten,
     };
   },
 };
