@@ -34,7 +34,7 @@ def firmware_hex() -> Path:
         "PLATFORMIO_DISABLE_UPGRADE_CHECK": "true",
         "PLATFORMIO_NO_ANSI": "true",
     }
-    pio = Path(sys.executable).with_name("pio")
+    pio = str(Path(sys.executable).with_name("pio"))
     with (HERE / "conftest.py").open() as lock:  # several test processes may want it at once
         fcntl.flock(lock, fcntl.LOCK_EX)
         for command in ([sys.executable, "firmware/platform/make_core.py"], [pio, "run", "-s", "-e", "uno_distro"]):

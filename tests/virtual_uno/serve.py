@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -20,7 +21,7 @@ from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
 
 from linkpose.simulation.link import simulate  # noqa: E402
-from virtual_uno import VirtualUno, VirtualUnoError  # noqa: E402
+from virtual_uno import Mouse, VirtualUno, VirtualUnoError  # noqa: E402
 
 DEFAULT_HEX = HERE.parents[1] / ".pio" / "build" / "uno_distro" / "firmware.hex"
 
@@ -129,7 +130,7 @@ class Faulty:
         for name, sensor in (("imu", uno.imu), ("baro", uno.baro)):
             self._named[f"{name}-unplug"] = sensor.unplug
             self._named[f"{name}-plug"] = sensor.plug
-            self._named[f"{name}-nack"] = lambda sensor=sensor: sensor.nack(address=True)
+            self._named[f"{name}-nack"] = partial(sensor.nack, address=True)
             self._named[f"{name}-ok"] = sensor.nack
         self._valued: dict[str, Callable[[str], None]] = {
             "sda-hold": lambda value: uno.hold_sda(int(value) if value else None),
@@ -138,11 +139,10 @@ class Faulty:
         for number, mouse in enumerate(uno.mice, start=1):
             self._named[f"mouse{number}-unplug"] = mouse.unplug
             self._named[f"mouse{number}-plug"] = mouse.plug
-            self._valued[f"mouse{number}-parity"] = lambda value, mouse=mouse: mouse.spoil_parity_every(float(value))
+            self._valued[f"mouse{number}-parity"] = partial(self._spoil_parity, mouse)
         for kind in ("flip", "drop", "insert"):
             for way in ("to_host", "to_board"):
-                name = f"{kind}-{way.replace('_', '-')}"
-                self._valued[name] = lambda value, kind=kind, way=way: self._disturb_line(way, kind, float(value))
+                self._valued[f"{kind}-{way.replace('_', '-')}"] = partial(self._disturb_line, way, kind)
 
     def act(self, text: str) -> None:
         """Raises VirtualUnoError for a fault that there is not."""
@@ -155,8 +155,11 @@ class Faulty:
         except (KeyError, ValueError):
             raise VirtualUnoError(f"there is no fault {text!r}: serve.py --help lists them") from None
 
-    def _disturb_line(self, way: str, kind: str, probability: float) -> None:
-        setattr(self._server, way, getattr(self._server, way)._replace(**{kind: probability}))
+    def _spoil_parity(self, mouse: Mouse, seconds: str) -> None:
+        mouse.spoil_parity_every(float(seconds))
+
+    def _disturb_line(self, way: str, kind: str, probability: str) -> None:
+        setattr(self._server, way, getattr(self._server, way)._replace(**{kind: float(probability)}))
         self._server.apply_line()
 
 

@@ -313,13 +313,17 @@ def test_saturation_is_flagged(board: MakeBoard) -> None:
     assert flags & SampleFlags.GYRO_SATURATED
 
 
-def test_highest_rate_without_mice(board: MakeBoard) -> None:
-    link = board()
+def at_500_hz(link: WireLink) -> WireLink:
     link.boot()
     link.carry_out(DEFAULTS._replace(sample_rate_hz=500))
     link.run_ms(300)
     link.carry_out(Start())
     link.forget()
+    return link
+
+
+def test_highest_rate_without_mice(board: MakeBoard) -> None:
+    link = at_500_hz(board())
     link.run_ms(5000)
     assert 2499 <= len(link.samples) <= 2501
     assert not seq_gaps(link.samples).any()
@@ -348,12 +352,7 @@ def longest_run(memory: bytes) -> int:
 
 def test_a_full_transmitter_drops_whole_frames(board: MakeBoard) -> None:
     """PINGs faster than PONGs fit beside 500 SAMPLEs a second: what arrives is sound, what is missing is counted."""
-    link = board()
-    link.boot()
-    link.carry_out(DEFAULTS._replace(sample_rate_hz=500))
-    link.run_ms(300)
-    link.carry_out(Start())
-    link.forget()
+    link = at_500_hz(board())
     for token in range(1000):
         link.send(Ping(token))
         if token % 2:

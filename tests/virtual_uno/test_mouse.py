@@ -42,7 +42,7 @@ class Desk:
 
     def move(self, x_mm: float, y_mm: float, duration_s: float) -> None:
         now = self.uno.time_s
-        self.mouse.feed([now, now + duration_s], [[0, 0], [x_mm, y_mm]])
+        self.mouse.feed([now, now + duration_s], np.array([[0, 0], [x_mm, y_mm]]))
 
 
 @pytest.fixture

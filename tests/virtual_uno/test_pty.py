@@ -15,10 +15,11 @@ import serial
 from pty_server import PtyServer
 from wire_link import WireLink
 
-from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
 from linkpose.wire.messages import BAUD, Ack, Configure, Hello, Message, Sample, Start
 
 MakeBoard = Callable[..., WireLink]
+SERVE = Path(__file__).with_name("serve.py")
 LIMIT_S = 20.0  # of waiting for anything
 
 
@@ -28,7 +29,7 @@ class Host:
     def __init__(self, link: Path, baud: int = BAUD) -> None:
         self.port = serial.Serial(str(link), baud, timeout=0.02)
         self.decoder = StreamDecoder()
-        self.messages: list[Message] = []
+        self.messages: list[Message | OtherProtocol] = []
 
     def read_until(self, enough: Callable[[], bool]) -> None:
         end = time.monotonic() + LIMIT_S
@@ -36,7 +37,7 @@ class Host:
             assert time.monotonic() < end, f"came: {self.messages[-3:]}, {self.decoder.corrupt}"
             self.messages += self.decoder.feed(self.port.read(self.port.in_waiting or 1))
 
-    def expect(self, kind: type) -> Message:
+    def expect(self, kind: type) -> Message | OtherProtocol:
         self.read_until(lambda: any(isinstance(message, kind) for message in self.messages))
         index = next(i for i, message in enumerate(self.messages) if isinstance(message, kind))
         message = self.messages[index]
@@ -47,6 +48,9 @@ class Host:
         self.expect(Hello)
         self.port.write(encode(Start()))
         self.expect(Ack)
+
+    def read_samples(self, count: int) -> None:
+        self.read_until(lambda: len(self.samples) >= count)
 
     @property
     def samples(self) -> list[Sample]:
@@ -62,7 +66,7 @@ def test_a_host_opens_the_port_and_reads_the_stream(board: MakeBoard, tmp_path: 
     with PtyServer(board().uno, tmp_path / "port", paced=False):
         host = Host(tmp_path / "port")
         host.start()
-        host.read_until(lambda: len(host.samples) >= 6000)
+        host.read_samples(6000)
         assert whole(host.samples)
         assert host.decoder.corrupt.total == 0
         host.port.close()
@@ -72,9 +76,9 @@ def test_paced_bytes_never_come_before_their_time(board: MakeBoard, tmp_path: Pa
     with PtyServer(board().uno, tmp_path / "port") as server:
         host = Host(tmp_path / "port")
         host.start()
-        host.read_until(lambda: len(host.samples) >= 1)
+        host.read_samples(1)
         first, begin = host.samples[0], time.monotonic()
-        host.read_until(lambda: len(host.samples) >= 100)
+        host.read_samples(100)
         wall_s, board_s = time.monotonic() - begin, (host.samples[-1].t_us - first.t_us) / 1e6
         host.port.close()
     statistics = server.stop()
@@ -88,7 +92,7 @@ def test_opening_the_port_resets_the_board(board: MakeBoard, tmp_path: Path) -> 
         for _ in range(3):
             host = Host(tmp_path / "port")
             host.start()
-            host.read_until(lambda host=host: len(host.samples) >= 10)
+            host.read_samples(10)
             assert host.samples[0].seq == 0
             host.port.close()
             end = time.monotonic() + LIMIT_S
@@ -102,7 +106,7 @@ def test_a_pulled_cable_takes_the_port_away_and_gives_it_back(board: MakeBoard, 
     with PtyServer(board().uno, link, paced=False, reset_on_open=False) as server:
         host = Host(link)
         host.start()
-        host.read_until(lambda: len(host.samples) >= 10)
+        host.read_samples(10)
         server.call(server.pull_cable)
         with pytest.raises(serial.SerialException):
             host.read_until(lambda: False)
@@ -113,7 +117,7 @@ def test_a_pulled_cable_takes_the_port_away_and_gives_it_back(board: MakeBoard, 
         while not link.exists() and time.monotonic() < end:
             time.sleep(0.001)
         again = Host(link)
-        again.read_until(lambda: len(again.samples) >= 10)
+        again.read_samples(10)
         assert again.samples[0].seq > host.samples[-1].seq  # it went on with its own supply
         assert whole(again.samples)
         again.port.close()
@@ -162,7 +166,7 @@ def test_a_host_that_stalls_is_in_step_again(board: MakeBoard, tmp_path: Path) -
 
 def test_the_command_serves_and_reports(firmware_hex: Path, tmp_path: Path) -> None:
     link = tmp_path / "port"
-    command = [sys.executable, Path(__file__).with_name("serve.py"), "--hex", firmware_hex, "--link", link]
+    command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(link)]
     options = ["--flat-out", "--duration", "20", "--test", "2", "--fault", "5:imu-unplug", "--fault", "6:imu-plug"]
     with subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as served:
         assert served.stdout
@@ -185,9 +189,8 @@ def test_the_command_serves_and_reports(firmware_hex: Path, tmp_path: Path) -> N
     ("arguments", "says"), [(["--hex", "no.hex"], "no.hex"), (["--fault", "0:fire"], "there is no fault 'fire'")]
 )
 def test_the_command_says_what_is_wrong(firmware_hex: Path, tmp_path: Path, arguments: list[str], says: str) -> None:
-    script = Path(__file__).with_name("serve.py")
-    command = [sys.executable, script, "--hex", firmware_hex, "--link", tmp_path / "port", "--duration", "1"]
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=30)
+    command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(tmp_path / "port")]
+    done = subprocess.run([*command, "--duration", "1", *arguments], capture_output=True, text=True, timeout=30)
     assert done.returncode == 1
     assert says in done.stderr
     assert "Traceback" not in done.stderr

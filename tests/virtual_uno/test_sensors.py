@@ -106,7 +106,9 @@ def test_mpu6050_self_test_response_fits_its_trim(asleep: MakeBoard) -> None:
     uno.imu.feed([0], [[0, 0, 1, 0, 0, 0, 25]])
     plain = np.array(burst(awake(uno, accel_config=0x10)))
     excited = np.array(burst(awake(uno, accel_config=0xF0, gyro_config=0xE0)))
-    x, y, z, a = uno.transact(MPU, b"\x0d", 4) or ()
+    trim_bytes = uno.transact(MPU, b"\x0d", 4)
+    assert trim_bytes is not None
+    x, y, z, a = trim_bytes
     accel_codes = np.array([x >> 5 << 2 | a >> 4 & 3, y >> 5 << 2 | a >> 2 & 3, z >> 5 << 2 | a & 3])
     gyro_codes = np.array([x & 31, y & 31, z & 31])
     assert accel_codes.tolist() == [13, 14, 17]

@@ -136,7 +136,7 @@ class Twi {
 
   #stop() {
     this.#after(1, () => {
-      if (this.bus.sdaHeld) {
+      if (this.owner && this.bus.sdaHeld) {
         this.#stop(); // SDA cannot rise: TWSTO stays set
         return;
       }
