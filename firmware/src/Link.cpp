@@ -48,6 +48,11 @@ void Link::run() {
   send_status();
 }
 
+void Link::configure(const wire::Configure& settings) {
+  sampler_.configure(settings);
+  mice_.configure(settings.sample_rate_hz, settings.mouse_counts_per_mm);
+}
+
 void Link::receive() {
   uint8_t byte;
   while (uart::take(byte, received_us_)) {
@@ -62,7 +67,7 @@ void Link::receive() {
 }
 
 void Link::greet() {
-  if (greeted_ || !(sampler_.sensors_settled() || clock::now_us() > kGreetUs)) return;
+  if (greeted_ || !((sampler_.sensors_settled() && mice_.settled()) || clock::now_us() > kGreetUs)) return;
   greeted_ = true;
   send_hello();
 }
@@ -85,7 +90,11 @@ void Link::send_hello() {
   static_assert(sizeof(wire::Hello) - sizeof hello.mice - offsetof(wire::Hello, ac1) == 2 * Bmp180::kCalibrationWords,
                 "AC1 to MD stand side by side");
   memcpy(&hello.ac1, words, 2 * Bmp180::kCalibrationWords);
-  uart::put(wire::Hello::kType, &hello, wire::Hello::size(0));
+  for (uint8_t i = 0; i < Mice::kPorts; i++) {
+    const Ps2Mouse& mouse = mice_.mouse(i);
+    hello.mice[i] = {mouse.id(), mouse.counts_per_mm(), mouse.report_rate_hz()};
+  }
+  uart::put(wire::Hello::kType, &hello, wire::Hello::size(Mice::kPorts));
 }
 
 void Link::send_status() {
@@ -112,7 +121,11 @@ void Link::send_status() {
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
   status.cpu_load = slept_us < elapsed_us ? static_cast<uint16_t>((elapsed_us - slept_us) / (elapsed_us / 1000)) : 0;
-  uart::put(wire::Status::kType, &status, wire::Status::size(0));
+  for (uint8_t i = 0; i < Mice::kPorts; i++) {
+    const Ps2Mouse& mouse = mice_.mouse(i);
+    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets()};
+  }
+  uart::put(wire::Status::kType, &status, wire::Status::size(Mice::kPorts));
 }
 
 void Link::send_pong(uint32_t token) {

@@ -3,11 +3,12 @@
 #include <Commands.h>
 #include <FrameDecoder.h>
 
+#include "Mice.h"
 #include "Sampler.h"
 
 class Link : public commands::Board {
  public:
-  explicit Link(Sampler& sampler) : sampler_(sampler) {}
+  Link(Sampler& sampler, Mice& mice) : sampler_(sampler), mice_(mice) {}
 
   // The time from wake-up to the present, for the longest pass in STATUS.
   void note_pass(uint32_t us);
@@ -16,16 +17,16 @@ class Link : public commands::Board {
   bool streaming() const override { return sampler_.streaming(); }
   uint16_t sample_rate_hz() const override { return sampler_.settings().sample_rate_hz; }
   bool imu_present() const override { return sampler_.imu().present(); }
-  uint8_t mouse_ports() const override { return 0; }
-  uint8_t mice_in_sample() const override { return 0; }
+  uint8_t mouse_ports() const override { return Mice::kPorts; }
+  uint8_t mice_in_sample() const override { return mice_.in_sample(); }
   void send_hello() override;
   void send_pong(uint32_t token) override;
   void acknowledge(uint8_t command) override;
   void refuse(uint8_t command, wire::NakReason reason) override;
-  void configure(const wire::Configure& settings) override { sampler_.configure(settings); }
+  void configure(const wire::Configure& settings) override;
   void start() override { sampler_.start(); }
   void stop() override { sampler_.stop(); }
-  void reset_mice(uint8_t) override {}
+  void reset_mice(uint8_t ports) override { mice_.reset(ports); }
   void self_test() override { sampler_.self_test(); }
 
  private:
@@ -34,6 +35,7 @@ class Link : public commands::Board {
   void send_status();
 
   Sampler& sampler_;
+  Mice& mice_;
   FrameDecoder decoder_;
   uint32_t received_us_ = 0;
   uint32_t status_us_ = 0;

@@ -6,8 +6,6 @@
 
 namespace {
 
-constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8};
-
 Mpu6050::Settings imu_settings(const wire::Configure& settings) {
   return {settings.accel_range_g, settings.gyro_range_deg_s, settings.dlpf};
 }
@@ -17,8 +15,8 @@ constexpr uint32_t kSampleDeadlineUs = 1500;
 
 }  // namespace
 
-Sampler::Sampler()
-    : settings_(kDefaults), imu_(imu_settings(kDefaults)), baro_(kDefaults.baro_oversampling) {}
+Sampler::Sampler(const wire::Configure& settings, Mice& mice)
+    : mice_(mice), settings_(settings), imu_(imu_settings(settings)), baro_(settings.baro_oversampling) {}
 
 void Sampler::configure(const wire::Configure& settings) {
   settings_ = settings;
@@ -29,6 +27,7 @@ void Sampler::configure(const wire::Configure& settings) {
 
 void Sampler::start() {
   streaming_ = true;
+  mice_.forget_movement();
   first_tick_ = clock::tick().number + 1;
 }
 
@@ -115,7 +114,11 @@ void Sampler::send_sample() {
   if (reading_.valid && reading_.accel_saturated) sample.flags |= flag::kAccelSaturated;
   if (reading_.valid && reading_.gyro_saturated) sample.flags |= flag::kGyroSaturated;
   if (baro_.valid()) sample.flags |= flag::kBaroValid;
-  uart::put(wire::Sample::kType, &sample, wire::Sample::size(0));
+  sample.flags |= mice_.flags();
+  const uint8_t count = mice_.in_sample();
+  for (uint8_t i = 0; i < count; i++) sample.mice[i] = {mice_.mouse(i).dx(), mice_.mouse(i).dy()};
+  // Movement that did not get into the transmit ring goes into the next SAMPLE.
+  if (uart::put(wire::Sample::kType, &sample, wire::Sample::size(count))) mice_.forget_movement();
 }
 
 void Sampler::send_self_test_result() {

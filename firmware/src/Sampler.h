@@ -6,9 +6,11 @@
 #include <Messages.h>
 #include <Mpu6050.h>
 
+#include "Mice.h"
+
 class Sampler {
  public:
-  Sampler();
+  Sampler(const wire::Configure& settings, Mice& mice);
 
   void run();
 
@@ -35,6 +37,7 @@ class Sampler {
   void send_sample();
   void send_self_test_result();
 
+  Mice& mice_;
   wire::Configure settings_;
   Mpu6050 imu_;
   Bmp180 baro_;

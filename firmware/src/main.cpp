@@ -8,10 +8,15 @@
 
 #include "Led.h"
 #include "Link.h"
+#include "Mice.h"
 #include "Sampler.h"
 
-static Sampler sampler;
-static Link host(sampler);
+// In force until the host says otherwise: 100 Hz, 8 g, 1000 deg/s, DLPF 3, oversampling 1, 8 counts/mm.
+static constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8};
+
+static Mice mice(kDefaults.mouse_counts_per_mm);
+static Sampler sampler(kDefaults, mice);
+static Link host(sampler, mice);
 static Led led(sampler);
 
 void setup() {
@@ -20,13 +25,15 @@ void setup() {
   board::begin_led();
   twi::begin();
   uart::begin();
-  clock::begin(sampler.settings().sample_rate_hz);
+  mice.begin(kDefaults.sample_rate_hz);
+  clock::begin(kDefaults.sample_rate_hz);
 }
 
 void loop() {
   const uint32_t woken_us = clock::now_us();
   board::feed_watchdog();
   sampler.run();
+  mice.run();
   host.run();
   led.run();
   board::scan_stack();

@@ -5,6 +5,7 @@
 #include <util/atomic.h>
 
 #include "Idle.h"
+#include "Ps2Ports.h"
 #include "Twi.h"
 
 namespace clock {
@@ -84,6 +85,7 @@ ISR(TIMER1_COMPA_vect) {
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
   twi::start_burst();
+  ps2::start_prepared();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
   clock::tick_us += (clock::period_steps >> 1) + (halves >> 1);

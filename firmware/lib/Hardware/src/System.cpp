@@ -73,7 +73,6 @@ void power_down_unused() {
   power_adc_disable();
   power_spi_disable();
   power_timer0_disable();
-  power_timer2_disable();
 }
 
 }  // namespace board

@@ -1,0 +1,115 @@
+// The bits of a PS/2 line, seen from the host: one falling edge of the mouse's clock at a time.
+//
+// A transaction is an optional byte to the mouse and a number of bytes from it. Between two transactions the host holds
+// the clock low, so that the mouse can neither send nor disturb anything. falling_edge() is called from the pin-change
+// interrupt, and says what to do with the lines; it keeps all bits of a byte in one word with a marker bit, so that it
+// needs neither a counter nor a loop.
+//
+// Timing and framing: A. Chapweske, "The PS/2 Mouse/Keyboard Protocol".
+#pragma once
+#include <stdint.h>
+
+class Ps2Bits {
+ public:
+  enum class Outcome : uint8_t {
+    kRunning,
+    kDone,
+    kBadParity,   // after which the clock is held: the mouse has sent the byte and waits
+    kBadFraming,  // start or stop bit wrong: in step no more
+    kRefused,     // the mouse did not acknowledge the byte it was sent
+  };
+  enum class Act : uint8_t { kNone, kDataLow, kDataHigh, kHoldClock };
+
+  static constexpr uint8_t kMaxAnswers = 4;
+  // One step of the time that falling_edge() is told; it may wrap.
+  static constexpr uint8_t kStepUs = 64;
+
+  // Before the clock is let go: data is low then already, which is the start bit.
+  void begin_sending(uint8_t byte, uint8_t answers) {
+    shift_ = byte | (odd_parity(byte) ? kSendParity : 0) | kSendStop | kSendMarker;
+    sending_ = true;
+    begin(answers);
+  }
+  void begin_listening(uint8_t answers) {
+    shift_ = kReceiveMarker;
+    sending_ = false;
+    begin(answers);
+  }
+
+  Act falling_edge(bool data, uint8_t now) {
+    const uint8_t gap = now - last_edge_;
+    last_edge_ = now;
+    if (sending_) return send_bit(data);
+    // A byte whose clock stopped for 2 ms is given up: this edge is the first of another one.
+    if (gap > kGapSteps && shift_ != kReceiveMarker) {
+      shift_ = kReceiveMarker;
+      resyncs_++;
+    }
+    shift_ >>= 1;
+    if (data) shift_ |= kReceiveMarker;
+    return shift_ & 1 ? end_byte() : Act::kNone;
+  }
+
+  Outcome outcome() const { return outcome_; }
+  uint8_t received() const { return received_; }  // sound bytes
+  const uint8_t* bytes() const { return bytes_; }
+  uint16_t resyncs() const { return resyncs_; }
+
+ private:
+  static constexpr uint16_t kSendParity = 1 << 8;
+  static constexpr uint16_t kSendStop = 1 << 9;
+  static constexpr uint16_t kSendMarker = 1 << 10;
+  // Bits come in at the top and push the marker down: 11 of them put it at bit 0, the start bit at bit 1.
+  static constexpr uint16_t kReceiveMarker = 1 << 11;
+  static constexpr uint8_t kGapSteps = 2000 / kStepUs;
+
+  static bool odd_parity(uint8_t byte) {
+    byte ^= byte >> 4;
+    byte ^= byte >> 2;
+    byte ^= byte >> 1;
+    return !(byte & 1);
+  }
+
+  void begin(uint8_t answers) {
+    expected_ = answers;
+    received_ = 0;
+    outcome_ = Outcome::kRunning;
+  }
+
+  Act send_bit(bool data) {
+    if (shift_ == 1) {  // all is out: this is the mouse's acknowledge bit
+      if (data) return end(Outcome::kRefused);
+      sending_ = false;
+      shift_ = kReceiveMarker;
+      return Act::kNone;
+    }
+    const bool bit = shift_ & 1;
+    shift_ >>= 1;
+    return bit ? Act::kDataHigh : Act::kDataLow;
+  }
+
+  Act end_byte() {
+    const bool start = shift_ & 1 << 1, parity = shift_ & 1 << 10, stop = shift_ & 1 << 11;
+    const uint8_t byte = static_cast<uint8_t>(shift_ >> 2);
+    shift_ = kReceiveMarker;
+    if (start || !stop) return end(Outcome::kBadFraming);
+    if (parity != odd_parity(byte)) return end(Outcome::kBadParity);
+    bytes_[received_] = byte;
+    received_ = received_ + 1;
+    return received_ == expected_ ? end(Outcome::kDone) : Act::kNone;
+  }
+
+  Act end(Outcome outcome) {
+    outcome_ = outcome;
+    return Act::kHoldClock;
+  }
+
+  uint16_t shift_ = kReceiveMarker;
+  uint16_t resyncs_ = 0;
+  uint8_t bytes_[kMaxAnswers];
+  uint8_t last_edge_ = 0;
+  uint8_t expected_ = 1;
+  volatile uint8_t received_ = 0;
+  volatile Outcome outcome_ = Outcome::kDone;
+  bool sending_ = false;
+};
