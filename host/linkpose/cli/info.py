@@ -17,9 +17,10 @@ OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of th
 
 @click.command(name="info")
 @options.port
+@click.option("--self-test", is_flag=True, help="Also run the MPU-6050's self-test; keep the board still.")
 @options.as_json
 @options.verbosity
-def command(port: str | None, json_lines: bool, verbose: bool, quiet: bool) -> None:
+def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, quiet: bool) -> None:
     """Show the board's versions, sensors, settings and link health. Takes about three seconds."""
     from linkpose.cli import live
     from linkpose.device.ports import choose_port
@@ -27,8 +28,9 @@ def command(port: str | None, json_lines: bool, verbose: bool, quiet: bool) -> N
 
     console = live.Console(quiet, verbose)
     with Session(port or choose_port(), console.say) as session:
+        tested = _self_test(session) if self_test else {}
         live.run(session, OBSERVED_S, lambda _: console.progress(lambda: "observing the link ..."))
-        report = _report(session, session.health())
+        report = _report(session, session.health()) | tested
     if json_lines:
         click.echo(json.dumps(report))
     else:
@@ -65,6 +67,17 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "clock_drift_std_ppm": _rounded(health.drift_std_ppm),
         "board": None if status is None else {k: v for k, v in status._asdict().items() if k not in ("t_us", "mice")},
     }
+
+
+def _self_test(session: Session) -> dict[str, Any]:
+    """How far each axis is from the factory's answer, and whether that is within the data sheet's limit."""
+    from linkpose.sensors.mpu6050 import SELF_TEST_LIMIT, self_test_deviation
+
+    deviations = self_test_deviation(session.self_test())
+    known = [deviation for deviation in deviations.values() if deviation is not None]
+    passed = bool(known) and all(abs(deviation) <= SELF_TEST_LIMIT for deviation in known)
+    percent = {axis: None if value is None else round(100 * value, 1) for axis, value in deviations.items()}
+    return {"self_test": "passed" if passed else "failed", "self_test_deviation_percent": percent}
 
 
 def _rounded(value: float | None) -> float | None:

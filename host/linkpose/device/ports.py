@@ -103,7 +103,7 @@ def _why_not(name: str, error: Exception) -> str:
         return f"{name} is in use by another program; close it and try again"
     if "no handler" in text or "invalid url" in text:
         return f"{name} is no port that can be opened; name a device such as /dev/ttyACM0 or COM3, or sim://link"
-    if code in (errno.ENOTTY, errno.EINVAL, errno.ENODEV, errno.EISDIR):
+    if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
         return f"{name} is not a serial port; `linkpose ports` lists those there are"
     return f"cannot open {name}: {error}"
 

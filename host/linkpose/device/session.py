@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple, TypeVar
 
@@ -41,6 +42,7 @@ from linkpose.wire.messages import (
 HANDSHAKE_TIMEOUT_S = 4.0  # a bootloader waits for up to two seconds before it starts the firmware
 ASK_INTERVAL_S = 0.4
 ANSWER_TIMEOUT_S = 1.0
+SELF_TEST_TIMEOUT_S = 3.0
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
@@ -163,8 +165,8 @@ class Session:
 
     def self_test(self) -> SelfTestResult:
         """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""
-        self._command(SelfTest(), Command.SELF_TEST)
-        return self._await(SelfTestResult, "SELF_TEST", 3.0)
+        with_ack = self._command(SelfTest(), Command.SELF_TEST)
+        return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
 
     def _command(self, message: Message, command: Command) -> Arrival:
         """Sends a command; the arrival that holds its ACK, from the ACK on. Raises LinkposeError on a NAK."""
@@ -177,9 +179,17 @@ class Session:
                     return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
         raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
 
-    def _await(self, kind: type[Answer], asked: str, timeout_s: float = ANSWER_TIMEOUT_S) -> Answer:
-        for arrival in self._arrivals(timeout_s):
-            for answer in arrival.messages:
+    def _await(
+        self,
+        kind: type[Answer],
+        asked: str,
+        heard: Sequence[Message | OtherProtocol] = (),
+        timeout_s: float = ANSWER_TIMEOUT_S,
+    ) -> Answer:
+        """The answer of a kind, from what was `heard` already or from what arrives within the time."""
+        arrivals = self._arrivals(timeout_s)
+        for messages in itertools.chain([heard], (arrival.messages for arrival in arrivals)):
+            for answer in messages:
                 if isinstance(answer, kind):
                     return answer
         raise LinkposeError(f"the board did not answer {asked}; unplug it, plug it in and try again")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, TypeVar
 
-from linkpose.wire.messages import SCALES
+from linkpose.wire.messages import SCALES, SelfTestResult
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,3 +35,25 @@ def temperature(count: Number) -> Number:
     """Die temperature in degC of a count, or of an array of them (register map, 4.18)."""
     scale = SCALES["SAMPLE.imu_temp"]
     return count * scale.scale + scale.offset
+
+
+SELF_TEST_LIMIT = 0.14  # of the factory's response (data sheet, 6.1 and 6.2)
+
+
+def self_test_deviation(result: SelfTestResult) -> dict[str, float | None]:
+    """How far each axis's answer to the self-test is from the factory's, as a share of that; None without a factory's.
+
+    Source: register map, 4.1, "Self-test registers"; readings at 8 g and 250 deg/s.
+    """
+    fine = result.trim_a
+    deviations: dict[str, float | None] = {}
+    for at, axis in enumerate("xyz"):
+        trim = getattr(result, f"trim_{axis}")
+        accel_code = (trim >> 3 & 0x1C) | (fine >> (4 - 2 * at) & 3)
+        gyro_code = trim & 0x1F
+        accel_factory = 4096 * 0.34 * (0.92 / 0.34) ** ((accel_code - 1) / 30)
+        gyro_factory = 25 * 131 * 1.046 ** (gyro_code - 1) * (-1 if axis == "y" else 1)
+        for sensor, code, factory in (("accel", accel_code, accel_factory), ("gyro", gyro_code, gyro_factory)):
+            answer = getattr(result, f"excited_{sensor}_{axis}") - getattr(result, f"plain_{sensor}_{axis}")
+            deviations[f"{sensor}_{axis}"] = answer / factory - 1 if code else None
+    return deviations

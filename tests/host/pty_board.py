@@ -1,0 +1,92 @@
+"""A simulated board at a pseudo terminal that can be pulled, reset, silenced and made to talk nonsense."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+from linkpose.simulation.board import SimulatedBoard
+from linkpose.simulation.link import LinkRun
+from linkpose.wire.messages import Configure
+
+
+def link_run(settings: Configure) -> LinkRun:
+    return LinkRun(
+        1,
+        0,
+        None,
+        settings.sample_rate_hz,
+        accel_range_g=settings.accel_range_g,
+        gyro_range_deg_s=settings.gyro_range_deg_s,
+        oversampling=settings.baro_oversampling,
+    )
+
+
+class PtyBoard:
+    """Serves a board at the symlink `path`. `spoil` may change what the board sends; `chatter` is said all the time."""
+
+    def __init__(
+        self, path: Path, spoil: Callable[[bytes], bytes] = lambda data: data, chatter: bytes = b""
+    ) -> None:
+        self.path = path
+        self.spoil = spoil
+        self.chatter = chatter
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __enter__(self) -> PtyBoard:
+        self.plug()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pull()
+
+    def plug(self) -> None:
+        """Switches a fresh board on and puts it at the path."""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._master)
+        tty.setraw(self._slave)
+        self._board, self._began = SimulatedBoard(link_run), time.monotonic()
+        self.path.symlink_to(os.ttyname(self._slave))
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def pull(self) -> None:
+        """The cable is pulled: the terminal vanishes, the board loses its power."""
+        if self._thread is None:
+            return
+        self._stop.set()
+        self._thread.join()
+        self._thread = None
+        self.path.unlink()
+        os.close(self._slave)
+        os.close(self._master)
+
+    def reset(self, says_hello: bool = True) -> None:
+        """The board starts anew at the same port, and says HELLO unless that gets lost."""
+        from linkpose.simulation import board as simulated
+        from linkpose.wire.frames import encode
+
+        self._board, self._began = SimulatedBoard(link_run), time.monotonic()
+        if says_hello:
+            os.write(self._master, encode(simulated.hello(simulated.DEFAULTS)))
+
+    def _serve(self) -> None:
+        while not self._stop.is_set():
+            heard = b""
+            if select.select([self._master], [], [], 0.004)[0]:
+                with contextlib.suppress(OSError):
+                    heard = os.read(self._master, 4096)
+            now_us = int((time.monotonic() - self._began) * 1e6)
+            said = self._board.advance(now_us) + self._board.receive(heard, now_us)
+            if said:
+                os.write(self._master, self.spoil(said))
+            if self.chatter:
+                os.write(self._master, self.chatter)

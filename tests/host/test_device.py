@@ -1,0 +1,201 @@
+"""The session: what can come at the other end of a cable, and what becomes of a recording then."""
+
+from __future__ import annotations
+
+import json
+import random
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pty_board import PtyBoard
+
+from linkpose.device import session as session_module
+from linkpose.device.session import Session
+from linkpose.recording.table import read_table
+from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.sensors.mpu6050 import self_test_deviation
+from linkpose.wire.frames import encode
+from linkpose.wire.messages import Configure, Hello
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """A handshake that gives up sooner."""
+    monkeypatch.setattr(session_module, "HANDSHAKE_TIMEOUT_S", 0.7)
+    monkeypatch.setattr(session_module, "ASK_INTERVAL_S", 0.1)
+
+
+def stranger(path: Path, chatter: bytes) -> PtyBoard:
+    """A port at which no board answers; what is said there is said again and again."""
+    return PtyBoard(path, spoil=lambda data: b"", chatter=chatter)
+
+
+OLD_HELLO = bytes.fromhex("01") + bytes([0, 9]) + b"\x11\x22\x33\x44" + b"whatever followed then"
+NEW_HELLO = bytes.fromhex("01") + bytes([2, 0]) + b"\x11\x22\x33\x44" + bytes(60)
+
+
+def framed(payload: bytes) -> bytes:
+    from binascii import crc_hqx
+
+    from cobs import cobs
+
+    return cobs.encode(payload + crc_hqx(payload, 0xFFFF).to_bytes(2, "little")) + b"\0"
+
+
+@pytest.mark.parametrize(
+    ("chatter", "sentence"),
+    [
+        (b"", "the board is silent"),
+        (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
+        (random.Random(3).randbytes(60), "only noise came"),
+        (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
+        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.0, the board's firmware 2.0"),
+    ],
+    ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
+)
+@pytest.mark.parametrize("command", ["record", "info", "estimate --live"])
+def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, sentence, command):
+    out = [tmp_path / "r.csv"] if command == "record" else []
+    with stranger(tmp_path / "port", chatter):
+        said = refused(*command.split(), "--port", tmp_path / "port", *out)
+    assert sentence in said
+    assert not (tmp_path / "r.csv").exists()
+
+
+def test_an_edited_schema_of_the_same_version_is_refused(impatient, refused, tmp_path):
+    from linkpose.simulation import board as simulated
+
+    hello = simulated.hello(simulated.DEFAULTS)._replace(schema_crc=1)
+    with stranger(tmp_path / "port", encode(hello)):
+        assert "linkpose flash" in refused("info", "--port", tmp_path / "port")
+
+
+def test_absent_busy_and_impossible_ports(refused, tmp_path):
+    assert "there is no port /dev/ttyNONE" in refused("info", "--port", "/dev/ttyNONE")
+    (tmp_path / "file").write_text("no port")
+    assert "is not a serial port" in refused("info", "--port", tmp_path / "file")
+    assert "is no port that can be opened" in refused("info", "--port", "nonsense://x")
+    assert "no simulated board 'nothing'" in refused("info", "--port", "sim://nothing")
+    assert "no option tset" in refused("info", "--port", "sim://link?tset=1")
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print):
+        assert "is in use by another program" in refused("info", "--port", tmp_path / "port")
+
+
+def test_settings_are_put_in_force_or_refused_with_the_reason():
+    with Session("sim://link", print) as session:
+        settings = Configure(200, 4, 500, 2, 0, 8)
+        hello = session.configure(settings)
+        assert (hello.sample_rate_hz, hello.accel_range_g, hello.gyro_range_deg_s) == (200, 4, 500)
+        with pytest.raises(session_module.LinkposeError, match="gyro range out of range"):
+            session.configure(settings._replace(gyro_range_deg_s=123))
+        deviations = self_test_deviation(session.self_test())
+    assert len(deviations) == 6
+    assert all(abs(deviation) < 0.001 for deviation in deviations.values())
+
+
+def test_a_board_that_streams_already_is_taken_over(tmp_path):
+    with PtyBoard(tmp_path / "port"):
+        first = Session(str(tmp_path / "port"), print)
+        next(iter(first.stream()))
+        first._link.close()  # as a killed program leaves it: no STOP
+        with Session(str(tmp_path / "port"), print) as second:
+            assert isinstance(second.hello, Hello)
+            seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]
+    assert seqs == list(range(30))
+
+
+def record_through(port: Path, out: Path, duration: float, *happenings) -> tuple[list[str], Session]:
+    """Records for a time of the board; each happening (after s, what) is done on the way."""
+    from linkpose.cli.live import Recorder
+    from linkpose.sensors.rig import Rig
+
+    said: list[str] = []
+    with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
+        waiting = list(happenings)
+        for placements in session.stream(duration):
+            recorder.take(placements)
+            if waiting and session.timeline.duration_s >= waiting[0][0]:
+                waiting.pop(0)[1]()
+        recorder.close("duration")
+    assert not waiting
+    return said, session
+
+
+def check_one_gap(out: Path, cause: str) -> None:
+    table = read_table(out, "recording")
+    marked = np.flatnonzero(table.columns["flags"].astype(int) & GAP_BEFORE)
+    assert len(marked) == 1
+    assert table.closing is not None
+    [gap] = table.closing["gaps"]
+    assert gap["cause"] == cause
+    time_s, seq = table.columns["time_s"], table.columns["seq"]
+    # Time runs on through the gap as the host's clock does, and seq counts the ticks that were missed.
+    assert gap["duration_s"] == pytest.approx(time_s[marked[0]] - time_s[marked[0] - 1], abs=1e-5)
+    assert seq[-1] == pytest.approx(time_s[-1] * 100, abs=3)
+    assert table.closing["lost"] == gap["lost"] == seq[-1] + 1 - len(table)
+    steps = np.delete(np.diff(time_s), marked[0] - 1)
+    assert steps.min() > 0.0099 and steps.max() < 0.0101
+
+
+def test_a_pulled_cable_is_waited_for_and_the_gap_is_marked(tmp_path):
+    with PtyBoard(tmp_path / "port") as board:
+        put_back = threading.Timer(0.6, board.plug)
+
+        def pull() -> None:
+            board.pull()
+            put_back.start()
+
+        said, session = record_through(tmp_path / "port", tmp_path / "r.csv", 2.0, (0.5, pull))
+    assert "is gone" in said[0] and "is back" in said[1]
+    assert len(session.health().gaps) == 1
+    check_one_gap(tmp_path / "r.csv", "cable")
+
+
+def test_a_reset_board_goes_on_with_the_settings_of_before(tmp_path):
+    with PtyBoard(tmp_path / "port") as board:
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 1.0, (0.4, board.reset))
+    assert "was reset (power on)" in said[0]
+    check_one_gap(tmp_path / "r.csv", "reset")
+
+
+def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
+    with PtyBoard(tmp_path / "port") as board:
+        reset = (0.3, lambda: board.reset(says_hello=False))
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 2.5, reset)
+    assert "was reset" in said[0]
+    check_one_gap(tmp_path / "r.csv", "reset")
+
+
+def test_corrupt_bytes_are_counted_and_lost_samples_too(tmp_path, linkpose):
+    rng = random.Random(5)
+
+    def flip(data: bytes) -> bytes:
+        if len(data) > 30 and rng.random() < 0.1:
+            at = rng.randrange(len(data))
+            return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+        return data
+
+    with PtyBoard(tmp_path / "port", spoil=flip):
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 3, "--json")
+    summary = json.loads(result.out.splitlines()[-1])
+    table = read_table(tmp_path / "r.csv", "recording")
+    seq = table.columns["seq"]
+    assert result.status == 0
+    assert summary["corrupt"] > 0
+    assert summary["lost"] == seq[-1] + 1 - len(table) > 0
+    assert summary["samples"] == len(table)
+    assert np.all(np.diff(seq) > 0)
+
+
+def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_path):
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        seqs = []
+        for placements in session.stream(1.5):
+            if not seqs:
+                time.sleep(1.0)  # a slow disk
+            seqs += [p.place.seq for p in placements]
+    assert seqs == list(range(150))
