@@ -41,7 +41,7 @@ class DeviceClock:
     @property
     def drift_ppm(self) -> float:
         """How much faster the board's clock runs than the host's, in parts per million."""
-        return -1e6 * self._rate
+        return 1e6 * (1 / (1 + self._rate) - 1)
 
     @property
     def drift_std_ppm(self) -> float:

@@ -147,7 +147,7 @@ def _from_capture(path: Path) -> Recording:
     restarts = sorted({before for before, hello in hellos if 0 < before < len(raw) and not hello.streaming})
     time_s, gap_before, gaps = _times(raw, restarts, settings.sample_rate_hz)
     flags = (raw["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
-    measurements = _measurements(raw, time_s, flags, settings, int(capture.mouse_count.max(initial=0)))
+    measurements = _measurements(raw, capture.mouse_count, time_s, flags, settings)
     remarks = [f"{path}: times are the board's own, for a raw capture holds no other clock"]
     if capture.corrupt.total:
         remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
@@ -177,7 +177,7 @@ def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[
 
 
 def _measurements(
-    raw: NDArray[np.void], time_s: Floats, flags: NDArray[np.int64], settings: Settings, mouse_ports: int
+    raw: NDArray[np.void], mouse_count: NDArray[np.uint8], time_s: Floats, flags: NDArray[np.int64], settings: Settings
 ) -> Measurements:
     """The same values, to the last bit, as `Converter` gives one by one."""
     valid = (flags & int(SampleFlags.IMU_VALID) != 0)[:, None]
@@ -187,8 +187,9 @@ def _measurements(
     gyro = np.round(gyro * mpu6050.gyro_scale(settings.gyro_range_deg_s), mpu6050.GYRO_DECIMALS)
     temp = np.round(mpu6050.temperature(raw["imu_temp"].astype(np.float64)), mpu6050.TEMPERATURE_DECIMALS)
     pressure, baro_temp, fresh = _baro(raw, flags, settings)
-    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :mouse_ports].astype(np.float64)
-    mouse_valid = flags[:, None] & np.array(MOUSE_VALID)[:mouse_ports] != 0
+    ports = int(mouse_count.max(initial=0))
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports].astype(np.float64)
+    mouse_valid = (flags[:, None] & np.array(MOUSE_VALID)[:ports] != 0) & (np.arange(ports) < mouse_count[:, None])
     return Measurements(
         time_s,
         np.where(valid, accel, np.nan),

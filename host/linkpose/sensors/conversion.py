@@ -20,6 +20,12 @@ BARO_VALID = int(SampleFlags.BARO_VALID)
 MOUSE_VALID = tuple(int(SampleFlags[f"MOUSE{port}_VALID"]) for port in (1, 2, 3, 4))
 GAP_BEFORE = int(SampleFlags.GAP_BEFORE)
 
+# Steps in one unit of what is kept. Rounded so, in floating point, a value is the same here and in NumPy: some lie
+# half-way between two decimals, and round(value, decimals) decides those by the exact value.
+_ACCEL_STEPS = 10.0**mpu6050.ACCEL_DECIMALS
+_GYRO_STEPS = 10.0**mpu6050.GYRO_DECIMALS
+_TEMPERATURE_STEPS = 10.0**mpu6050.TEMPERATURE_DECIMALS
+
 _NO_IMU = (math.nan,) * 7
 
 
@@ -83,13 +89,13 @@ class Converter:
         if flags & IMU_VALID:
             accel, gyro = self._accel, self._gyro
             imu = (
-                round(sample.accel_x * accel, mpu6050.ACCEL_DECIMALS),
-                round(sample.accel_y * accel, mpu6050.ACCEL_DECIMALS),
-                round(sample.accel_z * accel, mpu6050.ACCEL_DECIMALS),
-                round(sample.gyro_x * gyro, mpu6050.GYRO_DECIMALS),
-                round(sample.gyro_y * gyro, mpu6050.GYRO_DECIMALS),
-                round(sample.gyro_z * gyro, mpu6050.GYRO_DECIMALS),
-                round(mpu6050.temperature(sample.imu_temp), mpu6050.TEMPERATURE_DECIMALS),
+                round(sample.accel_x * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
+                round(sample.accel_y * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
+                round(sample.accel_z * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
+                round(sample.gyro_x * gyro * _GYRO_STEPS) / _GYRO_STEPS,
+                round(sample.gyro_y * gyro * _GYRO_STEPS) / _GYRO_STEPS,
+                round(sample.gyro_z * gyro * _GYRO_STEPS) / _GYRO_STEPS,
+                round(mpu6050.temperature(sample.imu_temp) * _TEMPERATURE_STEPS) / _TEMPERATURE_STEPS,
             )
         fresh = self._read_baro(sample, flags)
         mice = self._mice(sample, flags) if self._mouse_ports else ()

@@ -1,0 +1,347 @@
+"""Recordings: what is written is what is read, whatever happens to the file."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from linkpose.errors import LinkposeError
+from linkpose.recording import columns
+from linkpose.recording.fixedpoint import format_rows
+from linkpose.recording.reader import load_recording
+from linkpose.recording.table import read_table
+from linkpose.recording.writer import write_recording
+from linkpose.sensors import bmp180, mpu6050
+from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Joint, Rig
+from linkpose.simulation import board
+from linkpose.simulation.baro import DATASHEET_WORDS
+from linkpose.simulation.link import LinkRun
+from linkpose.wire.capture import decode_capture
+from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.messages import Configure, Hello, HelloMouse, Sample, SampleMouse
+
+CLI = [sys.executable, "-m", "linkpose"]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
+
+
+def test_the_data_sheets_example():
+    assert bmp180.compensate(27898, 23843, DATASHEET_WORDS, 0) == (150, 69964)
+    temperature, pressure = bmp180.compensate(np.array([27898] * 2), np.array([23843] * 2), DATASHEET_WORDS, 0)
+    assert temperature.tolist() == [150, 150] and pressure.tolist() == [69964, 69964]
+
+
+@pytest.mark.parametrize("range_g", [2, 4, 8, 16])
+@pytest.mark.parametrize("range_deg_s", [250, 500, 1000, 2000])
+def test_every_raw_count_comes_back_from_the_decimals_kept(range_g, range_deg_s):
+    counts = np.arange(-32768, 32768)
+    converter = Converter(Settings.of(hello_with(accel_range_g=range_g, gyro_range_deg_s=range_deg_s)))
+    rows = [converter.row(Sample(0, 0, c, c, c, c, c, c, c, 0, 0, 0, 1), 0.0, 0, 1).imu for c in counts.tolist()]
+    for at, scale, decimals in (
+        (0, mpu6050.accel_scale(range_g), mpu6050.ACCEL_DECIMALS),
+        (3, mpu6050.gyro_scale(range_deg_s), mpu6050.GYRO_DECIMALS),
+    ):
+        one_by_one = [row[at] for row in rows]
+        assert np.array_equal(one_by_one, np.round(counts * scale, decimals))
+        assert np.array_equal(np.rint(np.array(one_by_one) / scale), counts)
+        assert [float(f"{value:.{decimals}f}") for value in one_by_one] == one_by_one
+
+
+def hello_with(mice: int = 0, **settings: int) -> Hello:
+    hello = board.hello(board.DEFAULTS._replace(**settings))
+    return hello._replace(mice=tuple(HelloMouse(0, 8, 100) for _ in range(mice)))
+
+
+raw_samples = st.lists(
+    st.builds(
+        Sample,
+        seq=st.just(0),
+        t_us=st.just(0),
+        **{name: st.integers(-32768, 32767) for name in Sample._fields[2:9]},
+        baro_ut=st.integers(0, 65535),
+        baro_up=st.integers(0, 2**19 - 1),
+        baro_count=st.integers(0, 3),
+        flags=st.integers(0, 0x0FFF),
+        mice=st.lists(st.builds(SampleMouse, st.integers(-32768, 32767), st.integers(-32768, 32767)), max_size=3).map(
+            tuple
+        ),
+    ),
+    min_size=1,
+    max_size=30,
+)
+
+
+def equal(a: Measurements, b: Measurements) -> bool:
+    pairs = [(getattr(a, field), getattr(b, field)) for field in a.__slots__]
+    return all(np.array_equal(x, y, equal_nan=x.dtype == np.float64) for x, y in pairs)
+
+
+@settings(max_examples=60, deadline=None)
+@given(raw_samples, st.sampled_from([2, 8]), st.integers(0, 3))
+def test_live_csv_and_capture_give_the_same_measurements(tmp_path_factory, raw, range_g, oversampling):
+    """One by one as they arrive, read back from the CSV, and decoded at once from the raw bytes: all the same bits."""
+    folder = tmp_path_factory.mktemp("same")
+    hello = hello_with(mice=3, accel_range_g=range_g, baro_oversampling=oversampling)
+    raw = [s._replace(seq=i, t_us=10_000 * i) for i, s in enumerate(raw)]
+    write_recording(folder / "r.csv", hello, raw, "test", Rig(joint=Joint((1.0, 2.0, 3.0))), force=False)
+    (folder / "r.bin").write_bytes(encode(hello) + b"".join(map(encode, raw)))
+    converter = Converter(Settings.of(hello))
+    live = Measurements.of([converter.row(s, 0.01 * i, i, s.flags) for i, s in enumerate(raw)])
+    from_csv = load_recording(folder / "r.csv")
+    from_capture = load_recording(folder / "r.bin").measurements
+    assert equal(live, from_csv.measurements)
+    assert from_csv.rig == Rig(joint=Joint((1.0, 2.0, 3.0)))
+    mice = from_capture.mice_counts.shape[1]
+    assert np.array_equal(from_capture.mice_counts, live.mice_counts[:, :mice], equal_nan=True)
+    assert np.isnan(live.mice_counts[:, mice:]).all()
+    for field in ("time_s", "accel_m_s2", "gyro_rad_s", "imu_temp_degC", "pressure_Pa", "baro_temp_degC"):
+        assert np.array_equal(getattr(from_capture, field), getattr(live, field), equal_nan=True), field
+    assert np.array_equal(from_capture.baro_fresh, live.baro_fresh)
+    assert np.array_equal(from_capture.flags, live.flags)
+
+
+@given(st.binary(max_size=600), st.integers(0, 5))
+def test_a_capture_decodes_as_the_stream_does(noise, at):
+    frames = [encode(s) for s in LinkRun(duration_s=1.0).block(0, 8).samples()]
+    data = b"".join(frames[:at]) + noise + b"\0" + b"".join(frames[at:]) + encode(hello_with())
+    decoder = StreamDecoder()
+    stream = decoder.feed(data)
+    capture = decode_capture(data)
+    assert len(capture.samples) == sum(isinstance(m, Sample) for m in stream)
+    assert [m for _, m in capture.others] == [m for m in stream if not isinstance(m, Sample)]
+    assert capture.corrupt == decoder.corrupt
+
+
+def test_wraps_and_losses_in_a_capture(tmp_path):
+    run = list(LinkRun(duration_s=4.0).samples())
+    shifted = [s._replace(t_us=(s.t_us + 2**32 - 1_000_000) % 2**32, seq=s.seq) for s in run]
+    kept = shifted[:100] + shifted[105:]
+    (tmp_path / "r.bin").write_bytes(encode(hello_with()) + b"".join(map(encode, kept)))
+    recording = load_recording(tmp_path / "r.bin")
+    expected = np.delete(np.arange(400) * 0.01, range(100, 105))
+    assert np.allclose(recording.measurements.time_s, expected, atol=1e-9)
+    assert any("5 samples lost in 1 gaps" in remark for remark in recording.remarks)
+
+
+@given(st.lists(st.floats(-1e9, 1e9) | st.just(float("nan")), min_size=1, max_size=8), st.integers(0, 7))
+def test_numbers_as_text(values, decimals):
+    text = format_rows(np.array([values]), np.full(len(values), decimals))
+    for word, value in zip(text.rstrip("\n").split(","), values, strict=True):
+        if value != value:
+            assert word == ""
+        else:
+            assert float(word) == pytest.approx(value, abs=0.51 * 10.0**-decimals, rel=4e-15)
+            assert len(word.partition(".")[2]) == decimals
+            assert not word.startswith("-0.0") or float(word) != 0
+
+
+@pytest.fixture
+def recording(tmp_path) -> Path:
+    run = LinkRun(duration_s=3.0)
+    path = tmp_path / "run.csv"
+    write_recording(path, board.hello(board.DEFAULTS), run.samples(), "sim", run.rig, force=False)
+    return path
+
+
+def test_other_tools_read_it(recording):
+    table = np.loadtxt(recording, delimiter=",", skiprows=3)
+    assert table.shape == (300, 13)
+    lines = recording.read_text().splitlines()
+    assert lines[0] == "# linkpose recording 1"
+    assert json.loads(lines[1][1:])["settings"]["sample_rate_hz"] == 100
+    assert lines[2].split(",") == columns.names(0)
+    assert json.loads(lines[-1][1:])["samples"] == 300
+
+
+def edited(path: Path, change) -> Path:
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(change(lines)))
+    return path
+
+
+def swap(lines, at, old, new):
+    lines[at] = lines[at].replace(old, new)
+    return lines
+
+
+BAD_FILES = {
+    "a foreign file": (lambda _: ["x,y\n", "1,2\n"], "is no linkpose recording: its first line is 'x,y'"),
+    "an empty file": (lambda _: [], "is no linkpose recording"),
+    "only a head": (lambda lines: lines[:3], "has a header but no row"),
+    "cut in its head": (lambda lines: [*lines[:2], "time_s,se"], "ends before its first row"),
+    "metadata that is no JSON": (lambda lines: [lines[0], "# {oops\n", *lines[2:]], "line 2: the metadata is not JSON"),
+    "an unknown column": (
+        lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_x_rad"),
+        "unknown column gyro_x_rad; did you mean gyro_x_rad_s?",
+    ),
+    "a column twice": (lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_y_rad_s"), "gyro_y_rad_s stands twice"),
+    "no inertial sensor": (
+        lambda lines: [*lines[:2], "time_s,pressure_Pa\n", "0,1e5\n", "0.1,1e5\n"],
+        "nothing to estimate from",
+    ),
+    "a cut row": (lambda lines: [*lines[:9], "0.06,6,0.1\n", *lines[10:]], "line 10: 3 fields where the header has 13"),
+    "a word": (lambda lines: swap(lines, 11, ",0.", ",zero."), "line 12: 'zero."),
+    "time that runs backwards": (
+        lambda lines: [*lines[:8], lines[20], *lines[8:]],
+        "line 10: time_s runs backwards (0.050000 s)",
+    ),
+    "time that is missing": (
+        lambda lines: [*lines[:8], "," + lines[8].partition(",")[2], *lines[9:]],
+        "line 9: time_s is missing",
+    ),
+    "flags out of range": (
+        lambda lines: [*lines[:5], lines[5].rpartition(",")[0] + ",-1\n", *lines[6:]],
+        "line 6: flags must be a number from 0 to 65535",
+    ),
+    "an unknown rig key": (
+        lambda lines: swap(lines, 1, '"j2s_m"', '"j2s_mm"'),
+        "unknown key joint.j2s_mm; did you mean j2s_m",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_are_named_with_line_and_cure(name, recording, refused):
+    change, sentence = BAD_FILES[name]
+    said = refused("estimate", edited(recording, change))
+    assert sentence in said
+    assert str(recording) in said
+
+
+def test_absent_and_unreadable_files(refused, tmp_path):
+    assert "cannot read" in refused("estimate", tmp_path / "none.csv")
+    assert "cannot read" in refused("estimate", tmp_path)
+    (tmp_path / "x.bin").write_bytes(b"\0\1\2\3")
+    assert "holds no HELLO" in refused("estimate", tmp_path / "x.bin")
+    (tmp_path / "x.bin").write_bytes(encode(hello_with()))
+    assert "holds no sample" in refused("estimate", tmp_path / "x.bin")
+
+
+@given(cut=st.integers(0, 20_000))
+@settings(max_examples=50, deadline=None)
+def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
+    folder = tmp_path_factory.mktemp("cut")
+    run = LinkRun(duration_s=1.0)
+    path = folder / "run.csv"
+    write_recording(path, board.hello(board.DEFAULTS), run.samples(), "sim", run.rig, force=False)
+    whole = load_recording(path).measurements
+    path.write_bytes(path.read_bytes()[: -1 - cut])
+    try:
+        part = load_recording(path)
+    except LinkposeError:
+        return  # cut in the head
+    assert equal(part.measurements, whole[: len(part.measurements)])
+    assert len(part.measurements) >= 99 - cut // 80
+    assert "has no closing line" in part.remarks[0]
+
+
+def test_an_existing_file_is_kept_unless_forced(linkpose, refused, tmp_path):
+    (tmp_path / "r.csv").write_text("precious")
+    assert "exists already" in refused("record", tmp_path / "r.csv", "--port", "sim://link", "--duration", 0.1)
+    assert (tmp_path / "r.csv").read_text() == "precious"
+    assert linkpose("record", tmp_path / "r.csv", "--port", "sim://link", "--duration", 0.1, "--force").status == 0
+    assert len(read_table(tmp_path / "r.csv", "recording")) == 10
+
+
+def test_a_folder_that_may_not_be_written_and_a_folder_in_place_of_a_file(refused, tmp_path):
+    assert "cannot write" in refused("record", "/proc/r.csv", "--port", "sim://link")
+    assert "cannot write" in refused("record", tmp_path, "--port", "sim://link")
+    assert "named for two outputs" in refused("record", tmp_path / "a", "--raw", tmp_path / "a", "--port", "sim://link")
+
+
+def test_a_full_disk_leaves_whole_rows_and_says_so(tmp_path):
+    """A limit on file sizes stands in for the disk: the same error at the same call."""
+    done = subprocess.run(
+        [*CLI, "record", "r.csv", "--port", "sim://link?speed=0", "--duration", "60"],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        preexec_fn=lambda: (
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+        ),
+    )
+    assert done.returncode == 1
+    assert "cannot write to r.csv any more: File too large" in done.stderr
+    assert "Traceback" not in done.stderr
+    data = (tmp_path / "r.csv").read_bytes()
+    assert data.endswith(b"\n") and len(data) > 15_000
+    assert len(read_table(tmp_path / "r.csv", "recording")) > 100
+
+
+def test_a_reader_that_goes_away_is_no_traceback(recording):
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [*CLI, "estimate", recording]
+    done = subprocess.run(command, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+
+
+def test_kill_9_at_any_moment_leaves_a_readable_file(tmp_path):
+    rng = np.random.default_rng(4)
+    for attempt, moment in enumerate(rng.uniform(0.0, 0.5, 8)):
+        path = tmp_path / f"{attempt}.csv"
+        process = subprocess.Popen([*CLI, "record", path, "--port", "sim://link", "-q"], env=ENVIRONMENT)
+        deadline = time.monotonic() + 20
+        while not (path.exists() and path.read_bytes().count(b"\n") > 5):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        began = time.monotonic()
+        time.sleep(moment)
+        process.kill()
+        process.wait()
+        table = read_table(path, "recording")
+        assert table.columns["time_s"][-1] > moment - 1.0
+        assert len(table) <= (time.monotonic() - began) * 100 + 20
+        assert table.closing is None
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
+    path = tmp_path / "r.csv"
+    command = [*CLI, "record", path, "--port", "sim://link", "--json"]
+    process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 20
+    while not (path.exists() and path.read_bytes().count(b"\n") > 20):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.send_signal(stop)
+    out, err = process.communicate(timeout=10)
+    table = read_table(path, "recording")
+    assert process.returncode == 0
+    assert "Traceback" not in err
+    assert json.loads(out.splitlines()[-1])["samples"] == len(table)
+    assert table.closing is not None and table.closing["ended"] == "interrupted"
+
+
+def test_the_converter_forgets_a_barometer_that_went_away():
+    hello = board.hello(Configure(100, 8, 1000, 3, 0, 8))
+    converter = Converter(Settings.of(hello))
+    base = Sample(0, 0, 0, 0, 0, 0, 0, 0, 0, 27898, 23843, 7, 8)
+    rows = [
+        converter.row(base, 0.0, 0, 8),
+        converter.row(base, 0.01, 1, 8),
+        converter.row(base, 0.02, 2, 0),
+        converter.row(base, 0.03, 3, 8),
+    ]
+    assert [(row.pressure_Pa, row.baro_fresh) for row in rows if row.pressure_Pa == row.pressure_Pa] == [
+        (69964.0, 1),
+        (69964.0, 0),
+        (69964.0, 1),
+    ]

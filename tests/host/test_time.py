@@ -1,0 +1,117 @@
+"""The board's clock and the place of samples in time: wraps, losses, delays, restarts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from linkpose.device.clock import DeviceClock
+from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.sensors.timeline import BoardClock, Timeline
+from linkpose.wire.messages import Sample
+
+WRAP = 1 << 32
+
+
+def sample(tick: int, t_us: int) -> Sample:
+    return Sample(tick % 65536, t_us % WRAP, *([0] * 7), 0, 0, 0, 1)
+
+
+class Bench:
+    """A board whose clock runs `ppm` fast and starts at `t0_us`, asked once a second over a line with delays."""
+
+    def __init__(self, ppm: float, t0_us: int = 0, seed: int = 0) -> None:
+        self.rate, self.t0_us = 1 + 1e-6 * ppm, t0_us
+        self.rng = np.random.default_rng(seed)
+        self.clock = DeviceClock()
+
+    def t_us(self, host_s: float) -> int:
+        return int(self.t0_us + host_s * 1e6 * self.rate)
+
+    def ping(self, host_s: float, delay_s: float | None = None) -> None:
+        there, back = self.rng.exponential(3e-4, 2) + 3e-4
+        if delay_s is not None:
+            back += delay_s
+        self.clock.pong(self.t_us(host_s + there) % WRAP, host_s, host_s + there + back)
+
+
+@pytest.mark.parametrize("ppm", [0, 300, -5000, 5000])
+def test_drift_and_time_are_found(ppm):
+    bench = Bench(ppm)
+    times = []
+    for tick in range(6000):
+        host = tick * 0.01
+        if tick % 100 == 0:
+            bench.ping(host)
+        times.append(bench.clock.host_time(bench.clock.unwrap(bench.t_us(host) % WRAP, host)))
+    assert bench.clock.drift_ppm == pytest.approx(ppm, abs=10)
+    assert abs(bench.clock.drift_ppm - ppm) < 4 * bench.clock.drift_std_ppm
+    intervals = np.diff(times)
+    assert np.all(np.abs(intervals[1500:] - 0.01) < 0.01 * 2e-4)
+    # However wrong the first guess of the drift, no interval is off by more than the guess and the slew together.
+    assert np.all(np.abs(intervals - 0.01) < 0.01 * (abs(ppm) * 1e-6 + 1.5e-3))
+    assert times[-1] - 59.99 == pytest.approx(0, abs=1.5e-3)
+
+
+def test_a_delayed_answer_changes_little_and_a_changed_world_is_believed_in_the_end():
+    bench = Bench(100)
+    for second in range(60):
+        bench.ping(second)
+    before = bench.clock.drift_ppm
+    bench.ping(60, delay_s=0.5)
+    assert bench.clock.drift_ppm == pytest.approx(before, abs=5)
+    bench.t0_us -= 3_000_000  # the host was asleep for three seconds
+    for second in range(61, 200):
+        bench.ping(second)
+    bench.clock.host_time(bench.clock.unwrap(bench.t_us(200) % WRAP, 200))
+    assert bench.clock.drift_ppm == pytest.approx(100, abs=60)
+
+
+def test_a_board_faster_than_any_resonator_keeps_its_own_seconds():
+    bench = Bench(3_000_000)
+    for second in range(20):
+        bench.ping(second)
+    assert abs(bench.clock.drift_ppm) < 10_000
+
+
+@pytest.mark.parametrize("seq0", [0, 65000])
+def test_wraps_of_time_and_count_are_no_gap(seq0):
+    t0 = WRAP - 2_000_000
+    bench = Bench(200, t0_us=t0)
+    timeline = Timeline(100)
+    timeline.lost = -seq0  # a stream that begins here
+    places = []
+    for tick in range(1000):
+        host = tick * 0.01
+        if tick % 100 == 0:
+            bench.ping(host)
+        places.append(timeline.place(sample(seq0 + tick, bench.t_us(host)), bench.clock, host + 0.002))
+    time_s = np.array([p.time_s for p in places])
+    assert np.allclose(time_s, np.arange(1000) * 0.01, atol=2e-3)
+    assert [p.seq for p in places] == list(range(seq0, seq0 + 1000))
+    assert timeline.lost == 0
+
+
+def test_lost_samples_are_counted_over_the_wrap_of_the_count():
+    clock = BoardClock()
+    timeline = Timeline(100)
+    kept = [0, 1, 2, 10, 11, 65534, 65537, 65538, 65538 + 70000]
+    places = [timeline.place(sample(tick, tick * 10_000), clock, 0.0) for tick in kept]
+    assert [p.seq for p in places] == kept
+    assert timeline.lost == kept[-1] + 1 - len(kept)
+    assert [bool(p.flags & GAP_BEFORE) for p in places] == [False] * 3 + [True, False, True, True, False, True]
+    assert [gap.lost for gap in timeline.gaps] == [7, 65522, 2, 69999]
+
+
+def test_a_sample_that_comes_twice_is_taken_once():
+    timeline, clock = Timeline(100), BoardClock()
+    places = [timeline.place(sample(tick, tick * 10_000), clock, 0.0) for tick in (0, 1, 1, 2)]
+    assert [p and p.seq for p in places] == [0, 1, None, 2]
+    assert (timeline.samples, timeline.lost) == (3, 0)
+
+
+def test_samples_lost_before_the_first_one_count():
+    timeline = Timeline(100)
+    place = timeline.place(sample(3, 0), BoardClock(), 0.0)
+    assert place == (0.0, 3, 1 | GAP_BEFORE)
+    assert timeline.lost == 3
