@@ -102,7 +102,7 @@ void Link::send_status() {
   const uint32_t elapsed_us = now - status_us_;
   if (elapsed_us < kStatusUs) return;
   status_us_ = now;
-  const uint32_t slept_us = idle::take_slept() / 2;
+  const uint32_t awake_us = idle::take_awake_us();
   const uint16_t longest_pass_us = longest_pass_us_;
   longest_pass_us_ = 0;
   if (!sampler_.streaming()) return;
@@ -120,7 +120,7 @@ void Link::send_status() {
   status.baro_restarts = sampler_.baro().restarts();
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
-  status.cpu_load = slept_us < elapsed_us ? static_cast<uint16_t>((elapsed_us - slept_us) / (elapsed_us / 1000)) : 0;
+  status.cpu_load = static_cast<uint16_t>(awake_us / (elapsed_us / 1000));
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
     status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets()};

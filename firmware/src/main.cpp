@@ -23,6 +23,7 @@ void setup() {
   board::power_down_unused();
   board::start_watchdog();
   board::begin_led();
+  idle::begin();
   twi::begin();
   uart::begin();
   mice.begin(kDefaults.sample_rate_hz);

@@ -16,8 +16,8 @@ constexpr uint8_t kClocksD = clock_of(0) | clock_of(1) | clock_of(2);
 constexpr uint8_t kClocksB = clock_of(3);
 
 Ps2Bits lines[kPorts];
-uint8_t clocks_before_d;
-uint8_t clocks_before_b;
+volatile uint8_t levels_before_d;
+volatile uint8_t levels_before_b;
 
 // Prepared bytes: their lines are moved by the next tick that serves the mice.
 volatile uint8_t prepared_clocks_d, prepared_data_d, prepared_clocks_b, prepared_data_b;
@@ -26,7 +26,7 @@ volatile uint8_t ticks_left = 1;
 
 // Open drain: low is driven, high is left to the pull-up. The pull-up is off before the line is driven, and on after it
 // is let go, so that no line is ever driven high against a mouse.
-void pull(uint8_t port, uint8_t line) {
+inline __attribute__((always_inline)) void pull(uint8_t port, uint8_t line) {
   if (port < 3) {
     PORTD &= static_cast<uint8_t>(~line);
     DDRD |= line;
@@ -35,7 +35,7 @@ void pull(uint8_t port, uint8_t line) {
     DDRB |= line;
   }
 }
-void release(uint8_t port, uint8_t line) {
+inline __attribute__((always_inline)) void release(uint8_t port, uint8_t line) {
   if (port < 3) {
     DDRD &= static_cast<uint8_t>(~line);
     PORTD |= line;
@@ -142,23 +142,55 @@ void start_prepared() {
 
 }  // namespace ps2
 
-// One pass for all clocks of a port. An edge of a clock that is held low is our own.
-ISR(PCINT2_vect) {
-  idle::note_wake();
-  const uint8_t pins = PIND;
-  const uint8_t fallen = ps2::clocks_before_d & ~pins & ~DDRD;
-  ps2::clocks_before_d = pins & ps2::kClocksD;
-  if (!fallen) return;
-  const uint8_t now = TCNT2;
+// Each edge of each clock brings an interrupt, thousands a second. Half of them are rising edges, of which nothing is to
+// be done: so the interrupt itself only looks which clocks fell, in registers the compiler would not get along with, and
+// jumps to the compiled handler when there are any. An edge of a clock that is held low is our own.
+//
+// What it hands on: the pins in GPIOR1, the clocks that fell in GPIOR2. The beginning is idle::note_wake().
+#define PIN_CHANGE_INTERRUPT(vector, pin_register, direction_register, clocks, before, handler)       \
+  extern "C" void handler() __attribute__((signal, used));                                          \
+  ISR(vector, ISR_NAKED) {                                                                          \
+    asm volatile(                                                                                   \
+        "push r24                \n\t"                                                              \
+        "in   r24, __SREG__      \n\t"                                                              \
+        "push r24                \n\t"                                                              \
+        "push r25                \n\t"                                                              \
+        "ldi  r24, %[awake]      \n\t"                                                              \
+        "out  %[meter], r24      \n\t"                                                              \
+        "in   r24, %[pins]       \n\t"                                                              \
+        "out  %[now], r24        \n\t"                                                              \
+        "lds  r25, %[last]       \n\t"                                                              \
+        "sts  %[last], r24       \n\t"                                                              \
+        "com  r24                \n\t"                                                              \
+        "and  r25, r24           \n\t"                                                              \
+        "in   r24, %[driven]     \n\t"                                                              \
+        "com  r24                \n\t"                                                              \
+        "and  r25, r24           \n\t"                                                              \
+        "andi r25, %[mask]       \n\t"                                                              \
+        "out  %[fallen], r25     \n\t"                                                              \
+        "pop  r25                \n\t" /* POP and OUT leave the flags of ANDI as they are */        \
+        "pop  r24                \n\t"                                                              \
+        "brne 2f                 \n\t"                                                              \
+        "out  __SREG__, r24      \n\t"                                                              \
+        "pop  r24                \n\t"                                                              \
+        "reti                    \n"                                                                \
+        "2: out __SREG__, r24    \n\t"                                                              \
+        "pop  r24                \n\t"                                                              \
+        "jmp  " #handler "       \n\t" ::[meter] "I"(_SFR_IO_ADDR(TCCR0B)),                         \
+        [awake] "M"(idle::kCountAwake),                                                             \
+        [pins] "I"(_SFR_IO_ADDR(pin_register)), [driven] "I"(_SFR_IO_ADDR(direction_register)),     \
+        [now] "I"(_SFR_IO_ADDR(GPIOR1)), [fallen] "I"(_SFR_IO_ADDR(GPIOR2)), [last] "i"(&before),   \
+        [mask] "M"(clocks));                                                                        \
+  }                                                                                                 \
+  void handler()
+
+PIN_CHANGE_INTERRUPT(PCINT2_vect, PIND, DDRD, ps2::kClocksD, ps2::levels_before_d, __vector_of_port_d) {
+  const uint8_t pins = GPIOR1, fallen = GPIOR2, now = TCNT2;
   if (fallen & ps2::clock_of(0)) ps2::edge<0>(pins, now);
   if (fallen & ps2::clock_of(1)) ps2::edge<1>(pins, now);
   if (fallen & ps2::clock_of(2)) ps2::edge<2>(pins, now);
 }
 
-ISR(PCINT0_vect) {
-  idle::note_wake();
-  const uint8_t pins = PINB;
-  const uint8_t fallen = ps2::clocks_before_b & ~pins & ~DDRB;
-  ps2::clocks_before_b = pins & ps2::kClocksB;
-  if (fallen) ps2::edge<3>(pins, TCNT2);
+PIN_CHANGE_INTERRUPT(PCINT0_vect, PINB, DDRB, ps2::kClocksB, ps2::levels_before_b, __vector_of_port_b) {
+  ps2::edge<3>(GPIOR1, TCNT2);
 }

@@ -10,7 +10,7 @@ extern uint8_t __stack;
 namespace {
 
 constexpr uint8_t kPaint = 0xC5;
-constexpr uint8_t kStackBytesPerScan = 32;
+constexpr uint8_t kStackBytesPerScan = 8;
 
 uint16_t free_stack_bytes = 0;
 
@@ -68,11 +68,9 @@ void set_led(bool on) {
 }
 
 void power_down_unused() {
-  TIMSK0 = 0;  // the Arduino core's millis()
   ADCSRA = 0;
   power_adc_disable();
   power_spi_disable();
-  power_timer0_disable();
 }
 
 }  // namespace board

@@ -18,7 +18,7 @@ void scan_stack();
 void begin_led();
 void set_led(bool on);
 
-// What nobody uses (ADC, SPI, Timer0) is switched off.
+// What nobody uses (ADC, SPI) is switched off.
 void power_down_unused();
 
 }  // namespace board

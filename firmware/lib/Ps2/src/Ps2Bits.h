@@ -36,18 +36,21 @@ class Ps2Bits {
     begin(answers);
   }
 
-  Act falling_edge(bool data, uint8_t now) {
+  __attribute__((always_inline)) Act falling_edge(bool data, uint8_t now) {
     const uint8_t gap = now - last_edge_;
     last_edge_ = now;
-    if (sending_) return send_bit(data);
+    uint16_t shift = shift_;
+    if (sending_) return send_bit(shift, data);
     // A byte whose clock stopped for 2 ms is given up: this edge is the first of another one.
-    if (gap > kGapSteps && shift_ != kReceiveMarker) {
-      shift_ = kReceiveMarker;
+    if (gap > kGapSteps && shift != kReceiveMarker) {
+      shift = kReceiveMarker;
       resyncs_++;
     }
-    shift_ >>= 1;
-    if (data) shift_ |= kReceiveMarker;
-    return shift_ & 1 ? end_byte() : Act::kNone;
+    shift >>= 1;
+    if (data) shift |= kReceiveMarker;
+    if (shift & 1) return end_byte(shift);
+    shift_ = shift;
+    return Act::kNone;
   }
 
   Outcome outcome() const { return outcome_; }
@@ -63,7 +66,7 @@ class Ps2Bits {
   static constexpr uint16_t kReceiveMarker = 1 << 11;
   static constexpr uint8_t kGapSteps = 2000 / kStepUs;
 
-  static bool odd_parity(uint8_t byte) {
+  __attribute__((always_inline)) static bool odd_parity(uint8_t byte) {
     byte ^= byte >> 4;
     byte ^= byte >> 2;
     byte ^= byte >> 1;
@@ -76,30 +79,30 @@ class Ps2Bits {
     outcome_ = Outcome::kRunning;
   }
 
-  Act send_bit(bool data) {
-    if (shift_ == 1) {  // all is out: this is the mouse's acknowledge bit
+  __attribute__((always_inline)) Act send_bit(uint16_t shift, bool data) {
+    if (shift == 1) {  // all is out: this is the mouse's acknowledge bit
       if (data) return end(Outcome::kRefused);
       sending_ = false;
       shift_ = kReceiveMarker;
       return Act::kNone;
     }
-    const bool bit = shift_ & 1;
-    shift_ >>= 1;
-    return bit ? Act::kDataHigh : Act::kDataLow;
+    shift_ = shift >> 1;
+    return shift & 1 ? Act::kDataHigh : Act::kDataLow;
   }
 
-  Act end_byte() {
-    const bool start = shift_ & 1 << 1, parity = shift_ & 1 << 10, stop = shift_ & 1 << 11;
-    const uint8_t byte = static_cast<uint8_t>(shift_ >> 2);
+  __attribute__((always_inline)) Act end_byte(uint16_t shift) {
+    const bool start = shift & 1 << 1, parity = shift & 1 << 10, stop = shift & 1 << 11;
+    const uint8_t byte = static_cast<uint8_t>(shift >> 2);
     shift_ = kReceiveMarker;
     if (start || !stop) return end(Outcome::kBadFraming);
     if (parity != odd_parity(byte)) return end(Outcome::kBadParity);
-    bytes_[received_] = byte;
-    received_ = received_ + 1;
-    return received_ == expected_ ? end(Outcome::kDone) : Act::kNone;
+    const uint8_t received = received_;
+    bytes_[received] = byte;
+    received_ = received + 1;
+    return received + 1 == expected_ ? end(Outcome::kDone) : Act::kNone;
   }
 
-  Act end(Outcome outcome) {
+  __attribute__((always_inline)) Act end(Outcome outcome) {
     outcome_ = outcome;
     return Act::kHoldClock;
   }
