@@ -27,7 +27,7 @@ def main() -> int:
     stale = not PREBUILT.is_file() or PREBUILT.read_bytes() != built
     if check:
         if stale:
-            print(f"{PREBUILT.relative_to(ROOT)} is stale: type `python firmware/platform/prebuilt.py`", file=sys.stderr)
+            print(f"{PREBUILT} is stale: type `python firmware/platform/prebuilt.py`", file=sys.stderr)
         return int(stale)
     if stale:
         PREBUILT.write_bytes(built)

@@ -15,6 +15,7 @@ from linkpose.errors import LinkposeError
 # Command -> what it does.
 COMMANDS = {
     "ports": "List the serial ports and say which is the board.",
+    "flash": "Build the firmware, upload it to the board, and prove it.",
     "info": "Show the board's versions, sensors, settings and link health.",
     "record": "Record the sensors into a CSV file.",
     "estimate": "Run the filters, live or over a recording.",
