@@ -47,8 +47,7 @@ class Cpu extends CPU {
     const event = { cycle: Math.max(cycle, this.now + 1), action, next: null };
     if (this.nextEvent === null || event.cycle < this.nextEvent.cycle) {
       event.next = this.nextEvent;
-      this.nextEvent = event;
-      this.nextEventCycle = event.cycle;
+      this.#setNextEvent(event);
       return event;
     }
     let before = this.nextEvent;
@@ -62,8 +61,22 @@ class Cpu extends CPU {
     return this.at(this.now + cycles, action);
   }
 
+  /** Takes an event out that has not run yet; null and one that has run are no matter. */
   cancel(event) {
-    if (event !== null) event.action = null;
+    let before = null;
+    let each = this.nextEvent;
+    while (each !== event && each !== null) {
+      before = each;
+      each = each.next;
+    }
+    if (each === null) return;
+    if (before !== null) before.next = each.next;
+    else this.#setNextEvent(each.next);
+  }
+
+  #setNextEvent(event) {
+    this.nextEvent = event;
+    this.nextEventCycle = event === null ? Infinity : event.cycle;
   }
 
   /** Adds a peripheral; its reset() puts its registers to their values after a reset. */
@@ -112,9 +125,7 @@ class Cpu extends CPU {
   #runEvents() {
     while (this.nextEventCycle <= this.cycles) {
       const event = this.nextEvent;
-      this.nextEvent = event.next;
-      this.nextEventCycle = this.nextEvent === null ? Infinity : this.nextEvent.cycle;
-      if (event.action === null) continue;
+      this.#setNextEvent(event.next);
       this.eventCycle = event.cycle;
       event.action();
       this.eventCycle = -1;

@@ -162,12 +162,16 @@ class Ps2Mouse {
       else if (!this.#dataHigh) yield* this.#receive();
       else if (this.output.length > 0) yield* this.#send();
       else if (this.#reportDue()) this.#queueReport();
-      else yield { until: this.nextReport };
+      else yield { until: this.#streams ? this.nextReport : Infinity };
     }
   }
 
+  get #streams() {
+    return this.reporting && this.mode === "stream";
+  }
+
   #reportDue() {
-    if (!this.reporting || this.mode !== "stream" || this.cpu.now < this.nextReport) return false;
+    if (!this.#streams || this.cpu.now < this.nextReport) return false;
     this.nextReport += CLOCK_HZ / this.reportRateHz;
     this.#count();
     return this.counters[0] !== 0 || this.counters[1] !== 0;

@@ -18,7 +18,7 @@ class Watchdog {
     this.cpu = cpu;
     this.resetBoard = resetBoard;
     this.interrupt = { address: 0x0c, flagRegister: WDTCSR, flagMask: WDIF, enableRegister: WDTCSR, enableMask: WDIE };
-    cpu.onWatchdogReset = () => this.#restart();
+    cpu.onWatchdogReset = () => { this.deadline = cpu.now + this.timeoutCycles; }; // often: the event looks for itself
     cpu.writeHooks[WDTCSR] = (value) => this.#write(value);
     cpu.attach(this);
   }
@@ -54,7 +54,12 @@ class Watchdog {
   #restart(from = this.cpu.now) {
     this.cpu.cancel(this.event ?? null);
     this.event = null;
-    if (this.cpu.data[WDTCSR] & (WDE | WDIE)) this.event = this.cpu.at(from + this.timeoutCycles, () => this.#expire());
+    this.deadline = from + this.timeoutCycles;
+    if (this.cpu.data[WDTCSR] & (WDE | WDIE)) this.#schedule();
+  }
+
+  #schedule() {
+    this.event = this.cpu.at(this.deadline, () => (this.cpu.now < this.deadline ? this.#schedule() : this.#expire()));
   }
 
   #expire() {
