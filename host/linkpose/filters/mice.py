@@ -7,7 +7,7 @@ gives R(φ_i)ᵀ v_i, in counts. With the robot's velocity ẋ = (v_bx, v_by, ω
     A ẋ = Θ,   ẋ = (Aᵀ W A)⁻¹ Aᵀ W Θ                                                      (8), (11), (12)
 
 with W = diag(1/σ_i²). For equal mice on an equilateral triangle that is J of (14), (15), the means of (16), (17).
-σ_i² = ⅙ (count / T)² + (κ ‖v_i‖)²: a count is kept by the mouse until it is whole, so the error of a step is the
+σ_i² = ⅙ (count / T)² + (κ ‖v_i‖)² + σ²: a count is kept by the mouse until it is whole, so the error of a step is the
 difference of two roundings; and the surface scatters what a mouse sees in proportion to its speed. What the floor does to
 all mice alike cannot be told from motion: it is not in the weights, and adds (κ_c ‖v‖)² to the variance of v_b.
 
@@ -30,13 +30,13 @@ from numpy.typing import NDArray
 
 from linkpose.filters import CannotRun
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import Floats, ImuCalibration
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._imu import LONGEST_STEP_S, Floats, ImuCalibration, read_gyro
+from linkpose.filters._vector import Vec, compiled
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.wire.messages import SampleFlags
 
-Flags = NDArray[np.uint16]
+Bools = NDArray[np.bool_]
 
 NEAREST_M = 1e-3  # mice closer than this to one another tell no rotation
 
@@ -61,10 +61,12 @@ _BIAS_RAD_S, _BIAS_FLOOR_RAD_S, _BIAS_MEMORY_S = 0.35, 0.01, 10.0
 
 
 class MiceParameters(NamedTuple):
-    """What the filter assumes. Both are standard deviations as a share of the speed."""
+    """What the filter assumes of the mice: standard deviations, as a share of the speed or in m/s."""
 
-    scatter: float = 0.02  # κ: of one mouse by itself
+    scatter: float = 0.01  # κ: of one mouse, from sample to sample
     floor: float = 0.005  # κ_c: of all mice alike
+    mismatch: float = 0.02  # of one mouse, lasting: what its calibration has left; not a fault
+    noise_m_s: float = 0.0  # of one mouse, from sample to sample, at any speed, beyond the rounding to counts
 
 
 class Placement(NamedTuple):
@@ -85,24 +87,24 @@ class Placement(NamedTuple):
 
 
 class MiceState(NamedTuple):
-    """What the filter remembers from one block to the next; changed in place. All vectors are in b."""
+    """What the filter remembers from one block to the next; changed in place. Vectors are in b."""
 
-    time: Floats  # (3,) s: of the last sample, the usual interval, since when no mouse was of use; NaN before the first
+    time: Floats  # (3,) s: of the last sample, the usual interval, of the last sample with a velocity; NaN for none
     pose: Floats  # (3,) x, y (m), heading (rad) in n
     velocity: Floats  # (3,) v_bx, v_by (m/s), ω_b (rad/s)
-    variance: Floats  # (3,) of the velocity
-    gyro: Floats  # (4,) last usable rate, its bias less the rig's, how long that was learnt (s), window's turn (rad)
-    moved: Floats  # (3,) the window's motion X by the mice that count: m, m, rad
-    window: Floats  # (M + 1, 2) each mouse's motion S_i in the window (m); last, (the window's time (s), suspicion (s))
-    watch: Floats  # (M, 3) s without a count, s and m of agreement
-    distrusted: NDArray[np.bool_]  # (M,)
+    std: Floats  # (3,) of the velocity
+    reference: Floats  # (3,) mean velocity over the window when the mice last agreed
+    gyro: Floats  # (3,) rad/s: last usable rate (NaN for none), its bias beyond the rig's; s: for how long that was learnt
+    window: Floats  # (M + 1, 2) m: each mouse's motion S_i; last row: the window's time (s) and the gyro's turn (rad)
+    watch: Floats  # (M + 1, 3) s without a count, s and m of agreement; last row: s of disagreement, of all mice
+    distrusted: Bools  # (M,)
     rejected: NDArray[np.int64]  # (1,) samples in which no mouse was of use, or time did not go on
 
     @staticmethod
     def fresh(mice: int) -> MiceState:
         return MiceState(
-            np.full(3, np.nan), np.zeros(3), np.zeros(3), np.zeros(3), np.array([np.nan, 0.0, 0.0, 0.0]), np.zeros(3),
-            np.zeros((mice + 1, 2)), np.zeros((mice, 3)), np.zeros(mice, np.bool_), np.zeros(1, np.int64),
+            np.full(3, np.nan), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.array([np.nan, 0.0, 0.0]),
+            np.zeros((mice + 1, 2)), np.zeros((mice + 1, 3)), np.zeros(mice, np.bool_), np.zeros(1, np.int64),
         )  # fmt: skip
 
 
@@ -156,11 +158,20 @@ def check_placement(mice: tuple[Mouse, ...]) -> None:
 
 # ---- compiled ----
 
-# Σ w A_iᵀA_i and Σ w A_iᵀ s_i of some mice: (Σw, Σw p_x, Σw p_y, Σw ‖p‖²), (Σw s_x, Σw s_y, Σw (p_x s_y − p_y s_x)).
+# Σ w A_iᵀA_i and Σ w A_iᵀ s_i of some mice: (Σw, Σw p_x, Σw p_y, Σw ‖p‖²) and (Σw s_x, Σw s_y, Σw (p_x s_y − p_y s_x)).
 Normal = tuple[float, float, float, float]
 
 
-@inlined
+class Reading(NamedTuple):
+    """What one sample says, made usable. Arrays are room that every sample fills anew."""
+
+    moved: Floats  # (M, 2) m: motion of each mouse in b over the step
+    sound: Bools  # (M,) whether a mouse has counts
+    use: Bools  # (M,) whether they count for the estimate
+    weight: Floats  # (M,) 1/σ_i² over the window (1/m²)
+
+
+@compiled
 def add_mouse(normal: Normal, right: Vec, w: float, p: Floats, sx: float, sy: float) -> tuple[Normal, Vec]:
     """One mouse more in the normal equations."""
     return (
@@ -170,140 +181,227 @@ def add_mouse(normal: Normal, right: Vec, w: float, p: Floats, sx: float, sy: fl
 
 
 @compiled
-def tells_rotation(normal: Normal) -> bool:
-    """Whether A has rank 3: the weighted spread of the places about their mean."""
-    w, wx, wy, wpp = normal
-    return w > 0.0 and wpp - (wx * wx + wy * wy) / w > w * NEAREST_M * NEAREST_M
-
-
-@compiled
 def solve(normal: Normal, extra: Vec, right: Vec) -> tuple[Vec, Vec]:
-    """(12): ẋ and the diagonal of its covariance; `extra` are more weights on the diagonal of Aᵀ W A."""
+    """(12): ẋ and the diagonal of its covariance; `extra` are further weights on the diagonal of Aᵀ W A."""
     w, wx, wy, wpp = normal
     i = vec.inverse((w + extra[0], 0.0, -wy, w + extra[1], wx, wpp + extra[2]))
     return vec.apply(i, right), (i[0], i[3], i[5])
 
 
 @compiled
-def variance(step: float, count_m: float, moved: Vec, p: Floats, scatter: float) -> float:
-    """σ_i² of a mouse's motion over `step` (s), in (unit of `moved` / s · s)²: that of `moved` is m or m/s."""
-    vx, vy = moved[0] - moved[2] * p[1], moved[1] + moved[2] * p[0]
-    return _ROUNDING * (count_m / step) ** 2 + scatter * scatter * (vx * vx + vy * vy)
+def at_mouse(motion: Vec, p: Floats) -> tuple[float, float]:
+    """(6), (7): the motion of a point of the robot."""
+    return motion[0] - motion[2] * p[1], motion[1] + motion[2] * p[0]
 
 
 @compiled
-def misfit(total: Vec, p: Floats, sx: float, sy: float) -> float:
+def variance(count: float, motion: Vec, p: Floats, share: float, more: float) -> float:
+    """σ_i² of a mouse that moves with `motion`, in the square of its unit and that of a `count`: m or m/s."""
+    x, y = at_mouse(motion, p)
+    return _ROUNDING * count * count + share * share * (x * x + y * y) + more
+
+
+@compiled
+def misfit(motion: Vec, p: Floats, s: Floats) -> float:
     """‖s − A_i x‖²"""
-    ex, ey = sx - (total[0] - total[2] * p[1]), sy - (total[1] + total[2] * p[0])
-    return ex * ex + ey * ey
+    x, y = at_mouse(motion, p)
+    return float((s[0] - x) * (s[0] - x) + (s[1] - y) * (s[1] - y))
 
 
 @compiled
 def bias_doubt(learnt_s: float) -> float:
-    """Standard deviation (rad/s) of the gyro's bias after mice that agree have watched it for so long."""
+    """Standard deviation (rad/s) of the gyro's bias when mice that agree have told it for so long."""
     return _BIAS_RAD_S / (1.0 + learnt_s) + _BIAS_FLOOR_RAD_S
 
 
 @compiled
-def explain(
-    left_out: int, use: NDArray[np.bool_], weight: Floats, place: Placement, state: MiceState, has_gyro: bool
-) -> float:
-    """χ² of the window without one mouse (−1: with all, and the mice alone): see the module's text."""
-    normal, right = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    mice = use.shape[0]
-    for i in range(mice):
-        if use[i] and i != left_out:
-            normal, right = add_mouse(normal, right, weight[i], place.position[i], state.window[i, 0], state.window[i, 1])
-    span = state.window[mice, 0]
-    prior = (0.0, 0.0, 0.0)
-    turn, turn_weight = 0.0, 0.0
-    if left_out >= 0:
-        linear, angular = 1.0 / (_ACCEL_M_S2 * _WINDOW_S * span) ** 2, 1.0 / (_ANGULAR_RAD_S2 * _WINDOW_S * span) ** 2
-        if has_gyro:
-            turn = state.gyro[3] - state.gyro[1] * span
-            turn_weight = 1.0 / (bias_doubt(state.gyro[2]) * span) ** 2
-        prior = (linear, linear, angular + turn_weight)
-        right = (
-            right[0] + linear * state.moved[0],
-            right[1] + linear * state.moved[1],
-            right[2] + angular * state.moved[2] + turn_weight * turn,
-        )
-    total, _ = solve(normal, prior, right)
-    chi2 = 0.0
-    for i in range(mice):
-        if use[i] and i != left_out:
-            chi2 += weight[i] * misfit(total, place.position[i], state.window[i, 0], state.window[i, 1])
-    if left_out >= 0:
-        chi2 += prior[0] * ((total[0] - state.moved[0]) ** 2 + (total[1] - state.moved[1]) ** 2)
-        chi2 += (prior[2] - turn_weight) * (total[2] - state.moved[2]) ** 2 + turn_weight * (total[2] - turn) ** 2
-        if state.watch[left_out, 0] >= _SILENT_S:
-            chi2 -= _SILENT_BONUS
-    return chi2
-
-
-@compiled
 def fault_limit(freedom: int) -> float:
-    """χ² that sound mice exceed once in a million (Wilson and Hilferty 1931)."""
+    """χ² that sound mice exceed once in a million tests (Wilson and Hilferty 1931)."""
     part = 2.0 / (9.0 * freedom)
-    return freedom * (1.0 - part + _FAULT_Z * math.sqrt(part)) ** 3
+    return float(freedom * (1.0 - part + _FAULT_Z * math.sqrt(part)) ** 3)
 
 
 @compiled
-def find_fault(
-    use: NDArray[np.bool_], weight: Floats, place: Placement, state: MiceState, has_gyro: bool, step: float
-) -> int:
-    """The mouse to exclude, −1 for none. A lone mouse is no use without the gyro."""
-    mice = use.shape[0]
+def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState) -> bool:
+    """(11), (12) for one step: velocity and its standard deviation. False where the mice that are left cannot tell it.
+
+    `rate` is the gyro's (rad/s), NaN without one.
+    """
+    normal, right, before = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), vec.load(state.velocity)
+    for i in range(reading.use.shape[0]):
+        if reading.use[i]:
+            at = place.position[i]
+            w = 1.0 / variance(place.metres_per_count[i] / step, before, at, p.scatter, p.noise_m_s**2)
+            normal, right = add_mouse(normal, right, w, at, reading.moved[i, 0] / step, reading.moved[i, 1] / step)
+    w, wx, wy, wpp = normal
+    extra = (0.0, 0.0, 0.0)
+    # The weighted spread of the places about their mean: 0 where A has not rank 3.
+    if not (w > 0.0 and wpp - (wx * wx + wy * wy) / w > w * NEAREST_M * NEAREST_M):
+        if not (w > 0.0 and math.isfinite(rate)):
+            return False
+        extra = (0.0, 0.0, 1.0 / bias_doubt(state.gyro[2]) ** 2)
+        right = (right[0], right[1], right[2] + extra[2] * (rate - state.gyro[1]))
+    velocity, spread = solve(normal, extra, right)
+    common = p.floor * p.floor * (velocity[0] * velocity[0] + velocity[1] * velocity[1])
+    for j in range(3):
+        state.velocity[j] = velocity[j]
+        state.std[j] = math.sqrt(spread[j] + (common if j < 2 else 0.0))
+    return True
+
+
+@compiled
+def usable(reading: Reading) -> int:
+    """How many mice count for the estimate."""
     count = 0
+    for i in range(reading.use.shape[0]):
+        count += reading.use[i]
+    return count
+
+
+@compiled
+def explain(left_out: int, reading: Reading, place: Placement, state: MiceState) -> tuple[float, Vec]:
+    """χ² of the window without one mouse (M: with all), and the motion X that fits it best.
+
+    Where too few mice are left for themselves, X has to agree also with the gyro, and with the reference as far as a
+    robot keeps its velocity.
+    """
+    mice = reading.use.shape[0]
+    span, turn = state.window[mice, 0], state.window[mice, 1] - state.gyro[1] * state.window[mice, 0]
+    normal, right, chi2 = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
     for i in range(mice):
-        count += use[i]
-    if count < 2 or (count == 2 and not has_gyro):
+        if reading.use[i] and i != left_out:
+            s = state.window[i]
+            normal, right = add_mouse(normal, right, reading.weight[i], place.position[i], s[0], s[1])
+    r, linear, angular, by_gyro = vec.load(state.reference), 0.0, 0.0, 0.0
+    if left_out < mice or usable(reading) < 2:
+        linear = 1.0 / (_ACCEL_M_S2 * _WINDOW_S * span) ** 2
+        angular = 1.0 / (_ANGULAR_RAD_S2 * _WINDOW_S * span) ** 2
+        if math.isfinite(state.gyro[0]):
+            by_gyro = 1.0 / (bias_doubt(state.gyro[2]) * span) ** 2
+        right = (
+            right[0] + linear * r[0] * span,
+            right[1] + linear * r[1] * span,
+            right[2] + angular * r[2] * span + by_gyro * turn,
+        )
+    x, _ = solve(normal, (linear, linear, angular + by_gyro), right)
+    for i in range(mice):
+        if reading.use[i] and i != left_out:
+            chi2 += reading.weight[i] * misfit(x, place.position[i], state.window[i])
+    chi2 += linear * ((x[0] - r[0] * span) ** 2 + (x[1] - r[1] * span) ** 2)
+    chi2 += angular * (x[2] - r[2] * span) ** 2 + by_gyro * (x[2] - turn) ** 2
+    return chi2, x
+
+
+@compiled
+def find_fault(reading: Reading, step: float, place: Placement, state: MiceState) -> int:
+    """The mouse to exclude, −1 for none (yet)."""
+    mice, count = reading.use.shape[0], usable(reading)
+    # Of two mice one can go only where the gyro takes its part.
+    if count < 2 or (count == 2 and not math.isfinite(state.gyro[0])):
         return -1
-    if not explain(-1, use, weight, place, state, has_gyro) > fault_limit(2 * count - 3):
-        state.window[mice, 1] = 0.0
+    if not explain(mice, reading, place, state)[0] > fault_limit(2 * count - 3):
+        state.watch[mice, 0] = 0.0
         return -1
-    state.window[mice, 1] += step
+    state.watch[mice, 0] += step
     best, second, worst = math.inf, math.inf, -1
     for i in range(mice):
-        if use[i]:
-            chi2 = explain(i, use, weight, place, state, has_gyro)
+        if reading.use[i]:
+            chi2, _ = explain(i, reading, place, state)
+            if state.watch[i, 0] >= _SILENT_S:
+                chi2 -= _SILENT_BONUS
             if chi2 < best:
                 best, second, worst = chi2, best, i
             else:
                 second = min(second, chi2)
-    return worst if second - best > _DECISIVE or state.window[mice, 1] >= _UNDECIDED_S else -1
+    return worst if second - best > _DECISIVE or state.watch[mice, 0] >= _UNDECIDED_S else -1
 
 
 @compiled
-def fuse(
-    use: NDArray[np.bool_], counted: Floats, step: float, place: Placement, parameters: MiceParameters,
-    state: MiceState, rate: float, has_gyro: bool,
-) -> tuple[bool, Vec, Vec]:  # fmt: skip
-    """Velocity and its variances from the motion `counted` (M, 2), m, of a step; False where it cannot be told."""
-    normal, right = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    before = vec.load(state.velocity)
-    for i in range(use.shape[0]):
-        if use[i]:
-            w = 1.0 / variance(step, place.metres_per_count[i], before, place.position[i], parameters.scatter)
-            vx, vy = counted[i, 0] / step, counted[i, 1] / step
-            normal, right = add_mouse(normal, right, w, place.position[i], vx, vy)
-    extra = (0.0, 0.0, 0.0)
-    if not tells_rotation(normal):
-        if not has_gyro or normal[0] == 0.0:
-            return False, before, before
-        by_gyro = 1.0 / bias_doubt(state.gyro[2]) ** 2
-        extra = (0.0, 0.0, by_gyro)
-        right = (right[0], right[1], right[2] + by_gyro * (rate - state.gyro[1]))
-    velocity, spread = solve(normal, extra, right)
-    common = parameters.floor**2 * (velocity[0] * velocity[0] + velocity[1] * velocity[1])
-    return True, velocity, (spread[0] + common, spread[1] + common, spread[2])
+def remember(reading: Reading, dt: float, step: float, rate: float, place: Placement, state: MiceState) -> None:
+    """Takes the step into the window. A mouse that is away moves there as the others say: it returns in good order."""
+    mice = reading.sound.shape[0]
+    keep, velocity = math.exp(-dt / _WINDOW_S), vec.load(state.velocity)
+    for i in range(mice):
+        if not reading.sound[i]:
+            x, y = at_mouse(velocity, place.position[i])
+            reading.moved[i, 0], reading.moved[i, 1] = x * step, y * step
+        silent = reading.moved[i, 0] == 0.0 and reading.moved[i, 1] == 0.0
+        state.watch[i, 0] = state.watch[i, 0] + step if silent else 0.0
+        for j in range(2):
+            state.window[i, j] = keep * state.window[i, j] + reading.moved[i, j]
+    turned = rate if math.isfinite(rate) else velocity[2] + state.gyro[1]
+    state.window[mice, 0] = keep * state.window[mice, 0] + step
+    state.window[mice, 1] = keep * state.window[mice, 1] + turned * step
+
+
+@compiled
+def agree(reading: Reading, step: float, rate: float, place: Placement, state: MiceState) -> None:
+    """What follows from mice that agree: the reference, the gyro's bias, and excluded mice that are taken back."""
+    mice, count = reading.sound.shape[0], usable(reading)
+    span = state.window[mice, 0]
+    _, x = explain(mice, reading, place, state)
+    for j in range(3):
+        state.reference[j] = x[j] / span
+    if count >= 2 and math.isfinite(rate):
+        state.gyro[2] = min(state.gyro[2] + step, _BIAS_MEMORY_S)
+        state.gyro[1] += ((state.window[mice, 1] - x[2]) / span - state.gyro[1]) * step / state.gyro[2]
+    for i in range(mice):
+        if not (state.distrusted[i] and reading.sound[i]):
+            continue
+        # Twice, for the mice that it is compared with err as well.
+        if misfit(x, place.position[i], state.window[i]) > 2.0 * _AGREES / reading.weight[i]:
+            state.watch[i, 1] = state.watch[i, 2] = 0.0
+            continue
+        vx, vy = at_mouse(vec.load(state.velocity), place.position[i])
+        state.watch[i, 1] += step
+        state.watch[i, 2] += step * math.hypot(vx, vy)
+        state.distrusted[i] = state.watch[i, 1] < _AGREED_S or state.watch[i, 2] < _AGREED_M
+
+
+@compiled
+def correct(
+    reading: Reading, dt: float, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
+) -> bool:
+    """Velocity from the counts of one sample that cover the last `step` of `dt` (s); False where they do not tell it."""
+    mice = reading.sound.shape[0]
+    if not (step > 0.0 and fuse(reading, step, rate, place, p, state)):
+        return False
+    remember(reading, dt, step, rate, place, state)
+    if dt > step:  # a gap: what the robot did before it tells little of what it does now
+        for j in range(3):
+            state.reference[j] = state.velocity[j]
+    span = state.window[mice, 0]
+    usual = (state.reference[0] * span, state.reference[1] * span, state.reference[2] * span)
+    for i in range(mice):
+        count, at = place.metres_per_count[i], place.position[i]
+        reading.weight[i] = 1.0 / variance(count, usual, at, p.mismatch, 0.5 * span * step * p.noise_m_s**2)
+    faulty = find_fault(reading, step, place, state)
+    if faulty >= 0:
+        state.distrusted[faulty], reading.use[faulty] = True, False
+        state.watch[faulty, 1] = state.watch[faulty, 2] = state.watch[mice, 0] = 0.0
+        fuse(reading, step, rate, place, p, state)
+    if state.watch[mice, 0] == 0.0:
+        agree(reading, step, rate, place, state)
+    return True
+
+
+@compiled
+def read_mice(counts: Floats, flags: int, place: Placement, reading: Reading) -> None:
+    """The motion of each mouse in b. A mouse that is away, or overflowed, has none."""
+    for i in range(reading.sound.shape[0]):
+        reading.sound[i] = False
+        if i < counts.shape[0] and not flags & (_OVERFLOW << i):
+            x, y = counts[i, 0] * place.metres_per_count[i], counts[i, 1] * place.metres_per_count[i]
+            reading.sound[i] = math.isfinite(x + y)
+            c, s = place.axes[i, 0], place.axes[i, 1]
+            reading.moved[i, 0], reading.moved[i, 1] = c * x - s * y, s * x + c * y
 
 
 @compiled
 def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
     """The exact arc of a constant velocity in b over `step` (s)."""
     half = 0.5 * velocity[2] * step
-    reach = step * (math.sin(half) / half if abs(half) > 1e-6 else 1.0 - half * half / 6.0)
+    reach = step * (math.sin(half) / half if abs(half) > 1e-6 else 1.0)
     c, s = math.cos(pose[2] + half), math.sin(pose[2] + half)
     pose[0] += reach * (c * velocity[0] - s * velocity[1])
     pose[1] += reach * (s * velocity[0] + c * velocity[1])
@@ -312,85 +410,76 @@ def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
 
 
 @compiled
-def read_mice(counts: Floats, flags: int, place: Placement, counted: Floats, sound: NDArray[np.bool_]) -> None:
-    """The motion of each mouse in b (m), and whether it has one: a mouse that is away or overflowed has none."""
-    for i in range(sound.shape[0]):
-        sound[i] = False
-        if i < counts.shape[0] and not flags & (_OVERFLOW << i):
-            x, y = counts[i, 0] * place.metres_per_count[i], counts[i, 1] * place.metres_per_count[i]
-            sound[i] = math.isfinite(x + y)
-            c, s = place.axes[i, 0], place.axes[i, 1]
-            counted[i, 0], counted[i, 1] = c * x - s * y, s * x + c * y
+def hold(time_s: float, dt: float, state: MiceState) -> None:
+    """A sample without a velocity of its own: for a while the last one stands, then nobody knows."""
+    if time_s - state.time[2] <= _HOLD_S:
+        state.std[0] += _ACCEL_M_S2 * dt
+        state.std[1] += _ACCEL_M_S2 * dt
+        state.std[2] += _ANGULAR_RAD_S2 * dt
+        advance_pose(state.pose, state.velocity, dt)
+    else:
+        for j in range(3):
+            state.velocity[j] = 0.0
+        state.time[2] = math.nan
 
 
 @compiled
-def remember(
-    counted: Floats, sound: NDArray[np.bool_], step: float, turn: float, place: Placement, state: MiceState
+def advance(
+    time_s: float, flags: int, rate: float, reading: Reading, place: Placement, p: MiceParameters, state: MiceState
 ) -> None:
-    """The step goes into the window. A mouse that is away moves there as the others say, so it returns in good order."""
-    mice = sound.shape[0]
-    keep = math.exp(-step / _WINDOW_S)
-    v = state.velocity
-    for i in range(mice):
-        p = place.position[i]
-        if not sound[i]:
-            counted[i, 0], counted[i, 1] = (v[0] - v[2] * p[1]) * step, (v[1] + v[2] * p[0]) * step
-        state.watch[i, 0] = 0.0 if counted[i, 0] != 0.0 or counted[i, 1] != 0.0 else state.watch[i, 0] + step
-        for j in range(2):
-            state.window[i, j] = keep * state.window[i, j] + counted[i, j]
-    state.window[mice, 0] = keep * state.window[mice, 0] + step
-    state.gyro[3] = keep * state.gyro[3] + turn
-    for j in range(3):
-        state.moved[j] = keep * state.moved[j] + v[j] * step
+    """One sample. After a gap its counts cover one usual interval only: what the lost samples counted is lost."""
+    dt = time_s - state.time[0]
+    for i in range(reading.sound.shape[0]):
+        reading.use[i] = reading.sound[i] and not state.distrusted[i]
+    if not dt > 0.0:  # also the first sample, whose interval nobody knows
+        if math.isnan(state.time[0]):
+            state.time[0] = time_s
+        else:
+            state.rejected[0] += 1
+        return
+    state.time[0] = time_s
+    is_gap = bool(flags & _GAP_BEFORE) or dt > LONGEST_STEP_S
+    if not is_gap:
+        state.time[1] = dt
+    step = 0.0 if math.isnan(state.time[1]) else min(state.time[1], dt)
+    mean_rate = 0.5 * (rate + state.gyro[0]) if not is_gap and math.isfinite(state.gyro[0]) else rate
+    state.gyro[0] = rate
+    missed = dt - step if time_s - state.time[2] <= _HOLD_S else 0.0  # bridged by the velocities at its ends
+    if missed > 0.0:
+        advance_pose(state.pose, state.velocity, 0.5 * missed)
+    if correct(reading, dt, step, mean_rate, place, p, state):
+        state.time[2] = time_s
+        advance_pose(state.pose, state.velocity, step + 0.5 * missed)
+    else:
+        state.rejected[0] += 1
+        hold(time_s, dt - 0.5 * missed, state)
 
 
 @compiled
-def take_back(
-    sound: NDArray[np.bool_], step: float, place: Placement, parameters: MiceParameters, state: MiceState
+def _process(
+    time_s: Floats,
+    counts: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint16],
+    place: Placement,
+    imu: ImuCalibration,
+    p: MiceParameters,
+    state: MiceState,
+    out: Floats,
 ) -> None:
-    """Watches the excluded mice, and trusts again those that have agreed for long enough."""
-    moved, v = vec.load(state.moved), state.velocity
-    for i in range(sound.shape[0]):
-        if state.distrusted[i] and sound[i]:
-            p = place.position[i]
-            doubt = 2.0 * variance(1.0, place.metres_per_count[i], moved, p, parameters.scatter)
-            if misfit(moved, p, state.window[i, 0], state.window[i, 1]) > _AGREES * doubt:
-                state.watch[i, 1] = state.watch[i, 2] = 0.0
-                continue
-            state.watch[i, 1] += step
-            state.watch[i, 2] += step * math.hypot(v[0] - v[2] * p[1], v[1] + v[2] * p[0])
-            state.distrusted[i] = not (state.watch[i, 1] >= _AGREED_S and state.watch[i, 2] >= _AGREED_M)
-
-
-@compiled
-def correct(
-    counted: Floats, sound: NDArray[np.bool_], use: NDArray[np.bool_], weight: Floats, step: float, rate: float,
-    has_gyro: bool, place: Placement, parameters: MiceParameters, state: MiceState,
-) -> bool:  # fmt: skip
-    """One sample's counts: velocity and its variance; False where they cannot tell it. `use` and `weight` are room."""
-    mice = sound.shape[0]
-    for i in range(mice):
-        use[i] = sound[i] and not state.distrusted[i]
-    known, velocity, spread = fuse(use, counted, step, place, parameters, state, rate, has_gyro)
-    if not known:
-        return False
-    for j in range(3):
-        state.velocity[j], state.variance[j] = velocity[j], spread[j]
-    before = vec.load(state.moved)
-    remember(counted, sound, step, rate * step if has_gyro else 0.0, place, state)
-    for i in range(mice):
-        weight[i] = 1.0 / variance(1.0, place.metres_per_count[i], vec.load(state.moved), place.position[i], parameters.scatter)
-    fused = vec.load(state.moved)
-    keep = math.exp(-step / _WINDOW_S)
-    span = state.window[mice, 0]
-    grow = span / max(span - step, step) * keep  # the motion before this step, carried on over it
-    for j in range(3):
-        state.moved[j] = before[j] * grow
-    faulty = find_fault(use, weight, place, state, has_gyro, step)
-    for j in range(3):
-        state.moved[j] = fused[j]
-    if faulty >= 0:
-        state.distrusted[faulty] = True
-        state.watch[faulty, 1] = state.watch[faulty, 2] = 0.0
-        use[faulty] = False
-    return True
+    mice = place.position.shape[0]
+    reading = Reading(np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice))
+    for i in range(len(time_s)):
+        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
+        read_mice(counts[i], flags[i], place, reading)
+        advance(time_s[i], flags[i], rate[2] if has_rate else math.nan, reading, place, p, state)
+        known = not math.isnan(state.time[2])
+        excluded = 0
+        for j in range(mice):
+            if not reading.use[j]:
+                excluded |= 1 << j
+        for j in range(3):
+            out[i, j] = state.velocity[j] if known else np.nan
+            out[i, 3 + j] = state.std[j] if known else np.nan
+            out[i, 6 + j] = state.pose[j]
+        out[i, 9] = excluded
