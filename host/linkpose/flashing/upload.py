@@ -88,8 +88,8 @@ class Upload:
             )
         if "not in sync" in said or "not responding" in said:
             return (
-                f"no UNO bootloader answers at {port}, nothing was written: it is another board, another port, or "
-                "another program holds it; see `linkpose ports`, close other programs, then `linkpose flash --port PORT`"
+                f"no UNO bootloader answers at {port}, nothing was written: it is another board or another port, or "
+                "another program holds it; see `linkpose ports`, close the other, type `linkpose flash --port PORT`"
             )
         if "permission denied" in said or "access is denied" in said:
             return (
