@@ -26,17 +26,17 @@ def sensors_of(measurements: Measurements) -> Sensors:
     return imu | (Sensors.BMP180 if measurements.baro_fresh.any() else Sensors(0))
 
 
-def warm_up(names: Sequence[str]) -> None:
-    """Compiles all that an estimate needs, or loads it compiled: `names` as for `Estimator`."""
-    filters.warm_up(names or filters.NAMES)
-    format_rows(np.zeros((1, 1)), np.zeros(1, np.int64))
+def mice_of(measurements: Measurements) -> int:
+    """Mouse ports up to the last that ever gave a count."""
+    counted = np.isfinite(measurements.mice_counts).any(axis=(0, 2))
+    return int(np.flatnonzero(counted).max(initial=-1)) + 1
 
 
 class Estimator:
     """Runs filters over consecutive blocks of measurements."""
 
-    def __init__(self, names: Sequence[str], rig: Rig, sensors: Sensors) -> None:
-        """The filters of these names, or all that can run when there is none.
+    def __init__(self, names: Sequence[str], rig: Rig, sensors: Sensors, mice: int = 0) -> None:
+        """The filters of these names, or all that can run when there is none; `mice` is how many ports have one.
 
         Raises LinkposeError when a named one cannot run, or none at all; `left_out` tells why others do not.
         """
@@ -44,7 +44,7 @@ class Estimator:
         self.filters: list[filters.Filter] = []
         for name in dict.fromkeys(names or filters.NAMES):
             try:
-                self.filters.append(filters.create(name, rig, sensors))
+                self.filters.append(filters.create(name, rig, sensors, mice))
             except filters.CannotRun as reason:
                 if names:
                     raise LinkposeError(f"the filter {name} cannot run: {reason}") from None
@@ -54,6 +54,11 @@ class Estimator:
             raise LinkposeError(f"no filter can run on this ({reasons})")
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
         self._decimals = np.array([TIME_DECIMALS, *(_decimals(name) for name in self.columns[1:])], dtype=np.int64)
+
+    def warm_up(self) -> None:
+        """Compiles all that `process` and `text` need, or loads it compiled: no sample waits for a compiler."""
+        filters.warm_up(f.name for f in self.filters)
+        self.text(np.zeros((1, len(self.columns))))
 
     def process(self, block: Measurements) -> Floats:
         """The estimates (N, columns) at the next N samples."""

@@ -88,7 +88,7 @@ def command(
 
 def _replay(path: Path, request: Request, console: Console) -> None:
     """Estimates over a recording, as fast as it goes."""
-    from linkpose.estimation import Estimator, sensors_of
+    from linkpose.estimation import Estimator, mice_of, sensors_of
     from linkpose.recording.reader import load_recording
 
     recording = load_recording(path)
@@ -96,9 +96,10 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         console.say(remark)
     rig = options.resolve_rig(request.rig_file, request.j2s, recording.rig)
     with _patience(console):
-        estimator = Estimator(request.filter_names, rig, sensors_of(recording.measurements))
+        measurements = recording.measurements
+        estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
         _tell_left_out(estimator, console)
-        estimates = estimator.process(recording.measurements)
+        estimates = estimator.process(measurements)
     head = {"recording": str(path), "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
     with _sink(estimator, request, head) as sink:
         sink.write(estimates)
@@ -111,14 +112,11 @@ def _live(
     port: str | None, duration: float | None, record: Path | None, raw: Path | None, request: Request, console: Console
 ) -> None:
     """Estimates as the board measures."""
-    with _patience(console):  # compile before the board is started: no sample waits for a compiler
-        from linkpose.estimation import Estimator, warm_up
-
-        warm_up(request.filter_names)
     from linkpose.cli import live
     from linkpose.cli.view import View
     from linkpose.device.ports import choose_port
     from linkpose.device.session import Session
+    from linkpose.sensors.conversion import Settings
     from linkpose.sensors.measurements import Measurements
     from linkpose.wire.messages import Sensors
 
@@ -126,8 +124,13 @@ def _live(
         capture = stack.enter_context(live.raw_capture(raw, request.force))
         session = stack.enter_context(Session(port or choose_port(), console.say, capture))
         rig = options.resolve_rig(request.rig_file, request.j2s, session.rig)
-        estimator = Estimator(request.filter_names, rig, Sensors(session.hello.sensors))
-        _tell_left_out(estimator, console)
+        with _patience(console):  # before the board is started: no sample waits for a compiler
+            from linkpose.estimation import Estimator
+
+            mice = Settings.of(session.hello).mouse_ports
+            estimator = Estimator(request.filter_names, rig, Sensors(session.hello.sensors), mice)
+            _tell_left_out(estimator, console)
+            estimator.warm_up()
         recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
         head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
         sink = stack.enter_context(_sink(estimator, request, head))
@@ -149,8 +152,9 @@ def _live(
 
 
 def _tell_left_out(estimator: Estimator, console: Console) -> None:
-    for name, reason in estimator.left_out.items():
-        console.say(f"without {name}: {reason}")
+    for reason in dict.fromkeys(estimator.left_out.values()):
+        names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
+        console.say(f"without {names}: {reason}")
 
 
 def _rejected(estimator: Estimator) -> dict[str, Any]:

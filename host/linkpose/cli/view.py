@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from linkpose.cli.live import health_line
@@ -38,14 +38,14 @@ class View:
     def _table(self, estimates: Floats, caption: str) -> Any:
         from rich.table import Table
 
-        table = Table(title="height over the joint centre, live", caption=caption, title_justify="left")
         rows = self._by_filter(estimates)
+        table = Table(title=_title(rows), caption=caption, title_justify="left")
         quantities = list(dict.fromkeys(name for values in rows.values() for name in values))
         table.add_column("filter")
         for quantity in quantities:
             table.add_column(quantity, justify="right", min_width=9)
         for name, values in rows.items():
-            table.add_row(name, *(f"{values[q]:+.4f}" if q in values else "" for q in quantities))
+            table.add_row(name, *(_text(q, values[q]) if q in values else "" for q in quantities))
         return table
 
     def _by_filter(self, estimates: Floats) -> dict[str, dict[str, float]]:
@@ -68,3 +68,17 @@ class View:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _title(rows: Mapping[str, Mapping[str, float]]) -> str:
+    """What the filters on show are about."""
+    quantities = {name for values in rows.values() for name in values}
+    subjects = {"height_m": "height over the joint centre", "x_m": "the robot's motion"}
+    return " and ".join(text for name, text in subjects.items() if name in quantities) + ", live"
+
+
+def _text(quantity: str, value: float) -> str:
+    """A value as it is shown; the excluded mice by their numbers."""
+    if quantity != "excluded":
+        return f"{value:+.4f}"
+    return ", ".join(str(port + 1) for port in range(int(value).bit_length()) if int(value) >> port & 1) or "none"

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.measurements import Measurements
-from linkpose.sensors.rig import Rig
+from linkpose.sensors.rig import Mouse, Rig
 from linkpose.wire.messages import Sensors
 
 Floats = NDArray[np.float64]
 
 ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180
+MOST_MICE = 4  # the firmware's ports
 
 
 class _Entry(NamedTuple):
@@ -26,6 +27,7 @@ class _Entry(NamedTuple):
     cls: str
     sensors: Sensors
     needs_j2s: bool
+    needs_mice: bool = False
 
 
 _FILTERS = {
@@ -33,6 +35,8 @@ _FILTERS = {
     "tilt": _Entry("tilt", "TiltFilter", Sensors.MPU6050, False),
     "imu-baro": _Entry("imu_baro", "ImuBaroFilter", ALL_SENSORS, False),
     "baro": _Entry("baro", "BaroFilter", Sensors.BMP180, False),
+    "joint-inertial": _Entry("joint_inertial", "JointInertialFilter", Sensors.MPU6050, True),
+    "mice": _Entry("mice", "MiceFilter", Sensors(0), False, True),
 }
 NAMES = tuple(_FILTERS)
 
@@ -59,8 +63,11 @@ class CannotRun(LinkposeError):
     """The rig or the sensors do not allow a filter; the text says why and what to type."""
 
 
-def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS) -> Filter:
-    """A fresh filter. Raises CannotRun where the rig or the sensors do not allow it, LinkposeError for no such name."""
+def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST_MICE) -> Filter:
+    """A fresh filter for measurements of these sensors and of mice at ports 1 to `mice`.
+
+    Raises CannotRun where the rig or the sensors do not allow it, LinkposeError for no such name.
+    """
     if name not in _FILTERS:
         raise LinkposeError(f"there is no filter {name!r}: take {', '.join(NAMES)}")
     entry = _FILTERS[name]
@@ -68,13 +75,25 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS) -> Filter:
         raise CannotRun(f"{name} needs the {missing.name}, which does not answer: check its wiring")
     if entry.needs_j2s and rig.joint.j2s_m is None:
         raise CannotRun(f"{name} needs J2S: type `linkpose calibrate joint`, or give it with --j2s X,Y,Z")
+    if entry.needs_mice:
+        _check_mice(rig, sensors, mice)
     made: Filter = getattr(importlib.import_module(f"linkpose.filters.{entry.module}"), entry.cls)(rig)
     return made
 
 
+def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
+    """Raises CannotRun where there are no mice, or nobody knows where they sit, or a lone one lacks the gyro."""
+    if not mice:
+        raise CannotRun("no mouse gives counts; if there is one, check its wiring")
+    if not rig.mouse:
+        raise CannotRun("the rig file does not say where the mice sit: add [[mouse]] with x_m and y_m, port by port")
+    if min(mice, len(rig.mouse)) == 1 and not sensors & Sensors.MPU6050:
+        raise CannotRun("one mouse cannot tell a turn without the MPU6050's rate: add a second mouse")
+
+
 def warm_up(names: Iterable[str] = NAMES) -> None:
     """Compiles the filters, or loads them compiled, so that no sample waits for a compiler."""
-    rig = Rig().with_j2s((0.0, 0.0, 1.0))
+    rig = Rig(mouse=(Mouse(0.1, 0.0), Mouse(-0.1, 0.0))).with_j2s((0.0, 0.0, 1.0))
     for name in names:
         create(name, rig).process(_two_samples_at_rest())
 
@@ -88,6 +107,6 @@ def _two_samples_at_rest() -> Measurements:
         pressure_Pa=np.full(2, 1e5),
         baro_temp_degC=np.full(2, 25.0),
         baro_fresh=np.ones(2, np.bool_),
-        mice_counts=np.empty((2, 0, 2)),
+        mice_counts=np.zeros((2, 2, 2)),
         flags=np.zeros(2, np.uint16),
     )

@@ -1,21 +1,21 @@
 """`mice`: velocity of a robot from N optical mice by weighted least squares, and its path by dead reckoning.
 
-Frames: n is the floor's, b the robot's (x ahead, y to the left, z up). Mouse i sits at p_i in b and is turned by φ_i: it
-gives R(φ_i)ᵀ v_i, in counts. With the robot's velocity ẋ = (v_bx, v_by, ω_b),
+Frames: n is the floor's, b the robot's (x ahead, y to the left, z up). Mouse i sits at p_i in b and is turned by φ_i:
+it gives R(φ_i)ᵀ v_i, in counts. With the robot's velocity ẋ = (v_bx, v_by, ω_b),
 
     v_ix = v_bx − ω_b p_iy,   v_iy = v_by + ω_b p_ix                                      (6), (7)
     A ẋ = Θ,   ẋ = (Aᵀ W A)⁻¹ Aᵀ W Θ                                                      (8), (11), (12)
 
 with W = diag(1/σ_i²). For equal mice on an equilateral triangle that is J of (14), (15), the means of (16), (17).
 σ_i² = ⅙ (count / T)² + (κ ‖v_i‖)² + σ²: a count is kept by the mouse until it is whole, so the error of a step is the
-difference of two roundings; and the surface scatters what a mouse sees in proportion to its speed. What the floor does to
-all mice alike cannot be told from motion: it is not in the weights, and adds (κ_c ‖v‖)² to the variance of v_b.
+difference of two roundings; and the surface scatters what a mouse sees in proportion to its speed. What the floor does
+to all mice alike cannot be told from motion: it is not in W, and adds (κ_c ‖v‖)² to the variance of v_b.
 
 A mouse that slips, is lifted or dies shows in the residual over a short, exponentially forgetting window, in which the
-roundings cancel: Σ ‖S_i − A_i X‖² / σ_i² against χ² with 2N − 3 degrees of freedom. Each mouse is then left out in turn.
-Two mice that are left explain many a fault of the third as a turn, so the explanation that wins is the one that also
-agrees with the gyro and with what a robot can do in so short a time. A mouse that is excluded is watched, and taken back
-when it has agreed over a time and a distance; at rest everything agrees.
+roundings cancel: Σ ‖S_i − A_i X‖² / σ_i² against χ² with 2N − 3 degrees of freedom. Each mouse is then left out in
+turn. Two mice that are left explain many a fault of the third as a turn, so the explanation that wins is the one that
+also agrees with the gyro and with what a robot can do in so short a time. A mouse that is excluded is watched, and
+taken back when it has agreed over a time and a distance; at rest everything agrees.
 
 Source: the redundant-mice paper, equations (1)-(17).
 """
@@ -94,7 +94,7 @@ class MiceState(NamedTuple):
     velocity: Floats  # (3,) v_bx, v_by (m/s), ω_b (rad/s)
     std: Floats  # (3,) of the velocity
     reference: Floats  # (3,) mean velocity over the window when the mice last agreed
-    gyro: Floats  # (3,) rad/s: last usable rate (NaN for none), its bias beyond the rig's; s: for how long that was learnt
+    gyro: Floats  # (3,) last usable rate (rad/s, NaN for none), its bias beyond the rig's (rad/s), learnt over (s)
     window: Floats  # (M + 1, 2) m: each mouse's motion S_i; last row: the window's time (s) and the gyro's turn (rad)
     watch: Floats  # (M + 1, 3) s without a count, s and m of agreement; last row: s of disagreement, of all mice
     distrusted: Bools  # (M,)
@@ -362,7 +362,7 @@ def agree(reading: Reading, step: float, rate: float, place: Placement, state: M
 def correct(
     reading: Reading, dt: float, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
 ) -> bool:
-    """Velocity from the counts of one sample that cover the last `step` of `dt` (s); False where they do not tell it."""
+    """Velocity from counts that cover the last `step` of `dt` (s); False where they do not tell it."""
     mice = reading.sound.shape[0]
     if not (step > 0.0 and fuse(reading, step, rate, place, p, state)):
         return False

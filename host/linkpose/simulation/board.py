@@ -18,6 +18,7 @@ from linkpose.wire.messages import (
     Configure,
     GetInfo,
     Hello,
+    HelloMouse,
     Message,
     Nak,
     NakReason,
@@ -31,6 +32,7 @@ from linkpose.wire.messages import (
     Sensors,
     Start,
     Status,
+    StatusMouse,
     Stop,
 )
 
@@ -53,6 +55,10 @@ class Run(Protocol):
 
     @property
     def rig(self) -> Rig: ...
+    @property
+    def hello_sensors(self) -> Sensors: ...
+    @property
+    def hello_mice(self) -> tuple[HelloMouse, ...]: ...
     def samples(self) -> Iterator[Sample]: ...
 
 
@@ -105,7 +111,7 @@ class SimulatedBoard:
     def _answer(self, message: Message | OtherProtocol, now_us: int) -> list[Message]:
         match message:
             case GetInfo():
-                return [hello(self._settings, self._samples is not None)]
+                return [self._hello()]
             case Ping(token):
                 return [Pong(token, now_us & 0xFFFFFFFF)]
             case Start():
@@ -122,8 +128,11 @@ class SimulatedBoard:
                 return self._self_test()
             case ResetMice(ports):
                 no_such_port = Nak(Command.RESET_MICE, NakReason.MOUSE_PORT_OUT_OF_RANGE)
-                return [no_such_port if ports else Ack(Command.RESET_MICE)]
+                return [no_such_port if ports >> len(self._run.hello_mice) else Ack(Command.RESET_MICE)]
         return []
+
+    def _hello(self) -> Hello:
+        return hello(self._settings, self._samples is not None, self._run.hello_sensors, self._run.hello_mice)
 
     def _configure(self, settings: Configure) -> Message:
         if self._samples is not None:
@@ -140,7 +149,9 @@ class SimulatedBoard:
     def _status(self, now_us: int) -> Status:
         """A board whose every counter is 0: a simulated one has no bus, no stack and no load."""
         zero = dict.fromkeys(Status._fields, 0)
-        return Status(**(zero | {"t_us": now_us & 0xFFFFFFFF, "ticks": self._tick, "mice": ()}))  # type: ignore[arg-type]
+        mice = tuple(StatusMouse(0, 0, 0) for _ in self._run.hello_mice)
+        told = {"t_us": now_us & 0xFFFFFFFF, "ticks": self._tick, "mice": mice}
+        return Status(**(zero | told))  # type: ignore[arg-type]
 
     def _self_test(self) -> list[Message]:
         """A sound sensor at rest: each axis answers the self-test with just its factory trim (register map, 4.1)."""
@@ -155,7 +166,12 @@ class SimulatedBoard:
         return [Ack(Command.SELF_TEST), SelfTestResult(*trims, *plain, *excited, baro_id=0x55)]
 
 
-def hello(settings: Configure, streaming: bool = False) -> Hello:
+def hello(
+    settings: Configure,
+    streaming: bool = False,
+    sensors: Sensors = Sensors.MPU6050 | Sensors.BMP180,
+    mice: tuple[HelloMouse, ...] = (),
+) -> Hello:
     """What a simulated board with these settings says of itself."""
     major, minor, patch = map(int, VERSION.split("."))
     return Hello(
@@ -169,11 +185,12 @@ def hello(settings: Configure, streaming: bool = False) -> Hello:
         reset_cause=int(ResetCause.POWER_ON),
         streaming=int(streaming),
         sample_rate_hz=settings.sample_rate_hz,
-        sensors=int(Sensors.MPU6050 | Sensors.BMP180),
+        sensors=int(sensors),
         imu_id=0x68,
         accel_range_g=settings.accel_range_g,
         gyro_range_deg_s=settings.gyro_range_deg_s,
         dlpf=settings.dlpf,
         baro_oversampling=settings.baro_oversampling,
         **DATASHEET_WORDS._asdict(),
+        mice=mice,
     )

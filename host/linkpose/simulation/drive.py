@@ -1,7 +1,7 @@
 """Where a small robot drives: velocity in its own axes, the way that it has gone, and its pose, at any instant.
 
 Frames: n is the floor's, b the robot's (x ahead, y to the left, z up). With Q(t) = ∫ (v_bx, v_by, ω_b) dt, the way, a
-point p of the robot has moved in b by (Q_x − Q_ω p_y, Q_y + Q_ω p_x): what a mouse sees needs no integration of its own.
+point p of the robot has moved in b by (Q_x − Q_ω p_y, Q_y + Q_ω p_x): that is all that a mouse sees.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class Manoeuvres:
         number, within, before, after = self._tables(time_s)
         u = np.minimum(within / PASSAGE_S, 1.0)
         passed = PASSAGE_S * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(within - PASSAGE_S, 0.0)  # ∫ of the passage
-        return np.array(self._ways)[number] + before * within[:, None] + (after - before) * passed[:, None]
+        return np.asarray(np.array(self._ways)[number] + before * within[:, None] + (after - before) * passed[:, None])
 
 
 class Track:
@@ -143,7 +143,7 @@ class Track:
 
     def _steps(self, block: int) -> Floats:
         """The way in n within a block: (_POSE_BLOCK + 1, 2), by Simpson's rule."""
-        half = (2 * block * _POSE_BLOCK + np.arange(2 * _POSE_BLOCK + 1)) * 0.5 * _POSE_STEP_S
+        half: Floats = (2 * block * _POSE_BLOCK + np.arange(2 * _POSE_BLOCK + 1, dtype=np.float64)) * 0.5 * _POSE_STEP_S
         twist, heading = self._drive.twist(half), self._drive.way(half)[:, 2]
         c, s = np.cos(heading), np.sin(heading)
         velocity = np.column_stack([c * twist[:, 0] - s * twist[:, 1], s * twist[:, 0] + c * twist[:, 1]])

@@ -21,7 +21,7 @@ from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Joint, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation.motion import HandMotion
-from linkpose.wire.messages import Sample, SampleFlags
+from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -94,6 +94,9 @@ class RawBlock(NamedTuple):
 
 class LinkRun:
     """A run of the simulated link. Pure: every method gives the same for the same arguments, in any order."""
+
+    hello_sensors = Sensors.MPU6050 | Sensors.BMP180
+    hello_mice: tuple[HelloMouse, ...] = ()
 
     def __init__(
         self,

@@ -225,7 +225,7 @@ class MiceRun:
     def _noise_steps(self, block: int) -> Floats:
         """The noise's way within a block of draws, (_BLOCK + 1, M, 2)."""
         errors, mice = self._mouse_errors, len(self.mice)
-        middle = (block * _BLOCK + np.arange(_BLOCK) + 0.5) * NOISE_S
+        middle: Floats = (block * _BLOCK + np.arange(_BLOCK, dtype=np.float64) + 0.5) * NOISE_S
         v = self._drive.twist(middle)
         vx, vy = v[:, None, 0] - v[:, None, 2] * self._place[:, 1], v[:, None, 1] + v[:, None, 2] * self._place[:, 0]
         speed = np.hypot(vx, vy)[:, :, None]
@@ -274,15 +274,14 @@ class MiceRun:
             raise LinkposeError("a mouse moves by more counts in a sample than the wire holds; lower counts_per_m")
         flags = int(SampleFlags.IMU_VALID) + there @ (int(SampleFlags.MOUSE1_VALID) << np.arange(len(self.mice)))
         counts = self.imu_counts(time_s[1:], first).tolist()
-        stamps = np.rint(time_s[1:] * 1e6).astype(np.int64)
-        rows = zip(ticks[1:].tolist(), stamps.tolist(), counts, flags.tolist(), moved.tolist(), there.tolist(), strict=True)
+        stamps = np.rint(time_s[1:] * 1e6).astype(np.int64).tolist()
+        own = [tuple(SampleMouse(*pair) for pair in row) for row in np.where(there[:, :, None], moved, 0).tolist()]
         return [
-            Sample(
-                tick & 0xFFFF, t_us & 0xFFFFFFFF, *row, 0, 0, 0, bits,
-                tuple(SampleMouse(*(pair if on else (0, 0))) for pair, on in zip(pairs, plugged, strict=True)),
+            Sample(tick & 0xFFFF, t_us & 0xFFFFFFFF, ax, ay, az, temp, gx, gy, gz, 0, 0, 0, bits, mice)
+            for tick, t_us, (ax, ay, az, temp, gx, gy, gz), bits, mice in zip(
+                ticks[1:].tolist(), stamps, counts, flags.tolist(), own, strict=True
             )
-            for tick, t_us, row, bits, pairs, plugged in rows
-        ]  # fmt: skip
+        ]
 
     def samples(self) -> Iterator[Sample]:
         """All SAMPLEs one by one, in bounded memory; without end when the run has none."""

@@ -1,6 +1,7 @@
 """`sim://...`: simulated boards as pyserial ports, for any code that opens a port.
 
     sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&drift_ppm=0&speed=1
+    sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8&drift_ppm=0&speed=1
 
 `speed` is how much faster than real time the board lives; 0 is as fast as it is read. `drift_ppm` is how much its clock
 runs fast.
@@ -128,13 +129,18 @@ def _parse(url: str) -> tuple[Callable[[Configure], Run], dict[str, float]]:
     drift = _number(options, "drift_ppm", 0.0)
     if speed < 0 or abs(drift) > 10_000:
         raise LinkposeError("speed must be 0 or more, and drift_ppm within 10000")
-    if parts.netloc != "link":
-        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type sim://link")
-    make_run = _link(options)
+    if parts.netloc not in _RIGS:
+        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type {' or '.join(map(_address, _RIGS))}")
+    rig, known = _RIGS[parts.netloc]
+    make_run = rig(options)
     if options:
-        known = "test, seed, errors, j2s, drift_ppm and speed"
-        raise LinkposeError(f"sim://link has no option {', '.join(options)}; it has {known}")
+        known = f"{known}, drift_ppm and speed"
+        raise LinkposeError(f"{_address(parts.netloc)} has no option {', '.join(options)}; it has {known}")
     return make_run, {"speed": speed, "drift_ppm": drift}
+
+
+def _address(rig: str) -> str:
+    return f"sim://{rig}"
 
 
 def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
@@ -159,6 +165,36 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
         )
 
     return make_run
+
+
+def _mice(options: dict[str, str]) -> Callable[[Configure], Run]:
+    from linkpose.simulation.mice import Fault, MiceRun, ring
+
+    seed, mice = int(_number(options, "seed", 0)), int(_number(options, "mice", 3))
+    path, errors = options.pop("path", "drive"), options.pop("errors", "calibrated")
+    faults = tuple(Fault.parse(text) for text in options.pop("fault", "").split(",") if text)
+
+    def make_run(settings: Configure) -> MiceRun:
+        return MiceRun(
+            seed,
+            None,
+            settings.sample_rate_hz,
+            ring(mice, counts_per_m=1000.0 * settings.mouse_counts_per_mm),
+            path,
+            errors,
+            faults=faults,
+            accel_range_g=settings.accel_range_g,
+            gyro_range_deg_s=settings.gyro_range_deg_s,
+        )
+
+    return make_run
+
+
+# Simulated board -> what makes it from its options, and their names.
+_RIGS: dict[str, tuple[Callable[[dict[str, str]], Callable[[Configure], Run]], str]] = {
+    "link": (_link, "test, seed, errors, j2s"),
+    "mice": (_mice, "seed, mice, path, errors, fault"),
+}
 
 
 def _number(options: dict[str, str], name: str, default: float) -> float:
