@@ -95,9 +95,13 @@ class PtyServer:
         self._thread.start()
         return self
 
+    def end(self) -> None:
+        """Has `run` return after its present slice."""
+        self._stop.set()
+
     def stop(self) -> PtyStatistics:
         """Ends the thread and takes the port away. Raises what went wrong in the thread."""
-        self._stop.set()
+        self.end()
         if self._thread is not None:
             self._thread.join()
         self.pull_cable()
@@ -127,7 +131,7 @@ class PtyServer:
             self._failure = error
 
     def run(self, duration_s: float | None) -> PtyStatistics:
-        """Serves for a duration of the board's time (None: until `stop`)."""
+        """Serves for a duration of the board's time (None: until `end` or `stop`)."""
         begin_wall, begin_board = time.monotonic(), self.uno.time_s
         self.statistics.epoch_monotonic_s = begin_wall - begin_board
         while not self._stop.is_set() and (duration_s is None or self.uno.time_s - begin_board < duration_s):

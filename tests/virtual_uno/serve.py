@@ -46,8 +46,6 @@ def main() -> int:
     if not options.hex.is_file():
         print(f"there is no {options.hex}: type `pio run -e uno_distro`, or give --hex", file=sys.stderr)
         return 1
-    for stop_signal in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(stop_signal, lambda *_: sys.exit(0))
     try:
         disturbed = {"disturbancePa": options.disturbance}
         with VirtualUno(
@@ -102,11 +100,11 @@ def _serve(uno: VirtualUno, options: argparse.Namespace) -> dict[str, float]:
         on_slice=before_slice, on_open=first_open,
     )  # fmt: skip
     faults = Faulty(uno, server)
+    for stop_signal in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(stop_signal, lambda *_: server.end())
     print(json.dumps({"event": "ready", "port": str(options.link)}), flush=True)
     try:
         server.run(options.duration)
-    except SystemExit:  # a signal: end well
-        pass
     finally:
         server.pull_cable()
     return {**asdict(server.statistics), **uno.state(), "rig_start_s": feed.start_s}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -183,6 +184,17 @@ def test_the_command_serves_and_reports(firmware_hex: Path, tmp_path: Path) -> N
     invalid = sum(not sample.flags & 1 for sample in host.samples)
     assert 100 <= invalid <= 110
     assert len({sample.accel_x for sample in host.samples}) > 500  # the link moves
+
+
+def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -> None:
+    command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(tmp_path / "port")]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdout
+        assert json.loads(served.stdout.readline())["event"] == "ready"
+        served.send_signal(signal.SIGINT)
+        assert json.loads(served.stdout.readline())["event"] == "end"
+    assert served.returncode == 0
+    assert not (tmp_path / "port").is_symlink()
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,14 @@ Time is the core's own: cycles of 16 MHz since power-on. Nothing runs between ca
 
 from __future__ import annotations
 
+import atexit
 import base64
 import json
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +37,58 @@ class Faults(NamedTuple):
 
 
 NO_FAULTS = Faults()
+
+
+class _Emulator:
+    """The emulator's process. One that is done with is kept for the next board: its code is compiled by then."""
+
+    _idle: ClassVar[list[_Emulator]] = []
+
+    def __init__(self) -> None:
+        # In a session of its own, so that a Ctrl-C meant for us does not end it under us.
+        self._process = subprocess.Popen(
+            [_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        )
+        self._asked = False  # a request is under way; one that was broken off leaves the process out of step
+
+    @classmethod
+    def take(cls) -> _Emulator:
+        return cls._idle.pop() if cls._idle else cls()
+
+    def give_back(self) -> None:
+        if self._asked or self._process.poll() is not None:
+            self.end()
+        else:
+            self._idle.append(self)
+
+    def end(self) -> None:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait()
+
+    @classmethod
+    def end_idle(cls) -> None:
+        while cls._idle:
+            cls._idle.pop().end()
+
+    def request(self, request: dict[str, Any]) -> dict[str, Any]:
+        assert self._process.stdin and self._process.stdout
+        self._asked = True
+        self._process.stdin.write(json.dumps(request).encode() + b"\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise VirtualUnoError(f"the emulator ended with status {self._process.wait()}")
+        self._asked = False
+        reply: dict[str, Any] = json.loads(line)
+        if "error" in reply:
+            raise VirtualUnoError(reply["error"])
+        return reply
+
+
+atexit.register(_Emulator.end_idle)
+
 
 class Sensor:
     """One sensor of the GY-87: what it feels, and what goes wrong with it."""
@@ -144,7 +197,7 @@ class VirtualUno:
         these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
         `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
-        self._process = subprocess.Popen([_node(), str(SERVER)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self._emulator = _Emulator.take()
         self._to_send = bytearray()
         self._received = bytearray()
         self.cycle = 0
@@ -166,23 +219,11 @@ class VirtualUno:
         self.close()
 
     def close(self) -> None:
-        assert self._process.stdin and self._process.stdout
-        self._process.stdin.close()
-        self._process.wait()
-        self._process.stdout.close()
+        self._emulator.give_back()
 
     def request(self, op: str, **arguments: Any) -> dict[str, Any]:
         """One operation of emulator/server.js. Raises VirtualUnoError with what the emulator said."""
-        assert self._process.stdin and self._process.stdout
-        self._process.stdin.write(json.dumps({"op": op, **arguments}).encode() + b"\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
-        if not line:
-            raise VirtualUnoError(f"the emulator ended with status {self._process.wait()}")
-        reply: dict[str, Any] = json.loads(line)
-        if "error" in reply:
-            raise VirtualUnoError(reply["error"])
-        return reply
+        return self._emulator.request({"op": op, **arguments})
 
     # --- time ---
 
