@@ -57,7 +57,7 @@ void Mice::advance(uint8_t number, uint32_t now_us) {
     }
     const Ps2Bits& bits = ps2::bits(number);
     const bool running = bits.outcome() == Ps2Bits::Outcome::kRunning;
-    if (running && now_us - port.since_us < port.timeout_ms * 1000UL) return;
+    if (running && now_us - port.since_us < port.timeout_us) return;
     ps2::hold(number);
     port.busy = false;
     port.mouse.finish({ending_of(bits.outcome()), bits.received(), bits.bytes()});
@@ -69,7 +69,7 @@ void Mice::begin_transaction(uint8_t number, uint32_t now_us) {
   Port& port = ports_[number];
   const Ps2Mouse::Request request = port.mouse.next();
   port.busy = true;
-  port.timeout_ms = request.timeout_ms;
+  port.timeout_us = request.timeout_us;
   port.since_us = now_us;
   if (request.sends) {
     ps2::send(number, request.byte, request.answers);

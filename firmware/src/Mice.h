@@ -29,7 +29,7 @@ class Mice {
   struct Port {
     Ps2Mouse mouse;
     bool busy;
-    uint16_t timeout_ms;
+    uint32_t timeout_us;
     uint32_t since_us;
   };
 

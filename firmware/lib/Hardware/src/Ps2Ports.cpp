@@ -10,8 +10,10 @@ namespace ps2 {
 namespace {
 
 // Ports 1 to 3 are on port D, port 4 on port B.
-constexpr uint8_t clock_of(uint8_t port) { return port < 3 ? 1 << (2 + 2 * port) : _BV(PB0); }
-constexpr uint8_t data_of(uint8_t port) { return port < 3 ? 1 << (3 + 2 * port) : _BV(PB1); }
+constexpr uint8_t kClocks[kPorts] = {_BV(PD2), _BV(PD4), _BV(PD6), _BV(PB0)};
+constexpr uint8_t clock_of(uint8_t port) { return kClocks[port]; }
+// The data line is the next pin of each clock.
+constexpr uint8_t data_of(uint8_t port) { return kClocks[port] << 1; }
 constexpr uint8_t kClocksD = clock_of(0) | clock_of(1) | clock_of(2);
 constexpr uint8_t kClocksB = clock_of(3);
 
@@ -20,7 +22,7 @@ volatile uint8_t levels_before_d;
 volatile uint8_t levels_before_b;
 
 // Prepared bytes: their lines are moved by the next tick that serves the mice.
-volatile uint8_t prepared_clocks_d, prepared_data_d, prepared_clocks_b, prepared_data_b;
+volatile uint8_t prepared_d, prepared_b;  // clocks
 volatile uint8_t divider = 1;
 volatile uint8_t ticks_left = 1;
 
@@ -60,20 +62,10 @@ inline __attribute__((always_inline)) void edge(uint8_t pins, uint8_t now) {
   }
 }
 
-void prepare(uint8_t port, bool wanted) {
-  volatile uint8_t& clocks = port < 3 ? prepared_clocks_d : prepared_clocks_b;
-  volatile uint8_t& data = port < 3 ? prepared_data_d : prepared_data_b;
-  if (wanted) {
-    clocks |= clock_of(port);
-    data |= data_of(port);
-  } else {
-    clocks &= static_cast<uint8_t>(~clock_of(port));
-    data &= static_cast<uint8_t>(~data_of(port));
-  }
-}
+volatile uint8_t& prepared(uint8_t port) { return port < 3 ? prepared_d : prepared_b; }
 
 void hold_locked(uint8_t port) {
-  prepare(port, false);
+  prepared(port) &= static_cast<uint8_t>(~clock_of(port));
   pull(port, clock_of(port));
   release(port, data_of(port));
 }
@@ -104,7 +96,7 @@ void send(uint8_t port, uint8_t byte, uint8_t answers) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     hold_locked(port);
     lines[port].begin_sending(byte, answers);
-    prepare(port, true);
+    prepared(port) |= clock_of(port);
   }
 }
 
@@ -119,25 +111,26 @@ void hold(uint8_t port) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { hold_locked(port); }
 }
 
-bool waiting(uint8_t port) { return (port < 3 ? prepared_clocks_d : prepared_clocks_b) & clock_of(port); }
+bool waiting(uint8_t port) { return prepared(port) & clock_of(port); }
 const Ps2Bits& bits(uint8_t port) { return lines[port]; }
 
 // Data goes low first, which is the start bit, then the clocks go free: the mice begin to clock their byte in.
 void start_prepared() {
   if (--ticks_left != 0) return;
   ticks_left = divider;
-  PORTD &= static_cast<uint8_t>(~prepared_data_d);
-  DDRD |= prepared_data_d;
-  DDRD &= static_cast<uint8_t>(~prepared_clocks_d);
-  PORTD |= prepared_clocks_d;
-  prepared_clocks_d = prepared_data_d = 0;
-  if (prepared_clocks_b) {
-    PORTB &= static_cast<uint8_t>(~prepared_data_b);
-    DDRB |= prepared_data_b;
-    DDRB &= static_cast<uint8_t>(~prepared_clocks_b);
-    PORTB |= prepared_clocks_b;
-    prepared_clocks_b = prepared_data_b = 0;
-  }
+  const uint8_t clocks_d = prepared_d;
+  const uint8_t data_d = clocks_d << 1;
+  prepared_d = 0;
+  PORTD &= static_cast<uint8_t>(~data_d);
+  DDRD |= data_d;
+  DDRD &= static_cast<uint8_t>(~clocks_d);
+  PORTD |= clocks_d;
+  if (!prepared_b) return;
+  prepared_b = 0;
+  PORTB &= static_cast<uint8_t>(~data_of(3));
+  DDRB |= data_of(3);
+  DDRB &= static_cast<uint8_t>(~clock_of(3));
+  PORTB |= clock_of(3);
 }
 
 }  // namespace ps2

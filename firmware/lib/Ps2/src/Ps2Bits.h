@@ -97,6 +97,7 @@ class Ps2Bits {
     if (start || !stop) return end(Outcome::kBadFraming);
     if (parity != odd_parity(byte)) return end(Outcome::kBadParity);
     const uint8_t received = received_;
+    if (received == kMaxAnswers) return end(Outcome::kBadFraming);  // more than anyone asked for
     bytes_[received] = byte;
     received_ = received + 1;
     return received + 1 == expected_ ? end(Outcome::kDone) : Act::kNone;

@@ -37,9 +37,9 @@ constexpr struct {
 constexpr uint8_t kSetUpSteps = sizeof kSetUp / sizeof kSetUp[0];
 constexpr uint8_t kScaling2To1 = 0x10;  // in the first byte of the status
 
-constexpr uint16_t kAnswerMs = 20;      // the answer begins within 20 ms by the protocol
-constexpr uint16_t kPowerOnMs = 1000;   // the self-test takes 300 to 500 ms as a rule
-constexpr uint16_t kRepeatMs = 8;       // a repeated packet
+constexpr uint32_t kAnswerUs = 20000;      // the answer begins within 20 ms by the protocol
+constexpr uint32_t kPowerOnUs = 1000000;  // the self-test takes 300 to 500 ms as a rule
+constexpr uint32_t kRepeatUs = 8000;       // a repeated packet
 constexpr uint8_t kSilentLimit = 3;
 constexpr uint8_t kBadPacketLimit = 5;
 
@@ -82,13 +82,13 @@ Ps2Mouse::Request Ps2Mouse::next() {
     begin_reset();
   }
   switch (state_) {
-    case State::kListen: return {false, 0, 2, kPowerOnMs};
-    case State::kProbe: return {true, kSetDefaults, 1, kAnswerMs};
-    case State::kReset: return {true, kResetMouse, 1, kAnswerMs};
-    case State::kSetUp: return {true, set_up_byte(), kSetUp[step_].answers, kAnswerMs};
-    case State::kPoll: return {true, kReadData, 1 + kPacket, kAnswerMs};
-    case State::kResend: return {true, kResendLast, repeat_, kAnswerMs};
-    default: return {false, 0, kPacket, kRepeatMs};
+    case State::kListen: return {false, 0, 2, kPowerOnUs};
+    case State::kProbe: return {true, kSetDefaults, 1, kAnswerUs};
+    case State::kReset: return {true, kResetMouse, 1, kAnswerUs};
+    case State::kSetUp: return {true, set_up_byte(), kSetUp[step_].answers, kAnswerUs};
+    case State::kPoll: return {true, kReadData, 1 + kPacket, kAnswerUs};
+    case State::kResend: return {true, kResendLast, repeat_, kAnswerUs};
+    default: return {false, 0, kPacket, kRepeatUs};
   }
 }
 

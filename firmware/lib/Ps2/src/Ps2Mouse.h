@@ -18,7 +18,7 @@ class Ps2Mouse {
     bool sends;       // else only listens
     uint8_t byte;     // to send
     uint8_t answers;  // bytes expected
-    uint16_t timeout_ms;
+    uint32_t timeout_us;
   };
   enum class Ending : uint8_t { kDone, kBadParity, kBadFraming, kRefused, kTimeout };
   struct Answer {

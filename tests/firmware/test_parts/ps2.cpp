@@ -1,0 +1,403 @@
+#include <Ps2Bits.h>
+#include <Ps2Mouse.h>
+#include <doctest/doctest.h>
+
+#include <deque>
+
+#include "support.h"
+
+namespace {
+
+using Act = Ps2Bits::Act;
+using Ending = Ps2Mouse::Ending;
+using Outcome = Ps2Bits::Outcome;
+
+constexpr uint8_t kBitSteps = 1;  // a bit takes 60 to 100 us
+
+bool odd_parity(uint8_t byte) { return __builtin_parity(byte) == 0; }
+
+// The line of one port, with the time of its edges.
+class Line {
+ public:
+  Ps2Bits bits;
+  uint8_t now = 0;
+  Act last = Act::kNone;
+
+  void edge(bool data, uint8_t steps = kBitSteps) {
+    now = static_cast<uint8_t>(now + steps);
+    last = bits.falling_edge(data, now);
+  }
+  // The 11 bits of a byte from the mouse; stops when the host holds the clock.
+  void byte(uint8_t value, bool bad_parity = false, int clocks = 11, bool stop = true) {
+    const uint16_t frame = static_cast<uint16_t>(value << 1 | (odd_parity(value) != bad_parity) << 9 | stop << 10);
+    for (int i = 0; i < clocks; i++) edge(frame >> i & 1);
+  }
+  // Takes in a byte as the mouse does, and gives what it read: 8 bits, parity, stop.
+  uint16_t take(bool acknowledged = true) {
+    uint16_t read = 0;
+    bool data = false;  // the start bit
+    for (int i = 0; i < 10; i++) {
+      edge(data);
+      if (last == Act::kDataHigh) data = true;
+      if (last == Act::kDataLow) data = false;
+      read |= static_cast<uint16_t>(data << i);
+    }
+    edge(!acknowledged);
+    return read;
+  }
+};
+
+// A mouse in remote mode, as far as the transactions of Ps2Mouse can tell.
+class FakeMouse {
+ public:
+  bool present = true;
+  bool repeats_whole = true;
+  bool double_scaling = false;
+  uint8_t resolution = 2, rate = 60, id = 0x00;
+  int x = 0, y = 0;  // moved, not yet told
+  int resets = 0;
+  std::deque<bool> bad_parity;  // of the next bytes
+  uint8_t first_flags = 0x08;
+  Bytes log;
+
+  // Plays one transaction; the bytes that came stay in `received`.
+  Ps2Mouse::Answer play(const Ps2Mouse::Request& request, Bytes& received) {
+    received.clear();
+    if (!present) return {Ending::kTimeout, 0, nullptr};
+    if (request.sends) obey(request.byte);
+    while (!output_.empty() && received.size() < request.answers) {
+      const bool bad = !bad_parity.empty() && bad_parity.front();
+      if (!bad_parity.empty()) bad_parity.pop_front();
+      const uint8_t byte = output_.front();
+      output_.pop_front();
+      sent_++;
+      if (bad) return answer(Ending::kBadParity, received);
+      received.push_back(byte);
+    }
+    return answer(received.size() == request.answers ? Ending::kDone : Ending::kTimeout, received);
+  }
+
+  void power_on() { output_ = {0xAA, 0x00}; }
+
+ private:
+  static Ps2Mouse::Answer answer(Ending ending, const Bytes& received) {
+    return {ending, static_cast<uint8_t>(received.size()), received.data()};
+  }
+
+  void obey(uint8_t byte) {
+    log.push_back(byte);
+    if (byte == 0xFE) return repeat();
+    output_.clear();
+    if (argument_of_ != 0) {
+      (argument_of_ == 0xE8 ? resolution : rate) = byte;
+      argument_of_ = 0;
+      return say({0xFA});
+    }
+    switch (byte) {
+      case 0xFF:
+        resets++;
+        resolution = 2;
+        say({0xFA});
+        output_.push_back(0xAA);
+        output_.push_back(0x00);
+        break;
+      case 0xE8:
+      case 0xF3:
+        argument_of_ = byte;
+        say({0xFA});
+        break;
+      case 0xF2: say({0xFA, id}); break;
+      case 0xE9: say({0xFA, static_cast<uint8_t>(double_scaling ? 0x50 : 0x40), resolution, rate}); break;
+      case 0xEB: report(); break;
+      default: say({0xFA}); break;
+    }
+  }
+
+  void report() {
+    const uint8_t flags = static_cast<uint8_t>(first_flags | (x < 0 ? 0x10 : 0) | (y < 0 ? 0x20 : 0));
+    say({0xFA, flags, static_cast<uint8_t>(x), static_cast<uint8_t>(y)});
+    x = y = 0;
+  }
+  void say(const Bytes& bytes) {
+    output_.assign(bytes.begin(), bytes.end());
+    said_ = bytes;
+    sent_ = 0;
+  }
+  // FA is a chunk of its own, and so is what follows it.
+  void repeat() {
+    const size_t chunk = sent_ <= 1 ? 0 : 1;
+    const size_t from = repeats_whole || chunk == 0 ? chunk : sent_ - 1;
+    output_.assign(said_.begin() + static_cast<long>(from), said_.end());
+    sent_ = from;
+  }
+
+  std::deque<uint8_t> output_;
+  Bytes said_;
+  size_t sent_ = 0;
+  uint8_t argument_of_ = 0;
+};
+
+class Rig {
+ public:
+  FakeMouse mouse;
+  Ps2Mouse driver{8};
+  Bytes received;
+
+  void step() {
+    const Ps2Mouse::Request request = driver.next();
+    driver.finish(mouse.play(request, received));
+  }
+  bool start(int limit = 20) {
+    for (int i = 0; i < limit && !driver.valid(); i++) step();
+    return driver.valid();
+  }
+};
+
+}  // namespace
+
+TEST_CASE("PS/2: every byte goes out with its parity and stop bit, and is acknowledged") {
+  for (int value = 0; value < 256; value++) {
+    const uint8_t byte = static_cast<uint8_t>(value);
+    Line line;
+    line.bits.begin_sending(byte, 1);
+    CHECK(line.take() == (value | odd_parity(byte) << 8 | 1 << 9));
+    line.byte(0xFA);
+    CHECK(line.bits.outcome() == Outcome::kDone);
+    CHECK(line.last == Act::kHoldClock);
+  }
+}
+
+TEST_CASE("PS/2: a byte without the mouse's acknowledge bit is refused") {
+  Line line;
+  line.bits.begin_sending(0xEB, 4);
+  line.take(false);
+  CHECK(line.bits.outcome() == Outcome::kRefused);
+  CHECK(line.last == Act::kHoldClock);
+}
+
+TEST_CASE("PS/2: every byte is received, and the clock is held after the last") {
+  for (int value = 0; value < 256; value++) {
+    Line line;
+    line.bits.begin_listening(2);
+    line.byte(static_cast<uint8_t>(value));
+    CHECK(line.bits.outcome() == Outcome::kRunning);
+    CHECK(line.last == Act::kNone);
+    line.byte(0x55);
+    CHECK(line.bits.outcome() == Outcome::kDone);
+    CHECK(line.last == Act::kHoldClock);
+    CHECK(line.bits.bytes()[0] == value);
+  }
+}
+
+TEST_CASE("PS/2: a byte of bad parity is not used, and the clock is held at its stop bit") {
+  Line line;
+  line.bits.begin_listening(4);
+  line.byte(0xFA);
+  line.byte(0x08, true);
+  CHECK(line.bits.outcome() == Outcome::kBadParity);
+  CHECK(line.last == Act::kHoldClock);
+  CHECK(line.bits.received() == 1);
+}
+
+TEST_CASE("PS/2: a missing clock is found at the next byte's start bit") {
+  Line line;
+  line.bits.begin_listening(4);
+  line.byte(0x08, false, 9);
+  line.edge(true);  // its stop bit at the place of the parity
+  line.edge(false);
+  CHECK(line.bits.outcome() == Outcome::kBadFraming);
+  CHECK(line.last == Act::kHoldClock);
+}
+
+TEST_CASE("PS/2: a byte whose clock stops for 2 ms is given up") {
+  Line line;
+  line.bits.begin_listening(1);
+  line.byte(0x33, false, 5);
+  line.edge(false, 2000 / Ps2Bits::kStepUs + 1);
+  for (int i = 1; i < 11; i++) line.edge((0x47 << 1 | odd_parity(0x47) << 9 | 1 << 10) >> i & 1);
+  CHECK(line.bits.outcome() == Outcome::kDone);
+  CHECK(line.bits.bytes()[0] == 0x47);
+  CHECK(line.bits.resyncs() == 1);
+}
+
+TEST_CASE("PS/2: a slow mouse, 10 kHz, is not taken for one that stopped") {
+  Line line;
+  line.bits.begin_listening(1);
+  for (int i = 0; i < 11; i++) line.edge((0x47 << 1 | odd_parity(0x47) << 9 | 1 << 10) >> i & 1, 2);
+  CHECK(line.bits.outcome() == Outcome::kDone);
+  CHECK(line.bits.resyncs() == 0);
+}
+
+TEST_CASE("PS/2 fuzz: a million edges at random do no harm, and a sound transaction works after any of them") {
+  Random random(99);
+  Line line;
+  int working = 0;
+  for (int round = 0; round < 20000; round++) {
+    if (random.below(2)) {
+      line.bits.begin_sending(static_cast<uint8_t>(random.next()), static_cast<uint8_t>(1 + random.below(4)));
+    } else {
+      line.bits.begin_listening(static_cast<uint8_t>(1 + random.below(4)));
+    }
+    for (int i = 0; i < 50; i++) line.edge(random.below(2), static_cast<uint8_t>(random.below(64) ? 1 : random.next()));
+    if (line.bits.received() > Ps2Bits::kMaxAnswers) FAIL("too many");
+    line.bits.begin_sending(0xF2, 2);
+    const bool sent = line.take() == (0xF2 | odd_parity(0xF2) << 8 | 1 << 9);
+    line.byte(0xFA);
+    line.byte(0x03);
+    working += sent && line.bits.outcome() == Outcome::kDone && line.bits.bytes()[1] == 0x03;
+  }
+  CHECK(working == 20000);
+}
+
+TEST_CASE("PS/2 mouse: set up as wanted, and its settings read back") {
+  Rig rig;
+  rig.mouse.id = 0x03;
+  REQUIRE(rig.start());
+  CHECK(rig.driver.id() == 0x03);
+  CHECK(rig.driver.counts_per_mm() == 8);
+  CHECK(rig.driver.report_rate_hz() == 100);
+  CHECK(rig.mouse.log == Bytes{0xF6, 0xF6, 0xF2, 0xE6, 0xE8, 3, 0xF3, 100, 0xF0, 0xE9});
+  rig.driver.configure(2);
+  rig.step();
+  REQUIRE(rig.start());
+  CHECK(rig.driver.counts_per_mm() == 2);
+}
+
+TEST_CASE("PS/2 mouse: movement is 9 bits signed, summed until it is taken; overflow is passed on") {
+  Rig rig;
+  rig.start();
+  const int moves[][2] = {{255, -256}, {-1, 1}, {-256, 255}, {0, 0}};
+  for (const auto& move : moves) {
+    rig.mouse.x = move[0];
+    rig.mouse.y = move[1];
+    rig.step();
+  }
+  CHECK(rig.driver.dx() == -2);
+  CHECK(rig.driver.dy() == 0);
+  CHECK_FALSE(rig.driver.overflow());
+  rig.mouse.first_flags = 0x48;
+  rig.mouse.x = 255;
+  rig.step();
+  CHECK(rig.driver.overflow());
+  CHECK(rig.driver.dx() == 253);
+  rig.driver.forget_movement();
+  CHECK(rig.driver.dx() == 0);
+  CHECK_FALSE(rig.driver.overflow());
+}
+
+TEST_CASE("PS/2 mouse: no count is lost to bytes of bad parity, whatever the mouse repeats") {
+  for (bool whole : {true, false}) {
+    for (int bad_byte = 0; bad_byte < 4; bad_byte++) {
+      CAPTURE(whole);
+      CAPTURE(bad_byte);
+      Rig rig;
+      rig.mouse.repeats_whole = whole;
+      rig.start();
+      rig.mouse.x = 8;  // the byte that follows the flags equals them
+      rig.mouse.y = -5;
+      rig.mouse.bad_parity.assign(4, false);
+      rig.mouse.bad_parity[static_cast<size_t>(bad_byte)] = true;
+      rig.step();
+      CHECK(rig.driver.dx() == 0);
+      rig.step();
+      CHECK(rig.driver.dx() == 8);
+      CHECK(rig.driver.dy() == -5);
+      CHECK(rig.driver.parity_errors() == 1);
+      rig.step();
+      CHECK(rig.driver.dx() == 8);
+      CHECK(rig.driver.valid());
+    }
+  }
+}
+
+TEST_CASE("PS/2 mouse: parity errors in the repetition too") {
+  Rig rig;
+  rig.start();
+  rig.mouse.x = 30;
+  rig.mouse.bad_parity = {false, false, true, false, true, true, false, false, false};
+  for (int i = 0; i < 4; i++) rig.step();
+  CHECK(rig.driver.dx() == 30);
+  CHECK(rig.driver.parity_errors() == 3);
+}
+
+TEST_CASE("PS/2 mouse: reset after five packets that are none") {
+  Rig rig;
+  rig.start();
+  rig.mouse.first_flags = 0;
+  rig.mouse.x = 9;
+  for (int i = 0; i < 5; i++) {
+    CHECK(rig.mouse.resets == 0);
+    rig.step();
+  }
+  rig.step();
+  CHECK(rig.mouse.resets == 1);
+  CHECK(rig.driver.resets() == 1);
+  CHECK(rig.driver.dx() == 0);
+  rig.mouse.first_flags = 0x08;
+  CHECK(rig.start());
+  CHECK(rig.driver.counts_per_mm() == 8);
+}
+
+TEST_CASE("PS/2 mouse: pulled, it is missed after three polls; put back, it announces itself and is set up") {
+  Rig rig;
+  rig.start();
+  rig.mouse.present = false;
+  rig.step();
+  CHECK_FALSE(rig.driver.valid());
+  CHECK(rig.driver.id() == 0x00);
+  for (int i = 0; i < 2; i++) rig.step();
+  CHECK(rig.driver.id() == uint8_t{Ps2Mouse::kNoId});
+  CHECK(rig.driver.counts_per_mm() == 0);
+  for (int i = 0; i < 10; i++) rig.step();
+  while (rig.driver.next().sends) rig.step();
+  rig.mouse.present = true;
+  rig.mouse.power_on();
+  CHECK(rig.start());
+  CHECK(rig.driver.ever_found());
+}
+
+TEST_CASE("PS/2 mouse: one that was there before the board is found by the probe; an empty port stays empty") {
+  Rig rig;
+  rig.mouse.present = false;
+  for (int i = 0; i < 5; i++) rig.step();
+  CHECK(rig.driver.settled());
+  CHECK_FALSE(rig.driver.ever_found());
+  rig.mouse.present = true;
+  CHECK(rig.start());
+}
+
+TEST_CASE("PS/2 mouse: RESET_MICE resets and sets up again") {
+  Rig rig;
+  rig.start();
+  rig.driver.reset();
+  rig.step();
+  CHECK(rig.mouse.resets == 1);
+  CHECK_FALSE(rig.driver.valid());
+  CHECK(rig.start());
+  CHECK(rig.driver.resets() == 1);
+}
+
+TEST_CASE("PS/2 mouse: scaling that stays at 2:1 leads to a reset") {
+  Rig rig;
+  rig.mouse.double_scaling = true;
+  for (int i = 0; i < 12; i++) rig.step();
+  CHECK(rig.mouse.resets == 1);
+  CHECK_FALSE(rig.driver.valid());
+}
+
+TEST_CASE("PS/2 mouse fuzz: a mouse that answers at random is survived, and set up when it comes to its senses") {
+  Random random(4);
+  for (int round = 0; round < 2000; round++) {
+    Rig rig;
+    Bytes bytes(4);
+    for (int i = 0; i < 100; i++) {
+      const Ps2Mouse::Request request = rig.driver.next();
+      for (uint8_t& byte : bytes) byte = random.below(3) ? uint8_t{0xFA} : static_cast<uint8_t>(random.next());
+      const Ending ending = static_cast<Ending>(random.below(5));
+      const uint8_t count = ending == Ending::kDone ? request.answers : static_cast<uint8_t>(random.below(request.answers));
+      rig.driver.finish({ending, count, bytes.data()});
+    }
+    rig.driver.reset();
+    if (!rig.start(40)) FAIL("never set up");
+  }
+}
