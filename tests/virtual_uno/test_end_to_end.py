@@ -1,0 +1,101 @@
+"""The main job as a user does it: the firmware's own .hex behind a port, `linkpose` in front of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pty_server import PtyServer
+from rig_signals import RigFeed
+from wire_link import WireLink
+
+from linkpose.recording.table import read_table
+from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.simulation.link import PAPER_J2S_M, LinkRun
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
+LINK_FILTERS = [word for name in ("joint", "tilt", "imu-baro", "baro") for word in ("--filter", name)]
+J2S = ["--j2s", ",".join(map(str, PAPER_J2S_M))]
+
+
+def linkpose(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "linkpose", *map(str, arguments)]
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=90)
+
+
+@pytest.fixture
+def served(board: Callable[..., WireLink], tmp_path: Path) -> Iterator[PtyServer]:
+    """A board at `tmp_path / "port"`, in real time, with the rig's signals from its reset on."""
+    uno = board().uno
+    feed = RigFeed(uno, LinkRun(test=1, seed=0, duration_s=None))
+    with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
+        yield server
+
+
+def rows_of(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def test_live_estimates_from_the_real_firmware(served: PtyServer, tmp_path: Path) -> None:
+    """Nothing lost, heights near the truth, and the replay gives the same digits."""
+    live, recording, raw, replay = (tmp_path / name for name in ("live.csv", "rec.csv", "raw.bin", "replay.csv"))
+    source = ["--live", "--port", served.link, "--duration", 8, "--record", recording, "--raw", raw]
+    done = linkpose("estimate", *source, "-o", live, *J2S, *LINK_FILTERS, "--json")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert (summary["samples"], summary["lost"], summary["corrupt"], summary["gaps"]) == (800, 0, 0, 0)
+    assert linkpose("estimate", recording, "-o", replay, *J2S, *LINK_FILTERS).returncode == 0
+    assert rows_of(replay) == rows_of(live)
+    estimate = read_table(live, "estimate")
+    assert rms(height_error(estimate.columns["time_s"], estimate.columns["joint_height_m"])) < 0.011
+    assert linkpose("estimate", raw, *J2S, *LINK_FILTERS).stdout.count("\n") > 800
+
+
+def height_error(time_s: np.ndarray, height_m: np.ndarray) -> np.ndarray:
+    """Error (m) against the rig's truth, at the shift in time that fits best: the rig moved since the board's reset."""
+    run = LinkRun(test=1, seed=0, duration_s=None)
+    shifts = np.arange(0.0, 3.0, 0.002)
+    errors = [height_m[::10] - run.at(time_s[::10] + shift).height_m for shift in shifts]
+    best = shifts[int(np.argmin([rms(error) for error in errors]))]
+    return np.asarray(height_m - run.at(time_s + best).height_m)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def test_info_tells_what_the_board_is(served: PtyServer) -> None:
+    done = linkpose("info", "--port", served.link, "--json", "--self-test")
+    assert done.returncode == 0, done.stderr
+    info = json.loads(done.stdout)
+    assert info["sensors"] == ["mpu6050", "bmp180"]
+    assert (info["protocol"], info["sample_rate_hz"], info["mice"]) == ("1.0", 100, [])
+    assert (info["samples_lost"], info["frames_corrupt"], info["self_test"]) == (0, 0, "passed")
+    assert abs(info["clock_drift_ppm"]) < 5 * info["clock_drift_std_ppm"] + 100
+    assert info["board"]["stack_free"] >= 250
+
+
+def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, tmp_path: Path) -> None:
+    """The real HELLO after a real reset: the stream is started again and the gap is marked."""
+    path = tmp_path / "r.csv"
+    command = [sys.executable, "-m", "linkpose", "record", path, "--port", served.link, "--duration", "4"]
+    with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "recording to" in process.stderr.readline()
+        while not (path.exists() and path.read_bytes().count(b"\n") > 100):
+            assert process.poll() is None
+        served.call(served.uno.reset)
+        said = process.communicate(timeout=30)[1]
+    assert process.returncode == 0
+    assert "was reset (external)" in said
+    table = read_table(path, "recording")
+    assert table.closing is not None
+    assert [gap["cause"] for gap in table.closing["gaps"]] == ["reset"]
+    assert np.count_nonzero(table.columns["flags"].astype(int) & GAP_BEFORE) == 1
+    assert table.columns["time_s"][-1] == pytest.approx(3.99, abs=0.02)
