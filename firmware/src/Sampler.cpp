@@ -35,7 +35,7 @@ void Sampler::run() {
   const clock::Tick now = clock::tick();
   if (now.number != tick_.number) begin_tick(now);
   if (phase_ == Phase::kBurst && twi::burst_state() != twi::State::kBusy) take_burst();
-  if (phase_ == Phase::kRequests && !requests_pending()) phase_ = Phase::kQuiet;
+  if ((phase_ == Phase::kImuRequests || phase_ == Phase::kBaroRequests) && !requests_pending()) phase_ = Phase::kQuiet;
   if (sample_due_ && (phase_ == Phase::kQuiet || clock::now_us() - tick_.t_us > kSampleDeadlineUs)) {
     sample_due_ = false;
     send_sample();
@@ -62,10 +62,11 @@ void Sampler::take_burst() {
     imu_.accept_burst(state == twi::State::kDone, twi::burst_data(), clock::now_us(), reading_);
   }
   if (twi::down()) twi::free_bus();
-  phase_ = Phase::kRequests;
+  phase_ = Phase::kImuRequests;
 }
 
-// Gives the bus to the drivers in turn. False when neither wants it any more.
+// Gives the bus to the IMU's driver, then to the barometer's, until neither wants it: what the barometer is told last is
+// to convert, and nothing must follow that before the next tick. False when the bus is quiet.
 bool Sampler::requests_pending() {
   for (;;) {
     if (request_running_) {
@@ -76,10 +77,11 @@ bool Sampler::requests_pending() {
     }
     I2cRequest request;
     const uint32_t now = clock::now_us();
-    request_is_imu_ = imu_.next(now, request);
-    if (!request_is_imu_ && !baro_.next(now, request)) return false;
+    if (phase_ == Phase::kImuRequests && !imu_.next(now, request)) phase_ = Phase::kBaroRequests;
+    if (phase_ == Phase::kBaroRequests && !baro_.next(now, request)) return false;
     if (!twi::begin_request(request)) return false;  // at the next tick, then
     request_running_ = true;
+    request_is_imu_ = phase_ == Phase::kImuRequests;
   }
 }
 

@@ -28,7 +28,7 @@ class Sampler {
   const Bmp180& baro() const { return baro_; }
 
  private:
-  enum class Phase : uint8_t { kBurst, kRequests, kQuiet };
+  enum class Phase : uint8_t { kBurst, kImuRequests, kBaroRequests, kQuiet };
 
   void begin_tick(const clock::Tick& tick);
   void take_burst();
