@@ -175,7 +175,7 @@ def command(
     truth = read_truth(truth_path) if truth_path else None
     events, own_start = read_carmen(log) if is_carmen(log) else (read_events(log), None)
     chosen = _settings(settings, own_start)
-    tracks = {name: localize(events, name, chosen, grid, beacons) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
+    tracks = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
     for name, track in tracks.items():
         result = score(track.time_s, track.position_m, track.heading_rad, truth) if truth else None
         click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
@@ -231,7 +231,7 @@ def _sentence(name: str, track: Track, result: Score | None) -> str:
     )
     text = f"{name}: {track.applied} measurements applied, {track.rejected} rejected by the gate\n  at the end {last}"
     if track.widened:
-        text += f"\n  lost {track.widened} times: everything was refused, so the pose was opened again"
+        text += f"\n  lost {track.widened} times: most was refused, so the pose was opened again"
     if result is not None:
         text += f"\n  position error {result.position_rmse_m:.3f} m rms, {result.position_max_m:.3f} m at most"
         if result.heading_rmse_rad is not None:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from linkpose.localization.gate import gate_blocks
 from linkpose.localization.linalg import (
     Floats,
+    keep_positive_definite,
     lower_cholesky,
     product,
     product_transposed,
@@ -91,5 +92,4 @@ def ekf_step(
     covariance[:, :] = product_transposed(product(shrink, covariance), shrink) + product_transposed(
         product(gain, noise), gain
     )
-    symmetrise(covariance)
-    return True
+    return keep_positive_definite(covariance)

@@ -103,10 +103,9 @@ class KalmanFilter:
     gate: float | None = None
     transform: Transform = field(default_factory=Transform)
     grid: GridMap = field(default_factory=no_map)
-    _is_angle: Bools = field(init=False)
+    _angle_rows: dict[tuple[tuple[bool, ...], int], Bools] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._is_angle = self.motion.is_angle
         self.state = np.array(self.state, dtype=np.float64)
         self.covariance = np.array(self.covariance, dtype=np.float64)
         if self.name == "ukf":
@@ -127,11 +126,6 @@ class KalmanFilter:
         blocks = len(measurement.values) // measurement.block
         d2 = np.empty(blocks)
         threshold = np.inf if self.gate is None or not blocks else chi_square_quantile(self.gate, measurement.block)
-        rows = (
-            np.zeros(len(measurement.values), np.bool_)
-            if not measurement.angles
-            else np.tile(measurement.angles, blocks)
-        )
         arguments = (
             self.motion.model,
             self.state,
@@ -143,7 +137,7 @@ class KalmanFilter:
             measurement.values,
             measurement.covariance,
             measurement.parameters,
-            np.concatenate((self._is_angle, rows)),
+            self._angles_of(measurement),
             threshold,
             d2,
             self.grid.blocked,
@@ -159,6 +153,14 @@ class KalmanFilter:
                 "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
             )
         return np.asarray(d2 <= threshold)
+
+    def _angles_of(self, measurement: Measurement) -> Bools:
+        """Which of the states, and after them of the measurement's rows, are angles."""
+        key = measurement.angles, len(measurement.values)
+        if key not in self._angle_rows:
+            rows = np.resize(measurement.angles, key[1]) if measurement.angles else np.zeros(key[1])
+            self._angle_rows[key] = np.concatenate((self.motion.is_angle, rows.astype(np.bool_)))
+        return self._angle_rows[key]
 
     def widen(self, factor: float) -> None:
         """Multiplies the standard deviations of the motion model's position and heading, which keeps the covariance

@@ -86,6 +86,27 @@ def lower_cholesky(a: Floats, lower: Floats) -> bool:
 
 
 @njit(cache=True)
+def keep_positive_definite(a: Floats) -> bool:
+    """Symmetrises a covariance and, where rounding has made it indefinite, raises its variances by the least that
+    helps, in place.
+
+    Rounding of a sum of squares is relative to the largest terms of the sum, so a measurement that is 10¹⁰ times better
+    than what was known can leave an eigenvalue below 0. False when a hundred-thousandth does not help: then the cause
+    is no rounding.
+    """
+    symmetrise(a)
+    lower = np.zeros(a.shape)
+    share = 1e-15
+    while not lower_cholesky(a, lower):
+        share *= 10.0
+        if share > 1e-5:
+            return False
+        for i in range(a.shape[0]):
+            a[i, i] *= 1.0 + share
+    return True
+
+
+@njit(cache=True)
 def right_divide(t: Floats, lower: Floats) -> Floats:
     """t S⁻¹ for S = L Lᵀ: the Kalman gain from the cross covariance t."""
     n = lower.shape[0]

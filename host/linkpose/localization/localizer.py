@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.localization import models
-from linkpose.localization.events import Event, Log, Scan
+from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.kalman import (
     SUBMERSIBLE,
@@ -27,8 +28,10 @@ from linkpose.localization.noise import RangeNoise, check_correlation, equicorre
 from linkpose.localization.tables import Beacons
 
 Pose = tuple[float, float, float]
-PATIENCE = 10  # measurements of one kind refused in a row after which the pose, not the sensor, is taken to be wrong
-WIDENING = 2.0  # of the pose's standard deviations, then
+DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
+# When the gate has refused most of the last so many measurements of one kind, the pose is taken to be wrong, not the sensor.
+PATIENCE = 10
+WIDENING = 3.0  # of the pose's standard deviations, then
 CONSTANTS = {
     "scale": ("range_scale_error", 0.1),
     "bias": ("range_bias_m", 0.3),
@@ -66,7 +69,7 @@ class Track:
 
     `state` (N, n) in the order of `names`, `covariance` (N, n, n). `applied` and `rejected` count measurements: a
     range, a beam, a landmark, a depth, an attitude. `rejected_ranges` holds time and beacon of each range that the gate
-    refused. `widened` counts how often the pose's spread was doubled because everything was refused.
+    refused. `widened` counts how often the pose was opened again, since most was refused.
     """
 
     names: tuple[str, ...]
@@ -94,26 +97,29 @@ class Track:
 
 
 def localize(
-    log: Log, name: FilterName, settings: Settings, grid: GridMap | None = None, beacons: Beacons | None = None
+    log: Log,
+    name: FilterName,
+    settings: Settings,
+    grid: GridMap | None = None,
+    beacons: Beacons | None = None,
+    origin: str = "the log",
 ) -> Track:
-    """Estimates the path of a robot from its log. Raises LinkposeError when map, beacons, start or noise do not fit the
-    log.
+    """Estimates the path of a robot from its log, which the messages call `origin`.
+
+    Raises LinkposeError when map, beacons, start or noise do not fit the log, or a covariance ceases to be one.
     """
-    return _Run(log, name, settings, grid, beacons).track()
+    _check(log, settings, grid, beacons or {}, origin)
+    return _Run(log, name, settings, grid or no_map(), beacons or {}).track()
 
 
 class _Run:
     """One pass of a log through a filter."""
 
-    def __init__(
-        self, log: Log, name: FilterName, settings: Settings, grid: GridMap | None, beacons: Beacons | None
-    ) -> None:
-        self.log, self.settings, self.beacons, self.grid = log, settings, beacons, grid
-        kinds = {event.kind for event in log if isinstance(event, Event)}
-        _check(log, kinds, settings, grid, beacons)
-        constants = tuple(CONSTANTS[word] for word in settings.estimate)
-        self.diving = bool(kinds & {"velocity", "depth", "attitude"})
-        motion = (SUBMERSIBLE if self.diving else UNICYCLE).extended(tuple(name for name, _ in constants))
+    def __init__(self, log: Log, name: FilterName, settings: Settings, grid: GridMap, beacons: Beacons) -> None:
+        self.log, self.settings, self.beacons = log, settings, beacons
+        diving = bool(_kinds(log) & DIVING)
+        constants = tuple(CONSTANTS[word][0] for word in settings.estimate)
+        motion = (SUBMERSIBLE if diving else UNICYCLE).extended(constants)
         self.prior = _first_pose(log) if settings.start is None else None
         state, std = _start(log, settings, motion, self.prior)
         self.filter = KalmanFilter(
@@ -121,20 +127,20 @@ class _Run:
             motion,
             state,
             np.diag(std**2),
-            _noise_root(settings, self.diving),
+            _noise_root(settings, diving),
             settings.gate,
             settings.transform,
-            grid or no_map(),
+            grid,
         )
         self.control = np.zeros(motion.controls)
         self.hold = np.ones(motion.noises)
-        self.control_kind = "velocity" if self.diving else "odometry"
+        self.control_kind = "velocity" if diving else "odometry"
         self.holds = _holds(
             [event.time_s for event in log if isinstance(event, Event) and event.kind == self.control_kind]
         )
         self.now = log[0].time_s
         self.last_range: dict[str, float] = {}
-        self.refused_in_a_row: dict[int, int] = {}
+        self.lately_refused: dict[int, deque[bool]] = {}
         self.applied = self.rejected = self.widened = 0
         self.rejected_ranges: set[tuple[float, str]] = set()
 
@@ -145,13 +151,9 @@ class _Run:
         row, i = -1, 0
         while i < len(self.log):
             j = i + 1
-            first = self.log[i]
-            if (
-                isinstance(first, Event) and first.kind == "range"
-            ):  # ranges of one instant are one measurement, with one R
-                while j < len(self.log) and _same_ranges(first, self.log[j]):
-                    j += 1
-            if i == 0 or first.time_s > time[row]:
+            while j < len(self.log) and _one_measurement(self.log[i], self.log[j]):
+                j += 1
+            if i == 0 or self.log[i].time_s > time[row]:
                 row += 1
             self._take(self.log[i:j])
             time[row], state[row], covariance[row] = self.now, self.filter.state, self.filter.covariance
@@ -194,7 +196,7 @@ class _Run:
         if event.kind == "bearing_range":
             distance = np.array(event.values[:1])
             variance = settings.ranges.variances(distance, self._mean_range(event))[0]
-            place = np.array([self._beacon(event)[:2]])
+            place = np.array([self.beacons[event.beacon][:2]])
             covariance = np.diag([variance, settings.bearing_std_rad**2])
             return Measurement(models.LANDMARK, np.array(event.values), covariance, place, 2, (False, True))
         if event.kind == "depth":
@@ -221,7 +223,7 @@ class _Run:
         columns = [
             states.index(name) if name in states else -1 for name in ("z_m", "range_scale_error", "range_bias_m")
         ]
-        table = np.array([[*self._beacon(event), *columns] for event in events], dtype=np.float64)
+        table = np.array([[*self.beacons[event.beacon], *columns] for event in events], dtype=np.float64)
         ranges = np.array([event.values[0] for event in events])
         means = [self._mean_range(event) for event in events]
         return Measurement(models.BEACON_RANGE, ranges, self.settings.ranges.covariance(ranges, means[-1]), table)
@@ -230,15 +232,6 @@ class _Run:
         """r̄ of (14) for sensors that do not measure at one instant: the mean of each beacon's last range."""
         self.last_range[event.beacon] = event.values[0]
         return sum(self.last_range.values()) / len(self.last_range)
-
-    def _beacon(self, event: Event) -> Pose:
-        assert self.beacons is not None
-        if event.beacon not in self.beacons:
-            raise LinkposeError(
-                f"line {event.line} of the log measures beacon {event.beacon!r}, which the beacon file does not have "
-                f"(it has {', '.join(self.beacons)}); add its place there or delete the row"
-            )
-        return self.beacons[event.beacon]
 
     def _count(
         self, events: Sequence[Event | Scan], model: int, passed: np.ndarray[tuple[int], np.dtype[np.bool_]]
@@ -251,18 +244,22 @@ class _Run:
                 event for event, fits in zip(events, passed, strict=True) if not fits and isinstance(event, Event)
             ]
             self.rejected_ranges.update((event.time_s, event.beacon) for event in refused)
-        if 2 * good > len(passed):
-            self.refused_in_a_row[model] = 0
-            return
-        self.refused_in_a_row[model] = self.refused_in_a_row.get(model, 0) + 1
-        if self.refused_in_a_row[model] >= PATIENCE:
+        lately = self.lately_refused.setdefault(model, deque(maxlen=PATIENCE))
+        lately.append(2 * good <= len(passed))
+        if len(lately) == PATIENCE and 2 * sum(lately) > PATIENCE:
             self.filter.widen(WIDENING)
             self.widened += 1
-            self.refused_in_a_row[model] = 0
+            lately.clear()
 
 
-def _same_ranges(first: Event, other: Event | Scan) -> bool:
-    return isinstance(other, Event) and other.kind == "range" and other.time_s == first.time_s
+def _kinds(log: Log) -> set[str]:
+    return {event.kind for event in log if isinstance(event, Event)}
+
+
+def _one_measurement(first: Event | Scan, other: Event | Scan) -> bool:
+    """Ranges of one instant belong together: their errors may correlate."""
+    both = isinstance(first, Event) and isinstance(other, Event) and first.kind == other.kind == "range"
+    return both and other.time_s == first.time_s
 
 
 def _direct(
@@ -281,24 +278,30 @@ def _holds(times: list[float]) -> Iterator[float]:
     yield usual
 
 
-def _check(log: Log, kinds: set[str], settings: Settings, grid: GridMap | None, beacons: Beacons | None) -> None:
+def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons, origin: str) -> None:
+    kinds = _kinds(log)
     if not log:
-        raise LinkposeError("the log holds no measurements; record some first")
+        raise LinkposeError(f"{origin} holds no measurements; record some first")
     if any(isinstance(event, Scan) for event in log) and grid is None:
-        raise LinkposeError("the log holds laser scans, which need the map they were taken in; add --map MAP.yaml")
-    if kinds & {"range", "bearing_range"} and beacons is None:
-        raise LinkposeError("the log holds ranges to beacons, whose places must be known; add --beacons BEACONS.csv")
-    if "odometry" in kinds and kinds & {"velocity", "depth", "attitude"}:
+        raise LinkposeError(f"{origin} holds laser scans, which need the map they were taken in; add --map MAP.yaml")
+    if kinds & set(NAMED) and not beacons:
+        raise LinkposeError(f"{origin} holds ranges to beacons, whose places must be known; add --beacons BEACONS.csv")
+    if "odometry" in kinds and kinds & DIVING:
         raise LinkposeError(
-            "the log mixes a wheeled robot's odometry with a vehicle's velocity, depth or attitude; keep one of them"
+            f"{origin} mixes a wheeled robot's odometry with a vehicle's {' and '.join(sorted(kinds & DIVING))}; "
+            "delete the rows of the one or of the other"
         )
-    unknown = [word for word in settings.estimate if word not in CONSTANTS]
-    if unknown:
-        raise LinkposeError(f"{unknown[0]!r} cannot be estimated; known are {', '.join(CONSTANTS)}")
+    if settings.estimate and "range" not in kinds:
+        raise LinkposeError(f"{origin} holds no range rows from which a scale or bias follows; leave out --estimate")
+    for event in log:
+        if isinstance(event, Event) and event.kind in NAMED and event.beacon not in beacons:
+            raise LinkposeError(
+                f"{origin} line {event.line}: {event.kind} to beacon {event.beacon}, whose place is not known "
+                f"(known are {', '.join(beacons)}); add it to the beacon file or delete the row"
+            )
     check_correlation(settings.ranges.correlation, _widest(log), "the correlation of the ranges")
-    check_correlation(
-        settings.motion_correlation, 3 if "velocity" in kinds else 2, "the correlation of the motion's noises"
-    )
+    axes = 3 if kinds & DIVING else 2
+    check_correlation(settings.motion_correlation, axes, "the correlation of the motion's noises")
 
 
 def _widest(log: Log) -> int:

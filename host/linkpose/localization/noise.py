@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -54,10 +53,8 @@ class RangeNoise:
 
 def equicorrelated(std: Floats, correlation: float) -> Floats:
     """The covariance with these standard deviations and one correlation between any two."""
-    covariance = np.outer(std, std)
-    if correlation != 1.0:
-        covariance *= correlation
-        np.fill_diagonal(covariance, std * std)
+    covariance = correlation * np.outer(std, std)
+    np.fill_diagonal(covariance, std * std)
     return covariance
 
 
@@ -65,8 +62,9 @@ def check_correlation(correlation: float, size: int, name: str) -> None:
     """Raises LinkposeError where a matrix of this size with this correlation off its diagonal would not be positive
     definite.
     """
-    lowest = -1.0 / (size - 1) if size > 1 else -math.inf
-    if not lowest < correlation < (1.0 if size > 1 else math.inf):
+    size = max(size, 2)
+    lowest = -1.0 / (size - 1)
+    if not lowest < correlation < 1.0:
         raise LinkposeError(
             f"{name} {correlation:g} makes the {size} x {size} covariance not positive definite, "
             f"so it has no Cholesky factor; choose a value above {lowest:.3g} and below 1"

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from linkpose.localization.gate import gate_blocks
 from linkpose.localization.linalg import (
     Floats,
+    keep_positive_definite,
     lower_cholesky,
     product,
     product_transposed,
     right_divide,
-    symmetrise,
     wrap_where,
 )
 from linkpose.localization.models import predict, propagate
@@ -180,5 +180,4 @@ def _correct(
     wrap_where(state, is_angle[:n])
     rest = points - product_transposed(images, gain)
     covariance[:, :] = _moment(rest, rest, centre_squares, weight) + product_transposed(product(gain, noise), gain)
-    symmetrise(covariance)
-    return True
+    return keep_positive_definite(covariance)

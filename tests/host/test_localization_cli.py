@@ -1,0 +1,139 @@
+"""`simulate`, `localize` and `reproduce` of robots as a user types them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from linkpose.recording.table import read_table
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("robots")
+
+
+@pytest.fixture
+def indoor(folder, linkpose):
+    """A log of 20 s, its map and its truth."""
+    log, truth = folder / "indoor.log", folder / "indoor_truth.csv"
+    if not log.exists():
+        assert linkpose("simulate", "indoor", "-o", log, "--truth", truth, "--duration", 20, "--seed", 3).status == 0
+    return log, folder / "indoor.yaml", truth
+
+
+@pytest.fixture
+def dive(folder, linkpose):
+    """A log of 20 s, its beacons and its truth."""
+    log, truth = folder / "dive.csv", folder / "dive_truth.csv"
+    if not log.exists():
+        result = linkpose("simulate", "underwater", "-o", log, "--truth", truth, "--duration", 20, "--json")
+        checks = [json.loads(line) for line in result.out.splitlines()]
+        assert all(set(row) == {"check", "asked", "measured"} for row in checks)
+    return log, folder / "dive_beacons.csv", truth
+
+
+def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
+    log, grid, truth = indoor
+    out = tmp_path / "path.csv"
+    arguments = ["localize", log, "--map", grid, "--truth", truth, "--filter", "ekf", "--filter", "ukf", "--json"]
+    result = linkpose(*arguments, "-o", out)
+    rows = [json.loads(line) for line in result.out.splitlines()]
+    assert [row["filter"] for row in rows] == ["ekf", "ukf"]
+    for row in rows:
+        assert {"updates", "rejected", "position_rmse_m", "position_max_m", "heading_rmse_rad"} <= set(row)
+        assert row["position_rmse_m"] < 0.15
+        assert row["rejected"] < 0.1 * row["updates"]
+    table = read_table(out, "estimate")
+    table.require("time_s", "ekf_x_m", "ekf_heading_rad", "ukf_y_m", "ukf_x_std_m", "ukf_heading_std_rad")
+    assert len(table) == 201
+    assert table.closing is not None
+    assert linkpose(*arguments, "-o", out).status == 1  # never overwritten
+    assert linkpose(*arguments, "-o", out, "--force").status == 0
+
+
+@pytest.mark.parametrize("noise", ["fixed", "adaptive", "affine"])
+def test_underwater_with_every_noise(dive, linkpose, noise):
+    log, beacons, truth = dive
+    result = linkpose(
+        "localize", log, "--beacons", beacons, "--truth", truth, "--range-std", 0.25, "--noise", noise, "--json"
+    )
+    (row,) = [json.loads(line) for line in result.out.splitlines()]
+    assert row["filter"] == "ukf"
+    assert row["position_rmse_m"] < 0.3
+
+
+def test_gate_counts_and_can_be_switched_off(dive, linkpose):
+    log, beacons, _ = dive
+    gated, open_ = (
+        json.loads(linkpose("localize", log, "--beacons", beacons, "--range-std", 0.25, "--gate", gate, "--json").out)
+        for gate in ("0.997", "off")
+    )
+    assert gated["rejected"] >= 50
+    assert open_["rejected"] == 0
+    assert gated["updates"] + gated["rejected"] == open_["updates"]
+
+
+def test_words_without_json(dive, linkpose):
+    log, beacons, truth = dive
+    result = linkpose("localize", log, "--beacons", beacons, "--truth", truth)
+    assert "measurements applied" in result.out
+    assert "position error" in result.out
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ([], "add --map MAP.yaml or --beacons BEACONS.csv"),
+        (["--beacons", "BEACONS", "--correlation", "1.0"], "not positive definite"),
+        (["--beacons", "BEACONS", "--correlation", "nan"], "not positive definite"),
+        (["--beacons", "BEACONS", "--motion-correlation", "-0.9"], "not positive definite"),
+        (["--beacons", "BEACONS", "--gate", "1.5"], "'1.5' is neither `off` nor a probability"),
+        (["--beacons", "BEACONS", "--range-std", "0"], "0"),
+        (["--beacons", "BEACONS", "--start", "1,2"], "X,Y,HEADING"),
+        (["--beacons", "BEACONS", "--map", "gone.yaml"], "gone.yaml"),
+        (["--beacons", "gone.csv"], "gone.csv"),
+        (["--beacons", "BEACONS", "--truth", "gone.csv"], "gone.csv"),
+        (["--beacons", "BEACONS", "--estimate", "luck"], "luck"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(dive, refused, options, reason):
+    log, beacons, _ = dive
+    assert reason in refused("localize", log, *[beacons if word == "BEACONS" else word for word in options])
+
+
+@pytest.mark.parametrize(
+    ("rows", "reason"),
+    [
+        ("", "holds no measurements"),
+        ("0,pose,0,0,0\n1,range,9,5,\n", "line 3: range to beacon 9, whose place is not known (known are 1, 2, 3, 4)"),
+        ("0,odometry,1,0,\n1,range,1,5,\n", "add --start X,Y,HEADING"),
+        ("0,pose,0,0,0\n0,odometry,1,0,\n1,depth,5,,\n", "mixes a wheeled robot's odometry with a vehicle's depth"),
+        ("0,pose,0,0,0\n1,range,1,nan,\n", "line 3: 'nan' is not a number"),
+        ("1,pose,0,0,0\n0,range,1,5,\n", "line 3: time runs backwards"),
+    ],
+)
+def test_logs_that_cannot_be_are_refused(dive, refused, tmp_path, rows, reason):
+    log = tmp_path / "log.csv"
+    log.write_text(f"time_s,kind,a,b,c\n{rows}")
+    sentence = refused("localize", log, "--beacons", dive[1])
+    assert reason in sentence
+    if "start" not in reason:
+        assert "log.csv" in sentence
+
+
+def test_what_a_log_needs_is_named(indoor, dive, refused):
+    assert "add --map MAP.yaml" in refused("localize", indoor[0], "--beacons", dive[1])
+    assert "add --beacons BEACONS.csv" in refused("localize", dive[0], "--map", indoor[1])
+    assert "leave out --estimate" in refused("localize", indoor[0], "--map", indoor[1], "--estimate", "bias")
+
+
+@pytest.mark.parametrize("rig", ["indoor", "underwater"])
+def test_the_same_seed_gives_the_same_files(linkpose, tmp_path, rig):
+    texts = []
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        out = tmp_path / f"{name}.csv"
+        linkpose("simulate", rig, "-o", out, "--truth", tmp_path / f"{name}_truth.csv", "--duration", 5, "--seed", seed)
+        texts.append(out.read_text())
+    assert texts[0] == texts[1] != texts[2]
