@@ -62,7 +62,7 @@ def group() -> None:
 def main() -> None:
     """Entry point. Every failure a user can cause ends here as one sentence and a status."""
     try:
-        status = group.main(standalone_mode=False)
+        status = group.main(prog_name="linkpose", standalone_mode=False)
     except click.exceptions.Abort:
         status = 130
     except click.ClickException as error:

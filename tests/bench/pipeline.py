@@ -1,0 +1,61 @@
+"""What a live sample costs from its bytes to its estimates on disk, one at a time as they come.
+
+    python tests/bench/pipeline.py [--json]
+
+The peer is the time there is: the interval between two samples at 100 Hz.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from _report import Row, report
+
+from linkpose.estimation import EstimateWriter, Estimator
+from linkpose.filters import ALL_SENSORS
+from linkpose.recording.writer import RecordingWriter, metadata
+from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.timeline import BoardClock, Timeline
+from linkpose.simulation import board
+from linkpose.simulation.link import LinkRun
+from linkpose.wire.frames import StreamDecoder, encode
+
+SAMPLES = 3000
+
+
+def main() -> None:
+    run = LinkRun(duration_s=SAMPLES / 100)
+    frames = [encode(sample) for sample in run.samples()]
+    hello = board.hello(board.DEFAULTS)
+    settings = Settings.of(hello)
+    with tempfile.TemporaryDirectory() as folder:
+        decoder, timeline, clock = StreamDecoder(), Timeline(100), BoardClock()
+        converter, estimator = Converter(settings), Estimator([], run.rig, ALL_SENSORS)
+        estimator.warm_up()
+        head = metadata(hello, settings, "bench", run.rig, {})
+        recording = RecordingWriter(Path(folder, "r.csv"), head, 0, force=False)
+        estimates = EstimateWriter(Path(folder, "e.csv"), head, estimator.columns, force=False)
+        took = []
+        for frame in frames:
+            began = time.perf_counter()
+            for sample in decoder.feed(frame):
+                place = timeline.place(sample, clock, 0.0)
+                rows = [converter.row(sample, *place)]
+                recording.write_rows(rows)
+                estimates.write(estimator.text(estimator.process(Measurements.of(rows))))
+            took.append(1e6 * (time.perf_counter() - began))
+    name = f"{len(estimator.filters)} filters"
+    report(
+        [
+            Row(f"live, {name}, median", float(np.median(took)), "100 Hz", 1e4),
+            Row(f"live, {name}, p99", float(np.quantile(took, 0.99)), "100 Hz", 1e4),
+        ]
+    )
+
+
+if __name__ == "__main__":
+    main()

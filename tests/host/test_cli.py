@@ -1,0 +1,173 @@
+"""The commands of daily use, as they are typed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from linkpose.cli import COMMANDS
+from linkpose.device import ports
+from linkpose.device.ports import PortInfo
+from linkpose.recording.table import read_table
+
+HOST = Path(__file__).parents[2] / "host"
+SIM = "sim://link?speed=0"  # as fast as it goes
+
+
+def rows(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def test_live_and_replay_agree_to_the_last_digit(linkpose, tmp_path):
+    live, recording, replay = tmp_path / "live.csv", tmp_path / "rec.csv", tmp_path / "replay.csv"
+    done = linkpose("estimate", "--live", "--port", SIM, "--duration", 20, "-o", live, "--record", recording)
+    assert done.status == 0, done.err
+    assert linkpose("estimate", recording, "-o", replay).status == 0
+    assert len(rows(live)) == 2001
+    assert rows(live) == rows(replay)
+    names = read_table(live, "estimate").columns
+    for name in ("joint", "tilt", "imu_baro"):
+        assert {f"{name}_height_m", f"{name}_height_std_m", f"{name}_roll_deg", f"{name}_pitch_deg"} <= names.keys()
+    assert "baro_height_m" in names
+
+
+def test_json_estimates_have_the_csvs_keys_and_end_with_the_summary(linkpose, tmp_path):
+    out = tmp_path / "live.csv"
+    done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1, "-o", out, "--json")
+    *estimates, summary = map(json.loads, done.out.splitlines())
+    assert summary["event"] == "summary"
+    assert summary.keys() == {"event", "samples", "lost", "corrupt", "gaps", "duration_s", "rate_hz"}
+    header, *lines = rows(out)
+    assert [list(estimate) for estimate in estimates] == [header.split(",")] * 100
+    for estimate, line in zip(estimates, lines, strict=True):
+        assert list(estimate.values()) == [float(word) if word else None for word in line.split(",")]
+
+
+def test_without_o_the_estimates_go_to_stdout(linkpose, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("record", recording, "--port", SIM, "--duration", 1)
+    done = linkpose("estimate", recording)
+    assert done.out.startswith("# linkpose estimate 1\n# {")
+    assert len(done.out.splitlines()) == 103
+
+
+def test_a_filter_that_cannot_run_is_named_with_its_reason(linkpose, refused, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("record", recording, "--port", SIM, "--duration", 1)
+    lines = recording.read_text().splitlines(keepends=True)
+    lines[1] = re.sub(r'"joint": \{.*?\}, ', "", lines[1])
+    recording.write_text("".join(lines))
+    done = linkpose("estimate", recording, "-o", tmp_path / "e.csv")
+    assert done.status == 0
+    assert "joint needs J2S" in done.err and "--j2s X,Y,Z" in done.err
+    names = read_table(tmp_path / "e.csv", "estimate").columns
+    assert "tilt_roll_deg" in names and "joint_height_m" not in names
+    assert "the filter joint cannot run" in refused("estimate", recording, "--filter", "joint")
+    assert linkpose("estimate", recording, "--filter", "joint", "--j2s", "0,0,1", "-q").status == 0
+    assert "there is no filter 'jonit'" in refused("estimate", recording, "--filter", "jonit")
+
+
+def test_the_rig_files_j2s_is_used_and_a_wrong_key_is_named(linkpose, refused, tmp_path):
+    recording, rig = tmp_path / "r.csv", tmp_path / "rig.toml"
+    linkpose("record", recording, "--port", SIM, "--duration", 1)
+    heights = []
+    for text in ("[joint]\nj2s_m = [-0.09, -0.04, 1.65]\n", "[joint]\nj2s_m = [0.0, 0.0, 0.5]\n"):
+        rig.write_text(text)
+        linkpose("estimate", recording, "--rig", rig, "-o", tmp_path / "e.csv", "--force")
+        heights.append(read_table(tmp_path / "e.csv").columns["joint_height_m"][-1])
+    assert heights[0] > 1.5 and 0.4 < heights[1] < 0.5
+    for text, sentence in (
+        ("[joint]\nj2s = [0, 0, 1]\n", "unknown key joint.j2s; did you mean j2s_m?"),
+        ("[jonit]\n", "unknown key jonit; did you mean joint?"),
+        ("[joint]\nj2s_m = [0, 0]\n", "must be three numbers"),
+        ("[joint]\nj2s_m = [0, 0, nan]\n", "must be a number"),
+        ("[imu]\ngyro_noise_rad_s = 0\n", "must be above 0"),
+        ("[imu]\naccel_scale = [1, 1, -1]\n", "each axis must be above 0"),
+        ("[[mouse]]\nx_m = 1\n", "lacks y_m"),
+        ("joint = 3\n", "joint must be a table"),
+        ("j2s_m = [", "is not a rig file"),
+    ):
+        rig.write_text(text)
+        said = refused("estimate", recording, "--rig", rig)
+        assert sentence in said and "rig.toml" in said
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "estimate",
+        "estimate --live x.csv",
+        "estimate x.csv --port sim://link",
+        "estimate --live --port sim://link --j2s 1,2",
+        "estimate --live --port sim://link --j2s a,b,c",
+        "record --port sim://link --duration -1",
+        "record --port sim://link --duration never",
+        "record --nonsense",
+        "nonsense",
+    ],
+)
+def test_wrong_usage_has_status_2(linkpose, arguments):
+    done = linkpose(*arguments.split())
+    assert done.status == 2
+    assert "Error: " in done.err and "Traceback" not in done.err
+
+
+def test_every_command_has_help(linkpose):
+    listing = linkpose("--help").out
+    for name in COMMANDS:
+        assert name in listing
+        assert linkpose(name, "--help").out.startswith(f"Usage: linkpose {name}")
+    assert linkpose("--version").out.strip().startswith("linkpose, version")
+
+
+def test_nothing_heavy_is_imported_for_help_ports_info_and_record():
+    code = (
+        "import sys; import linkpose.cli; from linkpose.cli import COMMANDS\n"
+        "import linkpose.cli.ports, linkpose.cli.info, linkpose.cli.record, linkpose.cli.live\n"
+        "import linkpose.device.session, linkpose.recording.writer, linkpose.recording.csvfile\n"
+        "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib', 'rich') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=HOST)
+    assert done.stdout.strip() == "[]"
+
+
+def test_info_json(linkpose):
+    done = linkpose("info", "--port", "sim://link?drift_ppm=0", "--json")
+    info = json.loads(done.out)
+    assert done.status == 0
+    assert info["sensors"] == ["mpu6050", "bmp180"]
+    assert info["sample_rate_hz"] == 100 and info["mice"] == []
+    assert info["samples_lost"] == info["frames_corrupt"] == 0
+    assert {"protocol", "firmware", "clock_drift_ppm"} <= info.keys()
+
+
+UNO = PortInfo("/dev/ttyACM0", "Arduino Uno", 0x2341, 0x0043, "55", True, False)
+OTHER = PortInfo("/dev/ttyS0", "", None, None, None, False, None)
+
+
+@pytest.mark.parametrize(
+    ("found", "sentence"),
+    [
+        ([], "no serial port is connected"),
+        ([OTHER], "no UNO is connected; the ports there are: /dev/ttyS0"),
+        ([UNO, OTHER, dataclasses.replace(UNO, port="/dev/ttyACM1")], "2 boards are connected: /dev/ttyACM0"),
+        ([OTHER, UNO], "there is no port /dev/ttyACM0"),  # chosen, and then not there in this test
+    ],
+)
+def test_the_only_uno_is_chosen_and_none_or_several_are_listed(monkeypatch, refused, found, sentence):
+    monkeypatch.setattr(ports, "find_ports", lambda: found)
+    assert sentence in refused("info")
+
+
+def test_ports_json(monkeypatch, linkpose):
+    monkeypatch.setattr(ports, "find_ports", lambda: [UNO, OTHER])
+    listed = [json.loads(line) for line in linkpose("ports", "--json").out.splitlines()]
+    assert [list(port) for port in listed] == [["port", "description", "vid", "pid", "serial", "is_uno", "busy"]] * 2
+    assert listed[0]["is_uno"] and not listed[1]["is_uno"]
+    assert "UNO" in linkpose("ports").out
