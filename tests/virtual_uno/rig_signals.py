@@ -1,6 +1,8 @@
-"""What the simulated rig makes the emulated sensors feel: the truth is that of linkpose.simulation.link."""
+"""What a simulated rig makes the emulated sensors feel: the truth is that of linkpose.simulation."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,16 +10,19 @@ from numpy.typing import NDArray
 from linkpose.simulation import imu
 from linkpose.simulation.baro import PRESSURE_NOISE_PA
 from linkpose.simulation.link import LinkRun
+from linkpose.simulation.mice import MiceRun
 from virtual_uno import VirtualUno
 
 RATE_HZ = 1000  # rows of the tables, the MPU-6050's own sample rate
+STRETCH_S = 10  # fed at once
+_OVERLAP_S = 1
 _TEMPERATURE_OFFSET, _TEMPERATURE_SCALE = 36.53, 340.0  # product specification 6.3
 _AIR_NOISE_STREAM = 100  # apart from the streams of the simulation
 
 Floats = NDArray[np.float64]
 
 
-def imu_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
+def imu_rows(run: LinkRun | MiceRun, first: int, count: int) -> tuple[Floats, Floats]:
     """Times (N,) s and rows (N, 7) for `VirtualUno.imu.feed`: rows `first` … of the run's signal at RATE_HZ.
 
     The run's own counts (noise and errors in them) are turned back to g and deg/s: a board in the run's ranges gives
@@ -41,14 +46,22 @@ def air_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
     return time_s, np.column_stack([pressure, truth.temp_degC])
 
 
+def mouse_rows(run: MiceRun, first: int, count: int) -> tuple[Floats, list[Floats]]:
+    """Times (N,) s and for each mouse its path (N, 2) in mm for `Mouse.feed`.
+
+    The paths are the run's own counts: a mouse set to the resolution that the rig names gives exactly these.
+    """
+    time_s = np.arange(first, first + count) / RATE_HZ
+    counts = run.counts(time_s)
+    return time_s, [counts[:, i] * 1000 / mouse.counts_per_m for i, mouse in enumerate(run.mice)]
+
+
 class RigFeed:
     """Keeps the emulated sensors supplied with a run of any length, a stretch at a time."""
 
-    STRETCH_S = 10
-
-    def __init__(self, uno: VirtualUno, run: LinkRun) -> None:
+    def __init__(self, uno: VirtualUno, run: LinkRun | MiceRun) -> None:
         self._uno, self._run = uno, run
-        self._fed_until = 0.0
+        self._feed: Callable[[int, int], None] = self._feed_mice if isinstance(run, MiceRun) else self._feed_air
         self.restart()
 
     def restart(self) -> None:
@@ -58,10 +71,20 @@ class RigFeed:
 
     def supply(self) -> None:
         """Feeds the next stretch when the present one runs out; to be called often."""
-        if self._uno.time_s + 1 < self._fed_until:
+        if self._uno.time_s + _OVERLAP_S < self._fed_until:
             return
-        first = max(0, round((self._uno.time_s - self.start_s - 1) * RATE_HZ))
-        count = (self.STRETCH_S + 2) * RATE_HZ
+        first = max(0, round((self._uno.time_s - self.start_s - _OVERLAP_S) * RATE_HZ))
+        count = (STRETCH_S + 2 * _OVERLAP_S) * RATE_HZ
         self._uno.imu.feed(*imu_rows(self._run, first, count), start_s=self.start_s)
-        self._uno.baro.feed(*air_rows(self._run, first, count), start_s=self.start_s)
+        self._feed(first, count)
         self._fed_until = self.start_s + (first + count) / RATE_HZ
+
+    def _feed_air(self, first: int, count: int) -> None:
+        assert isinstance(self._run, LinkRun)
+        self._uno.baro.feed(*air_rows(self._run, first, count), start_s=self.start_s)
+
+    def _feed_mice(self, first: int, count: int) -> None:
+        assert isinstance(self._run, MiceRun)
+        time_s, paths = mouse_rows(self._run, first, count)
+        for mouse, path in zip(self._uno.mice, paths, strict=True):
+            mouse.feed(time_s, path, start_s=self.start_s)

@@ -20,7 +20,9 @@ sys.path.insert(0, str(HERE.parents[1] / "host"))
 from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
 
-from linkpose.simulation.link import simulate  # noqa: E402
+from linkpose.errors import LinkposeError  # noqa: E402
+from linkpose.simulation.link import LinkRun, simulate  # noqa: E402
+from linkpose.simulation.mice import MiceRun, ring  # noqa: E402
 from virtual_uno import Mouse, VirtualUno, VirtualUnoError  # noqa: E402
 
 DEFAULT_HEX = HERE.parents[1] / ".pio" / "build" / "uno_distro" / "firmware.hex"
@@ -52,7 +54,7 @@ def main() -> int:
             options.hex, seed=options.seed, bmp180=disturbed, mice=MICE[: options.mice], bootloader_s=options.bootloader
         ) as uno:
             statistics = _serve(uno, options)
-    except VirtualUnoError as error:
+    except (VirtualUnoError, LinkposeError) as error:
         print(error, file=sys.stderr)
         return 1
     print(json.dumps({"event": "end", **statistics, **_load(statistics)}), flush=True)
@@ -65,10 +67,11 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--hex", type=Path, default=DEFAULT_HEX, help="the firmware")
     parser.add_argument("--link", type=Path, default=Path("virtual-uno"), help="symbolic link to the port")
-    parser.add_argument("--test", type=int, default=1, help="Test of the simulated rig: 1, 2 or 3")
+    parser.add_argument("--rig", choices=("link", "mice"), default="link", help="what is simulated (default: the link)")
+    parser.add_argument("--test", type=int, default=1, help="Test of the link: 1, 2 or 3")
     parser.add_argument("--seed", type=int, default=0, help="of the rig and of everything random on the board")
     parser.add_argument("--errors", default="calibrated", help="of the sensors: calibrated, datasheet or none")
-    parser.add_argument("--mice", type=int, choices=range(5), default=0, help="how many are plugged in (default 0)")
+    parser.add_argument("--mice", type=int, choices=range(5), help="how many (default: 3 with the rig mice, else none)")
     parser.add_argument("--duration", type=float, default=None, help="seconds of the board's time; else endless")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
@@ -77,11 +80,20 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--bootloader", type=float, default=0.0, metavar="S", help="its wait after a reset (an UNO: 1)")
     parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="what traffic adds to the BMP180")
     parser.add_argument("--fault", action="append", default=[], metavar="SECONDS:FAULT", help="see below")
-    return parser.parse_args()
+    options = parser.parse_args()
+    if options.mice is None:
+        options.mice = 3 if options.rig == "mice" else 0
+    return options
+
+
+def _run(options: argparse.Namespace) -> LinkRun | MiceRun:
+    if options.rig == "mice":
+        return MiceRun(options.seed, None, mice=ring(options.mice), errors=options.errors)
+    return simulate(options.test, options.seed, None, errors=options.errors)
 
 
 def _serve(uno: VirtualUno, options: argparse.Namespace) -> dict[str, float]:
-    feed = RigFeed(uno, simulate(options.test, options.seed, None, errors=options.errors))
+    feed = RigFeed(uno, _run(options))
     planned = sorted((float(at), fault) for at, _, fault in (text.partition(":") for text in options.fault))
 
     def before_slice() -> None:

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from rig_signals import RigFeed
 from wire_link import WATCHED_BUS, WireLink, burst_starts, us
 
+from linkpose.simulation.mice import MiceRun
 from linkpose.wire.messages import Configure, GetInfo, Hello, ResetMice, Sample, SampleFlags, Start
 
 MakeBoard = Callable[..., WireLink]
@@ -36,7 +38,7 @@ def path(seconds: float, seed: int, top_speed_mm_s: float = 1000.0) -> tuple[NDA
 
 def totals(samples: list[Sample]) -> NDArray[np.int64]:
     """Sums of the counts, (mice, 2)."""
-    return np.array([sample.mice for sample in samples], dtype=np.int64).sum(axis=0)
+    return np.sum(np.array([sample.mice for sample in samples], dtype=np.int64), axis=0, dtype=np.int64)
 
 
 def reported(link: WireLink) -> NDArray[np.int64]:
@@ -123,6 +125,23 @@ def test_load_and_stack_with_three_mice(board: MakeBoard) -> None:
     after = link.uno.state()
     assert 1 - (after["sleep_cycles"] - before["sleep_cycles"]) / (after["cycle"] - before["cycle"]) <= 0.40
     assert link.status.stack_free >= 250
+
+
+def test_the_simulated_robot_reaches_the_wire_unchanged(board: MakeBoard) -> None:
+    """Over several stretches of the feed, the counts on the wire are those of the run."""
+    link = streaming(board(mice=MICE[:3]))
+    run = MiceRun(3, None)
+    before = reported(link)
+    feed = RigFeed(link.uno, run)
+    for _ in range(250):
+        feed.supply()
+        link.run_ms(100)
+    at_start, at_end = run.counts(np.array([0.0, link.uno.time_s - feed.start_s]))
+    for mouse in link.uno.mice:
+        mouse.feed([0], [[0, 0]])  # it stands
+    link.run_ms(100)
+    assert totals(link.samples).tolist() == (reported(link) - before).tolist()
+    assert np.abs(totals(link.samples) - (at_end - at_start)).max() <= 1
 
 
 def test_movement_arrives_when_it_happens(board: MakeBoard) -> None:
@@ -235,7 +254,7 @@ def test_overflow_is_flagged(board: MakeBoard) -> None:
     """40 mm within one report are more than nine bits of counts."""
     link = streaming(board(mice=MICE[:1]))
     now = link.uno.time_s
-    link.uno.mice[0].feed([now, now + 0.002], [[0, 0], [40.0, 0]])
+    link.uno.mice[0].feed([now, now + 0.002], np.array([[0, 0], [40.0, 0]]))
     link.run_ms(200)
     flagged = [sample for sample in link.samples if sample.flags & SampleFlags.MOUSE1_OVERFLOW]
     assert flagged

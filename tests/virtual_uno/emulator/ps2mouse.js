@@ -59,6 +59,7 @@ class Ps2Mouse {
     port.listeners.push((_level, changed) => this.#linesChanged(changed));
     this.event = null;
     this.waiting = false;
+    this.at = [0, 0]; // mm of the path that the counters have followed
     if (this.plugged) this.#powerOn();
   }
 
@@ -77,11 +78,13 @@ class Ps2Mouse {
     this.port.pullUp(this.clock | this.data, false);
   }
 
-  /** A new path, from where it is now: what the mouse has counted of the old one stays. */
+  /** A new path, from where it is now; what is less than a count of the old one stays. */
   follow(path) {
-    this.#count();
+    const time = this.cpu.now / CLOCK_HZ;
+    const before = [...this.path.at(time)];
     this.path = path;
-    this.at = [...path.at(this.cpu.now / CLOCK_HZ)];
+    const after = path.at(time);
+    for (let axis = 0; axis < 2; axis += 1) this.at[axis] += after[axis] - before[axis];
   }
 
   spoilParityEvery(seconds) {
@@ -91,7 +94,7 @@ class Ps2Mouse {
 
   #powerOn() {
     this.port.pullUp(this.clock | this.data);
-    this.at = [...this.path.at(this.cpu.now / CLOCK_HZ)]; // mm, as far as the counters have followed
+    this.at = [...this.path.at(this.cpu.now / CLOCK_HZ)];
     this.counters = [0, 0];
     this.#setDefaults();
     this.life = this.#life();
