@@ -21,10 +21,10 @@ Ps2Mouse::Ending ending_of(Ps2Bits::Outcome outcome) {
 }  // namespace
 
 Mice::Mice(uint8_t counts_per_mm)
-    : ports_{{Ps2Mouse(counts_per_mm), false, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, 0, 0}} {}
+    : ports_{{Ps2Mouse(counts_per_mm), false, false, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0}} {}
 
 void Mice::begin(uint16_t rate_hz) {
   ps2::begin();
@@ -51,10 +51,11 @@ void Mice::advance(uint8_t number, uint32_t now_us) {
   Port& port = ports_[number];
   if (port.busy) {
     // The time runs from when the byte begins to go out.
-    if (ps2::waiting(number)) {
+    if (port.waits) {
+      port.waits = ps2::waiting(number);
       port.since_us = now_us;
-      return;
     }
+    if (port.waits) return;
     const Ps2Bits& bits = ps2::bits(number);
     const bool running = bits.outcome() == Ps2Bits::Outcome::kRunning;
     if (running && now_us - port.since_us < port.timeout_us) return;
@@ -69,6 +70,7 @@ void Mice::begin_transaction(uint8_t number, uint32_t now_us) {
   Port& port = ports_[number];
   const Ps2Mouse::Request request = port.mouse.next();
   port.busy = true;
+  port.waits = request.sends;
   port.timeout_us = request.timeout_us;
   port.since_us = now_us;
   if (request.sends) {

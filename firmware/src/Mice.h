@@ -29,6 +29,7 @@ class Mice {
   struct Port {
     Ps2Mouse mouse;
     bool busy;
+    bool waits;  // for its tick
     uint32_t timeout_us;
     uint32_t since_us;
   };

@@ -37,7 +37,7 @@ constexpr struct {
 constexpr uint8_t kSetUpSteps = sizeof kSetUp / sizeof kSetUp[0];
 constexpr uint8_t kScaling2To1 = 0x10;  // in the first byte of the status
 
-constexpr uint32_t kAnswerUs = 20000;      // the answer begins within 20 ms by the protocol
+constexpr uint32_t kAnswerUs = 25000;     // command and answer; the answer begins within 20 ms by the protocol
 constexpr uint32_t kPowerOnUs = 1000000;  // the self-test takes 300 to 500 ms as a rule
 constexpr uint32_t kRepeatUs = 8000;       // a repeated packet
 constexpr uint8_t kSilentLimit = 3;
