@@ -29,7 +29,8 @@ def main() -> None:
     folder = Path(ProjectConfig.get_instance().get("platformio", "packages_dir")) / "tool-scons"
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scons.py").write_text("from SCons.Script.Main import main\n\nmain()\n")
-    package = {"name": "tool-scons", "version": wanted, "license": "MIT", "description": f"Runs SCons {scons} from PyPI"}
+    description = f"Runs SCons {scons} from PyPI"
+    package = {"name": "tool-scons", "version": wanted, "license": "MIT", "description": description}
     (folder / "package.json").write_text(json.dumps(package))
     owner = {"owner": "platformio", "id": None, "name": "tool-scons", "requirements": None, "uri": None}
     manifest = {"type": "tool", "name": "tool-scons", "version": wanted, "spec": owner}

@@ -11,9 +11,12 @@ def quoted(text: str) -> str:
 
 
 def header(vectors: dict) -> str:
+    def initialiser(row: dict, *keys: str) -> str:
+        return f"{{{', '.join(quoted(row[key]) for key in keys)}}},"
+
     rows = [f"{{{quoted(row['data'])}, {row['crc']}}}," for row in vectors["crc16"]]
-    frames = [f"{{{quoted(row['name'])}, {quoted(row['payload'])}, {quoted(row['frame'])}}}," for row in vectors["frames"]]
-    rejected = [f"{{{quoted(row['name'])}, {quoted(row['cause'])}, {quoted(row['frame'])}}}," for row in vectors["rejected"]]
+    frames = [initialiser(row, "name", "payload", "frame") for row in vectors["frames"]]
+    rejected = [initialiser(row, "name", "cause", "frame") for row in vectors["rejected"]]
     return "\n".join(
         [
             "#pragma once",

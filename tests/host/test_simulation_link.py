@@ -1,4 +1,4 @@
-"""The simulated link: its truth obeys mechanics, its raw values are the sensors', and a run is one however it is cut."""
+"""The simulated link: its truth obeys mechanics, its raw values are the sensors', a run is one however it is cut."""
 
 from __future__ import annotations
 
