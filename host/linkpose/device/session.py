@@ -48,8 +48,15 @@ PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
 RETRY_INTERVAL_S = 0.25
 
+FLASH = "type `linkpose flash`"
+UPGRADE = "type `pip install --upgrade linkpose`"
+
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
+
+
+class WrongBoard(LinkposeError):
+    """A board that cannot be gone on with, however long it is waited for."""
 
 
 class Placement(NamedTuple):
@@ -131,28 +138,25 @@ class Session:
                 heard += arrival.data[: 512 - len(heard)]
                 for message in arrival.messages:
                     if isinstance(message, OtherProtocol):
-                        raise LinkposeError(_other_protocol(message))
+                        raise WrongBoard(_other_protocol(message))
                     if isinstance(message, Hello) and not message.streaming:
-                        return self._accept(message)
+                        self._check_versions(message)
+                        link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                        return message
         except Disconnected as error:
             raise LinkposeError(f"{self.port} went away during the handshake ({error}); check the cable") from error
         raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
 
-    def _accept(self, hello: Hello) -> Hello:
-        """Checks the versions. What was heard before the handshake is no part of the session."""
+    def _check_versions(self, hello: Hello) -> None:
+        """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise LinkposeError(
-                f"the board's firmware {firmware_version(hello)} and this linkpose {VERSION} were built from different "
-                "wire schemas of one version; type `linkpose flash`"
-            )
+            raise WrongBoard(_other_schema(hello))
         if hello.protocol_minor != PROTOCOL_MINOR:
-            older = "board" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
+            older, cure = ("board", FLASH) if hello.protocol_minor < PROTOCOL_MINOR else ("linkpose", UPGRADE)
             self._notify(
                 f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
-                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older"
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
             )
-        self._link.decoder.corrupt = Corrupt()
-        return hello
 
     # ---- commands ----
 
@@ -292,8 +296,9 @@ class Session:
         elif isinstance(message, Status):
             self._status = message
         elif isinstance(message, OtherProtocol):
-            raise LinkposeError(_other_protocol(message))
+            raise WrongBoard(_other_protocol(message))
         elif isinstance(message, Hello) and not message.streaming:
+            self._check_versions(message)
             self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
             timeline.interrupted("reset")
             self._resume(message)
@@ -302,13 +307,13 @@ class Session:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
         if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
-            raise LinkposeError(f"another board answers at {self.port} now; record it into a file of its own")
+            raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
         self._begin()
 
     def _reconnect(self) -> Iterator[None]:
-        """Waits until the board can be opened again and streams; yields while it waits."""
+        """Waits until the board can be opened again and streams; yields while it waits. Raises WrongBoard."""
         self._link.close()
         for part, count in self._link.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
@@ -321,6 +326,8 @@ class Session:
                 continue
             try:
                 self._resume(self._handshake())
+            except WrongBoard:
+                raise
             except (Disconnected, LinkposeError):
                 self._link.close()
                 continue
@@ -383,11 +390,16 @@ def _other_protocol(other: OtherProtocol) -> str:
     theirs = f"{other.protocol_major}.{other.protocol_minor}"
     ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
     if other.protocol_major < PROTOCOL_MAJOR:
-        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; type `linkpose flash`"
-    return (
-        f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; "
-        "type `pip install --upgrade linkpose`"
-    )
+        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; {FLASH}"
+    return f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; {UPGRADE}"
+
+
+def _other_schema(hello: Hello) -> str:
+    theirs = firmware_version(hello)
+    release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
+    if release > tuple(map(int, VERSION.split("."))):
+        return f"this linkpose {VERSION} is older than the board's firmware {theirs}, their schemas differ; {UPGRADE}"
+    return f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas; {FLASH}"
 
 
 def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:

@@ -1,0 +1,130 @@
+"""Firmware and host that do not belong together: found at any time, both versions named, and what to type."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from pty_board import PtyBoard
+
+from linkpose.cli.live import Recorder
+from linkpose.device import session as session_module
+from linkpose.device.session import Session, WrongBoard
+from linkpose.recording.reader import load_recording
+from linkpose.sensors.rig import Rig
+from linkpose.simulation import board as simulated
+from linkpose.wire.frames import encode
+from linkpose.wire.messages import VERSION
+
+LIVE = ["info", "record {out}", "estimate --live -o {out}"]
+OURS = encode(simulated.hello(simulated.DEFAULTS))
+RELEASE = dict(zip(("firmware_major", "firmware_minor", "firmware_patch"), map(int, VERSION.split(".")), strict=True))
+OLDER = RELEASE | {"firmware_major": 0, "firmware_minor": 0, "firmware_patch": 1}
+NEWER = RELEASE | {"firmware_major": 99}
+
+
+class OtherFirmware:
+    """Replaces the HELLO of a board by another, from the moment in which `begin` is called."""
+
+    def __init__(self, **fields: int) -> None:
+        self._hello = encode(simulated.hello(simulated.DEFAULTS)._replace(**fields))
+        self._begun = threading.Event()
+
+    def begin(self) -> None:
+        self._begun.set()
+
+    @property
+    def begun(self) -> bool:
+        return self._begun.is_set()
+
+    def __call__(self, said: bytes) -> bytes:
+        return said.replace(OURS, self._hello) if self._begun.is_set() else said
+
+
+def arguments(command: str, port: Path, out: Path) -> list[str]:
+    return [*command.format(out=out).split(), "--port", str(port)]
+
+
+@pytest.mark.parametrize("command", LIVE)
+@pytest.mark.parametrize(
+    ("release", "named", "cure"),
+    [
+        (OLDER, "firmware 0.0.1 and this linkpose", "linkpose flash"),
+        (RELEASE, f"firmware {VERSION} and this linkpose {VERSION}", "linkpose flash"),
+        (NEWER, f"this linkpose {VERSION} is older than the board's firmware 99.", "pip install --upgrade linkpose"),
+    ],
+    ids=["older", "same release", "newer"],
+)
+def test_another_schema_at_the_start(
+    refused: Callable[..., str], tmp_path: Path, command: str, release: dict[str, int], named: str, cure: str
+) -> None:
+    firmware = OtherFirmware(schema_crc=1, **release)
+    firmware.begin()
+    with PtyBoard(tmp_path / "port", spoil=firmware):
+        said = refused(*arguments(command, tmp_path / "port", tmp_path / "out.csv"))
+    assert named in said
+    assert f"type `{cure}`" in said
+    assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("minor", "older", "cure"), [(4, "board", "linkpose flash"), (6, "linkpose", "pip install --upgrade linkpose")]
+)
+def test_another_minor_version_is_told_and_goes_on(
+    linkpose: Callable[..., tuple[int, str, str]],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    minor: int,
+    older: str,
+    cure: str,
+) -> None:
+    monkeypatch.setattr(session_module, "PROTOCOL_MINOR", 5)
+    firmware = OtherFirmware(protocol_minor=minor, schema_crc=1)
+    firmware.begin()
+    with PtyBoard(tmp_path / "port", spoil=firmware):
+        command = arguments("record {out} --duration 0.1", tmp_path / "port", tmp_path / "out.csv")
+        status, _, said = linkpose(*command)
+    assert status == 0
+    assert f"the board speaks protocol 1.{minor}, this linkpose 1.5" in said
+    assert f"the {older} is older: type `{cure}`" in said
+
+
+def pull_and_plug(board: PtyBoard) -> None:
+    board.pull()
+    board.plug()
+
+
+def reset_silently(board: PtyBoard) -> None:
+    board.reset(says_hello=False)
+
+
+@pytest.mark.parametrize("exchange", [pull_and_plug, reset_silently], ids=["at the cable", "under way"])
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"schema_crc": 1, **OLDER}, f"firmware 0.0.1 and this linkpose {VERSION}"),
+        ({"protocol_major": 0}, "it speaks protocol 0."),
+        ({"ac1": 1}, "another board answers"),
+    ],
+    ids=["schema", "protocol", "board"],
+)
+def test_another_firmware_in_the_middle_of_a_recording_ends_it(
+    tmp_path: Path, exchange: Callable[[PtyBoard], None], fields: dict[str, int], named: str
+) -> None:
+    """It is not waited for, and what was recorded until then is kept."""
+    firmware = OtherFirmware(**fields)
+    port, out = tmp_path / "port", tmp_path / "out.csv"
+    with (
+        PtyBoard(port, spoil=firmware) as board,
+        Session(str(port), lambda _: None) as session,
+        pytest.raises(WrongBoard, match=named),
+        Recorder(session, out, Rig(), False) as recorder,
+    ):
+        for placements in session.stream(5.0):
+            recorder.take(placements)
+            if session.timeline.samples >= 20 and not firmware.begun:
+                firmware.begin()
+                exchange(board)
+    assert len(load_recording(out).measurements) >= 20
