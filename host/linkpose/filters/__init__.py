@@ -37,6 +37,8 @@ _FILTERS = {
     "baro": _Entry("baro", "BaroFilter", Sensors.BMP180, False),
     "joint-inertial": _Entry("joint_inertial", "JointInertialFilter", Sensors.MPU6050, True),
     "mice": _Entry("mice", "MiceFilter", Sensors(0), False, True),
+    "planar-ekf": _Entry("planar", "PlanarEkf", Sensors(0), False, True),
+    "planar-ukf": _Entry("planar", "PlanarUkf", Sensors(0), False, True),
 }
 NAMES = tuple(_FILTERS)
 
