@@ -21,6 +21,7 @@ COMMANDS = {
     "estimate": "Run the filters, live or over a recording.",
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
+    "reproduce": "Measure the papers' tables and figures anew.",
     "localize": "Find where a robot was, in a map or among beacons.",
 }
 
