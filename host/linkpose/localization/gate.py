@@ -51,11 +51,14 @@ def gate_blocks(innovation: Floats, covariance: Floats, block: int, threshold: f
     """Fills `d2` for each block of `block` rows; returns the indices of the rows whose block passes."""
     keep = np.empty(innovation.shape[0], np.int64)
     kept = 0
-    lower = np.empty((block, block))
+    part, lower, residual = np.empty((block, block)), np.empty((block, block)), np.empty(block)
     for b in range(d2.shape[0]):
         first = b * block
-        part = covariance[first : first + block, first : first + block]
-        d2[b] = mahalanobis_squared(innovation[first : first + block], lower) if lower_cholesky(part, lower) else np.inf
+        for i in range(block):
+            residual[i] = innovation[first + i]
+            for j in range(block):
+                part[i, j] = covariance[first + i, first + j]
+        d2[b] = mahalanobis_squared(residual, lower) if lower_cholesky(part, lower) else np.inf
         if d2[b] <= threshold:
             for i in range(first, first + block):
                 keep[kept] = i

@@ -20,11 +20,44 @@ def wrap_angle(angle: float) -> float:
 
 
 @njit(cache=True)
-def wrap_where(values: Floats, is_angle: NDArray[np.bool_]) -> None:
-    """Puts those elements of a vector that are angles on the circle, in place."""
-    for i in range(values.shape[0]):
+def subtract_from(measured: Floats, expected: Floats, is_angle: NDArray[np.bool_], first: int) -> None:
+    """expected ← measured − expected, in place, on the circle where `is_angle` says so, which is read from index
+    `first` on.
+    """
+    for i in range(expected.shape[0]):
+        expected[i] = measured[i] - expected[i]
+        if is_angle[first + i]:
+            expected[i] = wrap_angle(expected[i])
+
+
+@njit(cache=True)
+def shift(
+    state: Floats, gain: Floats, innovation: Floats, keep: NDArray[np.int64], is_angle: NDArray[np.bool_]
+) -> None:
+    """x ← x + K ν, in place, with those rows of ν that `keep` names; angles stay on the circle."""
+    for i in range(state.shape[0]):
+        for j in range(keep.shape[0]):
+            state[i] += gain[i, j] * innovation[keep[j]]
         if is_angle[i]:
-            values[i] = wrap_angle(values[i])
+            state[i] = wrap_angle(state[i])
+
+
+@njit(cache=True)
+def taken(a: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+    """The rows and columns of a matrix that are named, as a new matrix."""
+    out = np.empty((rows.shape[0], columns.shape[0]))
+    for i in range(rows.shape[0]):
+        for j in range(columns.shape[0]):
+            out[i, j] = a[rows[i], columns[j]]
+    return out
+
+
+@njit(cache=True)
+def add_to(a: Floats, b: Floats) -> None:
+    """a ← a + b, in place."""
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            a[i, j] += b[i, j]
 
 
 @njit(cache=True)
@@ -110,10 +143,10 @@ def keep_positive_definite(a: Floats) -> bool:
 def right_divide(t: Floats, lower: Floats) -> Floats:
     """t S⁻¹ for S = L Lᵀ: the Kalman gain from the cross covariance t."""
     n = lower.shape[0]
-    out = t.copy()
+    out = np.empty(t.shape)
     for row in range(t.shape[0]):
         for i in range(n):
-            total = out[row, i]
+            total = t[row, i]
             for k in range(i):
                 total -= lower[i, k] * out[row, k]
             out[row, i] = total / lower[i, i]

@@ -29,7 +29,7 @@ from linkpose.localization.tables import Beacons
 
 Pose = tuple[float, float, float]
 DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
-# When the gate has refused most of the last so many measurements of one kind, the pose is taken to be wrong, not the sensor.
+# When the gate has refused most of so many measurements of a kind, the pose is taken to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # of the pose's standard deviations, then
 CONSTANTS = {

@@ -19,12 +19,16 @@ from numpy.typing import NDArray
 from linkpose.localization.gate import gate_blocks
 from linkpose.localization.linalg import (
     Floats,
+    add_to,
     keep_positive_definite,
     lower_cholesky,
     product,
     product_transposed,
     right_divide,
-    wrap_where,
+    shift,
+    subtract_from,
+    taken,
+    wrap_angle,
 )
 from linkpose.localization.models import predict, propagate
 
@@ -35,41 +39,42 @@ def _points(
 ) -> Floats:
     """(1) and (2): the propagated sigma points (1 + 2 (n + q), n); row 0 is the centre."""
     n, q = state.shape[0], noise_root.shape[0]
-    points, start, noise = np.empty((1 + 2 * (n + q), n)), np.empty(n), np.zeros(q)
-    for i in range(points.shape[0]):
-        start[:] = state
-        noise[:] = 0.0
-        side = reach if i % 2 else -reach
-        column = (i - 1) // 2
-        if 0 < i <= 2 * n:
-            start += side * root[:, column]
-        elif i > 2 * n:
-            noise += side * noise_root[:, column - n]
+    points, start, noise = np.empty((1 + 2 * (n + q), n)), np.empty(n), np.empty(q)
+    for point in range(points.shape[0]):
+        column = (point - 1) // 2
+        side = 0.0 if point == 0 else reach if point % 2 else -reach
+        for i in range(n):
+            start[i] = state[i] + (side * root[i, column] if 0 <= column < n else 0.0)
+        for i in range(q):
+            noise[i] = side * noise_root[i, column - n] if column >= n else 0.0
         if interval > 0.0:
-            propagate(motion, start, control, noise, interval, points[i])
+            propagate(motion, start, control, noise, interval, points[point])
         else:
-            points[i] = start
+            for i in range(n):
+                points[point, i] = start[i]
     return points
 
 
 @njit(cache=True)
-def _deviations(values: Floats, weight: float, is_angle: NDArray[np.bool_]) -> Floats:
-    """(3) and (7): the weighted mean of the rows. Turns `values` into their deviations from it.
+def _deviations(values: Floats, weight: float, is_angle: NDArray[np.bool_], first: int, mean: Floats) -> None:
+    """(3) and (7): fills the weighted mean of the rows, and turns `values` into their deviations from it.
 
     As the weights sum to 1, the mean is the centre plus the weighted differences from it. Taken so, it keeps its digits
     under the huge weights of a scaled transform, and angles on both sides of ±π have their mean between them.
+    `is_angle` is read from index `first` on.
     """
-    mean: Floats = values[0].copy()
-    difference = np.empty(values.shape[1])
-    for i in range(1, values.shape[0]):
-        difference[:] = values[i] - values[0]
-        wrap_where(difference, is_angle)
-        mean += weight * difference
-    wrap_where(mean, is_angle)
-    for i in range(values.shape[0]):
-        values[i] -= mean
-        wrap_where(values[i], is_angle)
-    return mean
+    for j in range(values.shape[1]):
+        angle = is_angle[first + j]
+        total = 0.0
+        for i in range(1, values.shape[0]):
+            difference = values[i, j] - values[0, j]
+            total += wrap_angle(difference) if angle else difference
+        mean[j] = values[0, j] + weight * total
+        if angle:
+            mean[j] = wrap_angle(mean[j])
+        for i in range(values.shape[0]):
+            difference = values[i, j] - mean[j]
+            values[i, j] = wrap_angle(difference) if angle else difference
 
 
 @njit(cache=True)
@@ -82,6 +87,13 @@ def _moment(a: Floats, b: Floats, centre_weight: float, weight: float) -> Floats
             for k in range(b.shape[1]):
                 out[j, k] += w * a[i, j] * b[i, k]
     return out
+
+
+@njit(cache=True)
+def _assign(target: Floats, source: Floats) -> None:
+    for i in range(target.shape[0]):
+        for j in range(target.shape[1]):
+            target[i, j] = source[i, j]
 
 
 @njit(cache=True)
@@ -122,62 +134,38 @@ def ukf_step(
     if not lower_cholesky(covariance, root):
         return False
     points = _points(motion, state, root, control, noise_root, interval, math.sqrt(scale))
-    images = np.empty((points.shape[0], m))
+    images, innovation = np.empty((points.shape[0], m)), np.empty(m)
     for i in range(points.shape[0] if m else 0):
         predict(model, points[i], parameters, blocked, geometry, images[i])
-    state[:] = _deviations(points, weight, is_angle[:n])
-    covariance[:, :] = _moment(points, points, centre_squares, weight)
+    _deviations(points, weight, is_angle, 0, state)
+    _assign(covariance, _moment(points, points, centre_squares, weight))
     if m == 0:
         return True
-    innovation = measured - _deviations(images, weight, is_angle[n:])
-    wrap_where(innovation, is_angle[n:])
-    spread = _moment(images, images, centre_squares, weight) + measurement_covariance
+    _deviations(images, weight, is_angle, n, innovation)
+    subtract_from(measured, innovation, is_angle, n)
+    spread = _moment(images, images, centre_squares, weight)
+    add_to(spread, measurement_covariance)
     keep = gate_blocks(innovation, spread, m // d2.shape[0], threshold, d2)
     if keep.shape[0] == 0:
         return True
-    return _correct(
-        state,
-        covariance,
-        points,
-        images[:, keep],
-        innovation[keep],
-        spread,
-        measurement_covariance,
-        keep,
-        is_angle,
-        centre_squares,
-        weight,
-    )
+    lower = np.empty((keep.shape[0], keep.shape[0]))
+    if not lower_cholesky(taken(spread, keep, keep), lower):
+        return False
+    kept_images = taken(images, np.arange(images.shape[0]), keep)
+    gain = right_divide(_moment(points, kept_images, centre_squares, weight), lower)
+    shift(state, gain, innovation, keep, is_angle)
+    rest = _rest(points, kept_images, gain)
+    noise = product_transposed(product(gain, taken(measurement_covariance, keep, keep)), gain)
+    _assign(covariance, _moment(rest, rest, centre_squares, weight))
+    add_to(covariance, noise)
+    return keep_positive_definite(covariance)
 
 
 @njit(cache=True)
-def _correct(
-    state: Floats,
-    covariance: Floats,
-    points: Floats,
-    images: Floats,
-    innovation: Floats,
-    spread: Floats,
-    measurement_covariance: Floats,
-    keep: NDArray[np.int64],
-    is_angle: NDArray[np.bool_],
-    centre_squares: float,
-    weight: float,
-) -> bool:
-    """(9) to (12) with the rows that passed the gate."""
-    n, k = state.shape[0], keep.shape[0]
-    part, noise, lower = np.empty((k, k)), np.empty((k, k)), np.empty((k, k))
-    for i in range(k):
-        for j in range(k):
-            part[i, j] = spread[keep[i], keep[j]]
-            noise[i, j] = measurement_covariance[keep[i], keep[j]]
-    if not lower_cholesky(part, lower):
-        return False
-    gain = right_divide(_moment(points, images, centre_squares, weight), lower)
-    for i in range(n):
-        for j in range(k):
-            state[i] += gain[i, j] * innovation[j]
-    wrap_where(state, is_angle[:n])
-    rest = points - product_transposed(images, gain)
-    covariance[:, :] = _moment(rest, rest, centre_squares, weight) + product_transposed(product(gain, noise), gain)
-    return keep_positive_definite(covariance)
+def _rest(points: Floats, images: Floats, gain: Floats) -> Floats:
+    """δx − K δz, row by row: what the measurement leaves of each point's deviation."""
+    out = product_transposed(images, gain)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = points[i, j] - out[i, j]
+    return out

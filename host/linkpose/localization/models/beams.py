@@ -39,7 +39,9 @@ def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geom
     """Fills ∂h/∂state by central differences, since a map has no formula; at an edge by the difference on one side."""
     above, below, centre = np.empty(out.shape[0]), np.empty(out.shape[0]), np.empty(out.shape[0])
     predict(state, parameters, blocked, geometry, centre)
-    moved = state.copy()
+    moved = np.empty(state.shape[0])
+    for j in range(state.shape[0]):
+        moved[j] = state[j]
     for j in range(3):
         step = TURN_STEP if j == 2 else geometry[0]
         moved[j] = state[j] + step

@@ -22,7 +22,8 @@ ID = 2
 @njit(cache=True)
 def propagate(state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """noise (a_x, a_y m/s², α rad/s², ḃ rad/s²); `control` is not used; interval in s."""
-    out[:] = state
+    for i in range(state.shape[0]):
+        out[i] = state[i]
     turn = state[5] * interval
     reach = interval * sinc(0.5 * turn)
     c, s = math.cos(state[2] + 0.5 * turn), math.sin(state[2] + 0.5 * turn)

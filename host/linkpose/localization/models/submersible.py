@@ -26,7 +26,8 @@ def propagate(state: Floats, control: Floats, noise: Floats, interval: float, ou
     """control (v forward, left, up m/s, roll, pitch rad), noise (three velocities m/s, yaw acceleration rad/s²);
     interval in s.
     """
-    out[:] = state
+    for i in range(state.shape[0]):
+        out[i] = state[i]
     forward, left, up = control[0] + noise[0], control[1] + noise[1], control[2] + noise[2]
     cr, sr, cp, sp = math.cos(control[3]), math.sin(control[3]), math.cos(control[4]), math.sin(control[4])
     heading = state[3] + 0.5 * state[4] * interval

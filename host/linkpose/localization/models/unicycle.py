@@ -33,7 +33,8 @@ def sinc_slope(angle: float) -> float:
 @njit(cache=True)
 def propagate(state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """control (v m/s, ω rad/s), noise alike; interval in s."""
-    out[:] = state
+    for i in range(state.shape[0]):
+        out[i] = state[i]
     turn = (control[1] + noise[1]) * interval
     chord = (control[0] + noise[0]) * interval * sinc(0.5 * turn)
     out[0] += chord * math.cos(state[2] + 0.5 * turn)
