@@ -50,7 +50,7 @@ void Mice::run() {
 void Mice::advance(uint8_t number, uint32_t now_us) {
   Port& port = ports_[number];
   if (port.busy) {
-    // The time runs from when the byte begins to go out.
+    // The time runs from the tick at which it begins.
     if (port.waits) {
       port.waits = ps2::waiting(number);
       port.since_us = now_us;
@@ -70,7 +70,7 @@ void Mice::begin_transaction(uint8_t number, uint32_t now_us) {
   Port& port = ports_[number];
   const Ps2Mouse::Request request = port.mouse.next();
   port.busy = true;
-  port.waits = request.sends;
+  port.waits = true;
   port.timeout_us = request.timeout_us;
   port.since_us = now_us;
   if (request.sends) {

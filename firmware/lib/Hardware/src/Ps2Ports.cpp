@@ -21,8 +21,9 @@ Ps2Bits lines[kPorts];
 volatile uint8_t levels_before_d;
 volatile uint8_t levels_before_b;
 
-// Prepared bytes: their lines are moved by the next tick that serves the mice.
-volatile uint8_t prepared_d, prepared_b;  // clocks
+// Prepared transactions: their lines are moved by the next tick that serves the mice.
+volatile uint8_t prepared_d, prepared_b;  // clocks to let go
+volatile uint8_t start_bits_d, start_bits_b;  // data to pull low before that
 volatile uint8_t divider = 1;
 volatile uint8_t ticks_left = 1;
 
@@ -63,9 +64,11 @@ inline __attribute__((always_inline)) void edge(uint8_t pins, uint8_t now) {
 }
 
 volatile uint8_t& prepared(uint8_t port) { return port < 3 ? prepared_d : prepared_b; }
+volatile uint8_t& start_bits(uint8_t port) { return port < 3 ? start_bits_d : start_bits_b; }
 
 void hold_locked(uint8_t port) {
   prepared(port) &= static_cast<uint8_t>(~clock_of(port));
+  start_bits(port) &= static_cast<uint8_t>(~data_of(port));
   pull(port, clock_of(port));
   release(port, data_of(port));
 }
@@ -97,13 +100,15 @@ void send(uint8_t port, uint8_t byte, uint8_t answers) {
     hold_locked(port);
     lines[port].begin_sending(byte, answers);
     prepared(port) |= clock_of(port);
+    start_bits(port) |= data_of(port);
   }
 }
 
 void listen(uint8_t port, uint8_t answers) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+    hold_locked(port);
     lines[port].begin_listening(answers);
-    release(port, clock_of(port));
+    prepared(port) |= clock_of(port);
   }
 }
 
@@ -118,19 +123,17 @@ const Ps2Bits& bits(uint8_t port) { return lines[port]; }
 void start_prepared() {
   if (--ticks_left != 0) return;
   ticks_left = divider;
-  const uint8_t clocks_d = prepared_d;
-  const uint8_t data_d = clocks_d << 1;
-  prepared_d = 0;
-  PORTD &= static_cast<uint8_t>(~data_d);
-  DDRD |= data_d;
-  DDRD &= static_cast<uint8_t>(~clocks_d);
-  PORTD |= clocks_d;
+  PORTD &= static_cast<uint8_t>(~start_bits_d);
+  DDRD |= start_bits_d;
+  DDRD &= static_cast<uint8_t>(~prepared_d);
+  PORTD |= prepared_d;
+  prepared_d = start_bits_d = 0;
   if (!prepared_b) return;
-  prepared_b = 0;
-  PORTB &= static_cast<uint8_t>(~data_of(3));
-  DDRB |= data_of(3);
-  DDRB &= static_cast<uint8_t>(~clock_of(3));
-  PORTB |= clock_of(3);
+  PORTB &= static_cast<uint8_t>(~start_bits_b);
+  DDRB |= start_bits_b;
+  DDRB &= static_cast<uint8_t>(~prepared_b);
+  PORTB |= prepared_b;
+  prepared_b = start_bits_b = 0;
 }
 
 }  // namespace ps2
