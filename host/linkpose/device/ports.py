@@ -54,7 +54,7 @@ def find_ports() -> list[PortInfo]:
     return found
 
 
-def choose_port() -> str:
+def choose_port(simulated_will_do: bool = True) -> str:
     """The only UNO there is. Raises LinkposeError that lists what there is when it is none or several."""
     ports = find_ports()
     unos = [port for port in ports if port.is_uno]
@@ -65,7 +65,8 @@ def choose_port() -> str:
         raise LinkposeError(f"{len(unos)} boards are connected: {listed}; choose one with --port")
     if ports:
         raise LinkposeError(f"no UNO is connected; the ports there are: {listed}; connect it or choose with --port")
-    raise LinkposeError("no serial port is connected; plug the board in, or try --port sim://link")
+    hint = ", or try --port sim://link" if simulated_will_do else ""
+    raise LinkposeError(f"no serial port is connected; plug the board in{hint}")
 
 
 def open_port(name: str) -> serial.Serial:
