@@ -7,8 +7,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import pytest
+from hypothesis import settings
 
 from linkpose.cli import main
+
+# The first example may wait for a compiler.
+settings.register_profile("linkpose", deadline=None)
+settings.load_profile("linkpose")
 
 
 class Result(NamedTuple):
@@ -21,7 +26,8 @@ class Result(NamedTuple):
 
 @pytest.fixture
 def linkpose(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Result]:
-    """Runs `linkpose ARGUMENTS...`; a traceback fails the test."""
+    """Runs `linkpose ARGUMENTS...`; an exception that is no sentence for the user fails the test."""
+    monkeypatch.setenv("LINKPOSE_DEBUG", "1")
 
     def run(*arguments: object) -> Result:
         monkeypatch.setattr(sys, "argv", ["linkpose", *map(str, arguments)])

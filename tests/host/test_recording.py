@@ -88,7 +88,7 @@ def equal(a: Measurements, b: Measurements) -> bool:
     return all(np.array_equal(x, y, equal_nan=x.dtype == np.float64) for x, y in pairs)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(raw_samples, st.sampled_from([2, 8]), st.integers(0, 3))
 def test_live_csv_and_capture_give_the_same_measurements(tmp_path_factory, raw, range_g, oversampling):
     """One by one as they arrive, read back from the CSV, and decoded at once from the raw bytes: all the same bits."""
@@ -230,7 +230,7 @@ def test_absent_and_unreadable_files(refused, tmp_path):
 
 
 @given(cut=st.integers(0, 20_000))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
     folder = tmp_path_factory.mktemp("cut")
     run = LinkRun(duration_s=1.0)

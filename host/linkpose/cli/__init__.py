@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Mapping
 from typing import Any
@@ -74,5 +75,11 @@ def main() -> None:
         status = 1
     except BrokenPipeError:  # the reader of our output has gone, as in `linkpose ... | head`
         sys.stderr.close()
+        status = 1
+    except Exception as error:
+        if os.environ.get("LINKPOSE_DEBUG"):
+            raise
+        what = f"{type(error).__name__}: {error}"
+        click.echo(f"linkpose: unexpected {what}; please report it with what LINKPOSE_DEBUG=1 shows", err=True)
         status = 1
     sys.exit(status if isinstance(status, int) else 0)

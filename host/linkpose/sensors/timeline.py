@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -63,13 +64,16 @@ class Placed(NamedTuple):
 class Timeline:
     """Places the samples of one recording one after another, over wraps, losses and restarts of the board."""
 
-    def __init__(self, sample_rate_hz: float) -> None:
+    def __init__(self, sample_rate_hz: float, end_s: float = math.inf) -> None:
+        """Samples from `end_s` on are not taken, nor counted in any way."""
         self._period_s = 1.0 / sample_rate_hz
+        self._end_s = end_s - self._period_s / 2
         self._start_s = 0.0  # the host's time of the first sample
         self._last: Placed | None = None
         self._wire_seq = 0  # the last sample's seq as it came
         self._cause = "link"
         self._restarted = False
+        self.is_over = False  # the end has come
         self.samples = 0
         self.lost = 0
         self.gaps: list[Gap] = []
@@ -84,7 +88,10 @@ class Timeline:
         self._cause, self._restarted = cause, True
 
     def place(self, sample: Sample, clock: Clock, arrived_s: float) -> Placed | None:
-        """Place of a sample that arrived at `arrived_s` (s, the host's clock); None for one that came twice."""
+        """Place of a sample that arrived at `arrived_s` (s, the host's clock).
+
+        None for one that came twice, and for one from the end on.
+        """
         host_s = clock.host_time(clock.unwrap(sample.t_us, arrived_s))
         last = self._last
         if last is None:
@@ -93,7 +100,8 @@ class Timeline:
         else:
             time_s = max(host_s - self._start_s, last.time_s)
             ticks = self._ticks(sample.seq, (time_s - last.time_s) / self._period_s)
-            if ticks == 0:
+            if ticks == 0 or time_s >= self._end_s:
+                self.is_over = time_s >= self._end_s
                 return None
             seq, missing = last.seq + ticks, ticks - 1
         marked = missing or (self._restarted and last)
@@ -104,6 +112,7 @@ class Timeline:
         self._restarted, self._cause, self._wire_seq = False, "link", sample.seq
         self._last = Placed(time_s, seq, sample.flags | (GAP_BEFORE if marked else 0))
         self.samples += 1
+        self.is_over = time_s + self._period_s >= self._end_s
         return self._last
 
     def _ticks(self, seq: int, elapsed: float) -> int:
