@@ -199,6 +199,23 @@ def test_counts_corrupt_commands_and_carries_on(board: MakeBoard) -> None:
     assert link.expect(Pong, 50).token == 7
 
 
+def test_noise_from_the_host_does_no_harm(board: MakeBoard) -> None:
+    """Two seconds of random bytes at the line's full rate, some stretches of them without any 0x00."""
+    link = board()
+    link.start()
+    rng = np.random.default_rng(8)
+    for turn in range(100):
+        link.uno.send(rng.integers(turn % 2, 256, 500, dtype=np.uint8).tobytes())
+        link.run_ms(20)
+    link.uno.send(b"\0")
+    link.run_ms(1100)
+    assert lost(link.samples) == 0
+    assert link.status.rx_overruns == 0
+    assert link.status.commands_corrupt > 50
+    link.send(Ping(9))
+    assert link.expect(Pong, 50).token == 9
+
+
 # --- the stream ---
 
 

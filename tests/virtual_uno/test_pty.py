@@ -17,7 +17,7 @@ from pty_server import PtyServer
 from wire_link import WireLink
 
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
-from linkpose.wire.messages import BAUD, Ack, Configure, Hello, Message, Sample, Start
+from linkpose.wire.messages import BAUD, Ack, Configure, Hello, Message, Sample, SampleFlags, Start
 
 MakeBoard = Callable[..., WireLink]
 SERVE = Path(__file__).with_name("serve.py")
@@ -165,25 +165,33 @@ def test_a_host_that_stalls_is_in_step_again(board: MakeBoard, tmp_path: Path) -
     assert whole(host.samples[kept:])
 
 
-def test_the_command_serves_and_reports(firmware_hex: Path, tmp_path: Path) -> None:
+def test_the_command_serves_breaks_and_reports(firmware_hex: Path, tmp_path: Path) -> None:
+    """A sensor is pulled by a line on its standard input, the cable at a time of the board."""
     link = tmp_path / "port"
     command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(link)]
-    options = ["--flat-out", "--duration", "20", "--test", "2", "--fault", "5:imu-unplug", "--fault", "6:imu-plug"]
+    options = ["--flat-out", "--duration", "101", "--test", "2", "--fault", "100:cable-pull"]
     with subprocess.Popen([*command, *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as served:
+        assert served.stdin
         assert served.stdout
         assert json.loads(served.stdout.readline())["event"] == "ready"
         host = Host(link)
         host.start()
-        with pytest.raises(serial.SerialException):  # the port goes with the command
+        host.read_samples(500)
+        assert len({sample.accel_x for sample in host.samples}) > 200  # the link moves
+        for fault, flag in (("imu-unplug", 0), ("imu-plug", SampleFlags.IMU_VALID)):
+            served.stdin.write(fault + "\n")
+            served.stdin.flush()
+            host.read_until(lambda flag=flag: host.samples[-1].flags & SampleFlags.IMU_VALID == flag)
+        with pytest.raises(serial.SerialException):
             host.read_until(lambda: False)
+        host.port.close()
+        served.send_signal(signal.SIGTERM)
         report = json.loads(served.stdout.readline())
     assert served.returncode == 0
     assert report["event"] == "end"
-    assert report["board_s"] == pytest.approx(20, abs=0.1)
+    assert report["board_s"] == pytest.approx(100, abs=0.1)
+    assert report["opens"] == 1
     assert whole(host.samples)
-    invalid = sum(not sample.flags & 1 for sample in host.samples)
-    assert 100 <= invalid <= 110
-    assert len({sample.accel_x for sample in host.samples}) > 500  # the link moves
 
 
 def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -> None:
