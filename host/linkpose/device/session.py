@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -238,8 +239,7 @@ class Session:
         A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
         was reset or unplugged is waited for, and goes on in the same timeline with the gap marked.
         """
-        timeline = self.timeline = Timeline(self.hello.sample_rate_hz)
-        end_s = None if duration_s is None else duration_s - 0.5 / self.hello.sample_rate_hz
+        timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
         while True:
             try:
@@ -251,10 +251,8 @@ class Session:
                 for _ in self._reconnect():
                     yield []
                 continue
-            if end_s is not None:
-                placements = [p for p in placements if p.place.time_s < end_s]
             yield placements
-            if end_s is not None and timeline.duration_s > end_s:
+            if timeline.is_over:
                 return
 
     def _begin(self) -> None:
