@@ -20,6 +20,7 @@ COMMANDS = {
     "info": "Show the board's versions, sensors, settings and link health.",
     "record": "Record the sensors into a CSV file.",
     "estimate": "Run the filters, live or over a recording.",
+    "calibrate": "Complete a rig file from recordings made for it.",
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
     "reproduce": "Measure the papers' tables and figures anew.",

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import click
 
+from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Rig, Vector
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -84,3 +85,13 @@ def resolve_rig(rig_file: Path | None, j2s: Vector | None, brought: Rig | None) 
     """The rig file where one is named, or else the one that came along; `--j2s` goes before either's."""
     rig = Rig.load(rig_file) if rig_file else brought or Rig()
     return rig.with_j2s(j2s) if j2s else rig
+
+
+def save_rig(path: Path, rig: Rig) -> None:
+    """Writes a rig file, whole or not at all. Raises LinkposeError where it cannot be written."""
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        partial.write_text(rig.to_toml(), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise LinkposeError(f"cannot write the rig file {path}: {error.strerror}") from error

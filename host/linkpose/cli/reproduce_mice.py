@@ -13,6 +13,8 @@ from linkpose.cli import options
 if TYPE_CHECKING:
     from linkpose.evaluation.mice import PaperRun, Redundancy
 
+PLOTTED_S = 4.0
+
 
 @click.command("mice")
 @click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="How many simulated drives.")
@@ -83,6 +85,7 @@ def _plot(path: Path, run: PaperRun) -> None:
     axes[0, 1].set_title("The robot's velocity by least squares (Figure 3)")
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
+        axis.set_xlim(0, PLOTTED_S)
     try:
         figure.savefig(path)
     except (OSError, ValueError) as error:

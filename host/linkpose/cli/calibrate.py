@@ -1,0 +1,17 @@
+"""`linkpose calibrate`: completes a rig file from recordings made for it. Each part is a module `calibrate_<part>`."""
+
+from __future__ import annotations
+
+import click
+
+from linkpose.cli import LazyGroup
+
+# Part of the rig file -> what is found.
+PARTS = {
+    "mice": "Counts per metre and mounting angle of each mouse, from a straight line and a full turn.",
+}
+
+
+@click.group("calibrate", cls=LazyGroup, table=PARTS, modules="linkpose.cli.calibrate_")
+def command() -> None:
+    """Complete a rig file from recordings that were made for it."""

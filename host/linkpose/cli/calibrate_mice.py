@@ -1,0 +1,51 @@
+"""`linkpose calibrate mice`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from linkpose.cli import options
+
+if TYPE_CHECKING:
+    from linkpose.calibration.mice import MouseCalibration
+
+
+@click.command("mice")
+@click.argument("recordings", type=options.FILE, nargs=-1, required=True)
+@click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to complete: it places the mice.")
+@click.option("--length", type=float, required=True, metavar="M", help="Length of the straight line (m).")
+@options.as_json
+def command(recordings: tuple[Path, ...], rig_file: Path, length: float, json_lines: bool) -> None:
+    """Find counts per metre and mounting angle of each mouse, and write them into the rig file.
+
+    Measure where each mouse sits (x_m ahead, y_m to the left of the robot's centre) and write it into the rig file.
+    Record a straight line of known length, driven ahead, and a full turn on the spot (several turns, or several
+    recordings, are better), each with a second of rest before it. The gyro tells which recording is which.
+    """
+    from linkpose.calibration.mice import calibrate_mice, with_calibration
+    from linkpose.recording.reader import load_recording
+
+    if not 0 < length < float("inf"):
+        raise click.UsageError("--length is that of the line in metres, above 0")
+    loaded = [load_recording(path) for path in recordings]
+    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    found = calibrate_mice(loaded, rig, length)
+    options.save_rig(rig_file, with_calibration(rig, found))
+    for mouse in found:
+        click.echo(json.dumps(_object(mouse)) if json_lines else _line(mouse))
+    click.echo(f"written to {rig_file}", err=True)
+
+
+def _object(mouse: MouseCalibration) -> dict[str, int | float]:
+    return {name: round(getattr(mouse, name), 5) for name in mouse.__slots__}
+
+
+def _line(mouse: MouseCalibration) -> str:
+    return (
+        f"mouse {mouse.mouse}: {mouse.counts_per_m:.1f} ± {mouse.counts_per_m_std:.1f} counts/m, "
+        f"turned by {mouse.angle_deg:.2f} ± {mouse.angle_std_deg:.2f}°, residual {mouse.residual_mm:.2f} mm"
+    )
