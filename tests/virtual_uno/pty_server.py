@@ -46,16 +46,18 @@ class PtyServer:
     """
 
     def __init__(
-        self, uno: VirtualUno, link: Path, *, paced: bool = True, reset_on_open: bool = True,
+        self, uno: VirtualUno, link: Path, *, paced: bool = True, clock_ppm: float = 0.0, reset_on_open: bool = True,
         on_slice: Callable[[], None] | None = None, on_open: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
-        """`paced`: by the wall clock, never early; otherwise as fast as the host reads. `on_slice` is called before
-        every piece of emulated time, `on_open` when a host has opened the port (after the reset)."""
+        """`paced`: by the wall clock, never early; otherwise as fast as the host reads. `clock_ppm`: how much faster
+        than the wall clock the board's own runs (an UNO's resonator: up to 5000 either way). `on_slice` is called
+        before every piece of emulated time, `on_open` when a host has opened the port (after the reset)."""
         self.uno, self.link = uno, link
         self.statistics = PtyStatistics()
         self.to_host = self.to_board = Faults()
         self.waits_for_host = not paced  # rather than losing what the host does not read in time
         self._paced, self._reset_on_open = paced, reset_on_open
+        self._clock_rate = 1 + clock_ppm * 1e-6  # seconds of the board a second
         self._on_slice, self._on_open = on_slice, on_open
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
@@ -145,7 +147,7 @@ class PtyServer:
             self.statistics.board_s = self.uno.time_s - begin_board
             self.statistics.wall_s = time.monotonic() - begin_wall
             if self._paced:
-                late = self.statistics.wall_s - self.statistics.board_s
+                late = self.statistics.wall_s - self.statistics.board_s / self._clock_rate
                 self.statistics.max_late_s = max(self.statistics.max_late_s, late)
                 time.sleep(max(0.0, _SLICE_S - late))
         return self.statistics
@@ -160,7 +162,7 @@ class PtyServer:
             time.sleep(_SLICE_S)
             return
         if self._paced:
-            ahead = (time.monotonic() - begin_wall) - (self.uno.time_s - begin_board)
+            ahead = (time.monotonic() - begin_wall) * self._clock_rate - (self.uno.time_s - begin_board)
         if ahead > 0:
             self.uno.run_cycles(round(min(ahead, _LONGEST_RUN_S) * CLOCK_HZ))
 

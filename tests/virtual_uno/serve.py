@@ -76,6 +76,7 @@ def _parse() -> argparse.Namespace:
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--pace", dest="paced", action="store_true", default=True, help="by the wall clock (default)")
     pace.add_argument("--flat-out", dest="paced", action="store_false", help="as fast as the host reads")
+    parser.add_argument("--clock-ppm", type=float, default=0.0, metavar="PPM", help="how fast the board's clock is")
     parser.add_argument("--no-reset-on-open", dest="reset_on_open", action="store_false", help="as without DTR")
     parser.add_argument("--bootloader", type=float, default=0.0, metavar="S", help="its wait after a reset (an UNO: 1)")
     parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="what traffic adds to the BMP180")
@@ -108,7 +109,7 @@ def _serve(uno: VirtualUno, options: argparse.Namespace) -> dict[str, float]:
             feed.restart()  # the rig's time zero is the moment in which the port is first opened
 
     server = PtyServer(
-        uno, options.link, paced=options.paced, reset_on_open=options.reset_on_open,
+        uno, options.link, paced=options.paced, clock_ppm=options.clock_ppm, reset_on_open=options.reset_on_open,
         on_slice=before_slice, on_open=first_open,
     )  # fmt: skip
     faults = Faulty(uno, server)

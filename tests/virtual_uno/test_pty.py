@@ -88,6 +88,17 @@ def test_paced_bytes_never_come_before_their_time(board: MakeBoard, tmp_path: Pa
     assert statistics.bytes_dropped == 0
 
 
+def test_the_boards_clock_may_be_off(board: MakeBoard, tmp_path: Path) -> None:
+    """20 % fast, which no UNO is, so that one second shows it."""
+    with PtyServer(board().uno, tmp_path / "port", clock_ppm=200_000) as server:
+        host = Host(tmp_path / "port")
+        host.start()
+        host.read_samples(100)
+        host.port.close()
+    statistics = server.stop()
+    assert statistics.board_s / statistics.wall_s == pytest.approx(1.2, abs=0.06)
+
+
 def test_opening_the_port_resets_the_board(board: MakeBoard, tmp_path: Path) -> None:
     with PtyServer(board().uno, tmp_path / "port", paced=False) as server:
         for _ in range(3):
