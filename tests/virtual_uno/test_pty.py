@@ -217,7 +217,13 @@ def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"), [(["--hex", "no.hex"], "no.hex"), (["--fault", "0:fire"], "there is no fault 'fire'")]
+    ("arguments", "says"),
+    [
+        (["--hex", "no.hex"], "no.hex"),
+        (["--hex", __file__], "line 1 of the program is not Intel HEX"),
+        (["--fault", "0:fire"], "there is no fault 'fire'"),
+        (["--test", "9"], "there is no Test 9"),
+    ],
 )
 def test_the_command_says_what_is_wrong(firmware_hex: Path, tmp_path: Path, arguments: list[str], says: str) -> None:
     command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(tmp_path / "port")]

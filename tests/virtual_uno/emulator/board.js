@@ -36,13 +36,11 @@ class Board {
    *  @param {object} [options.mpu6050] see Mpu6050
    *  @param {object} [options.bmp180] see Bmp180
    *  @param {object[]} [options.mice] see Ps2Mouse; one for each port from the first on
-   *  @param {number} [options.startUpS] from a reset to the first instruction
    *  @param {number} [options.bootloaderS] how long the UNO's bootloader waits for a program after a reset from outside;
    *    it clears MCUSR before it starts the one that is there. 0: no bootloader
    *  @param {number} [options.bootAddress] where every reset begins: that of a bootloader which is part of the program */
-  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], startUpS = START_UP_S, bootloaderS = 0, bootAddress = 0 }) {
+  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], bootloaderS = 0, bootAddress = 0 }) {
     const random = seededRandom(seed);
-    this.startUpCycles = startUpS * CLOCK_HZ;
     this.bootloaderCycles = bootloaderS * CLOCK_HZ;
     this.log = new Log();
     this.cpu = new Cpu(readHex(hex), this.log);
@@ -70,7 +68,7 @@ class Board {
 
   reset(cause) {
     const waiting = cause === RESET_CAUSE.external ? this.bootloaderCycles : 0;
-    this.cpu.restart(cause, this.startUpCycles + waiting, this.bootloaderCycles === 0);
+    this.cpu.restart(cause, START_UP_S * CLOCK_HZ + waiting, this.bootloaderCycles === 0);
   }
 
   /** Bit-bangs the host's side of a mouse port in place of the program. */

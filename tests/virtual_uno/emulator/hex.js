@@ -12,11 +12,11 @@ function readHex(text) {
     if (line === "") continue;
     const record = Buffer.from(line.slice(1), "hex");
     const sum = record.reduce((total, byte) => (total + byte) & 0xff, 0);
-    if (line[0] !== ":" || record.length !== record[0] + 5 || sum !== 0) throw new Error(`line ${index + 1} is not Intel HEX`);
+    if (line[0] !== ":" || record.length !== record[0] + 5 || sum !== 0) throw new Error(`line ${index + 1} of the program is not Intel HEX`);
     const address = base + record.readUInt16BE(1);
     const type = record[3];
     const data = record.subarray(4, -1);
-    if (type === 0 && address + data.length > FLASH_BYTES) throw new Error(`line ${index + 1} lies beyond the flash`);
+    if (type === 0 && address + data.length > FLASH_BYTES) throw new Error(`line ${index + 1} of the program lies beyond the flash`);
     if (type === 0) flash.set(data, address);
     else if (type === 2) base = data.readUInt16BE(0) << 4;
     else if (type === 4) base = data.readUInt16BE(0) << 16;

@@ -49,12 +49,12 @@ class MismatchedReceiver {
 }
 
 class SerialLine {
-  /** @param {() => import("./usart").Usart} usart
-   *  @param {() => number} [random] */
+  /** @param {import("./cpu").Cpu} cpu
+   *  @param {() => number} random */
   constructor(cpu, random) {
     this.cpu = cpu;
     this.random = random;
-    this.usart = null;
+    this.usart = null; // the board's end, set by the board
     this.hostBitCycles = null; // null: the host follows the board's bit time
     this.toHost = [];
     this.toBoard = [];

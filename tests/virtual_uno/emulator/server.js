@@ -134,7 +134,8 @@ function answer(line) {
     const request = JSON.parse(line);
     return OPERATIONS[request.op](request);
   } catch (error) {
-    return { error: String(error.stack) };
+    const foreseen = error.constructor === Error; // other kinds are mistakes of the emulator itself
+    return { error: foreseen ? error.message : error.stack };
   }
 }
 
