@@ -2,8 +2,8 @@
 
     python tests/bench/latency.py [--json]
 
-The board runs in real time. The tick is the START of the inertial sensor's read on its bus; the end is the arrival of the
-estimate's line in another process. The peer is the interval between two samples. The firmware must have been built.
+The board runs in real time. The tick is the START of the inertial sensor's read on its bus; the end is the arrival of
+the estimate's line in another process. The peer is the interval between two samples. The firmware must have been built.
 """
 
 from __future__ import annotations
