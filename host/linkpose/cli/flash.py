@@ -45,15 +45,13 @@ def command(
         raise click.UsageError("choose one of --prebuilt and --hex")
     console = Console(quiet, verbose)
     port = _usable_port(port)
-    if prebuilt or hex_file is not None:
-        image = read_image(hex_file or PREBUILT)
-        _announce(console, image, port)
-        from linkpose.flashing.upload import upload_with_avrdude
-
-        upload_with_avrdude(image, port, _shows_upload(console))
-    else:
-        image = _build_and_upload(environment, port, console)
-    console.clear()
+    try:
+        if prebuilt or hex_file is not None:
+            image = _upload_ready_built(read_image(hex_file or PREBUILT), port, console)
+        else:
+            image = _build_and_upload(environment, port, console)
+    finally:
+        console.clear()
     hello = _prove(port, image, console)
     click.echo(f"{'port':18} {port}")
     click.echo(f"{'firmware':18} {image.identity.version}")
@@ -69,6 +67,14 @@ def _usable_port(named: str | None) -> str:
     port = named or choose_port(simulated_will_do=False)
     open_port(port).close()
     return port
+
+
+def _upload_ready_built(image: Image, port: str, console: Console) -> Image:
+    from linkpose.flashing.upload import upload_with_avrdude
+
+    _announce(console, image, port)
+    upload_with_avrdude(image, port, _shows_upload(console))
+    return image
 
 
 def _announce(console: Console, image: Image, port: str) -> None:

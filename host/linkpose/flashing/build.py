@@ -100,6 +100,6 @@ def _why_not_built(output: str) -> str:
     if "Compiling" not in output and UNREACHABLE.search(output):
         return f"the firmware was not built: {TOOLCHAIN_UNREACHABLE}"
     lines = [line.strip() for line in output.splitlines() if line.strip()]
-    errors = [line for line in lines if re.search(r"\berror\b", line, re.IGNORECASE)]
+    errors = [line for line in lines if re.search(r"\berror\b|undefined reference", line, re.IGNORECASE)]
     said = (errors or lines[-1:] or ["no reason"])[0]
     return f"PlatformIO did not build the firmware ({said}); see all of it with -v, or type `linkpose flash --prebuilt`"
