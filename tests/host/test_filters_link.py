@@ -12,7 +12,7 @@ from linkpose import filters
 from linkpose.errors import LinkposeError
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Rig
+from linkpose.sensors.rig import Imu, Joint, Rig
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.messages import SampleFlags, Sensors
 
@@ -122,7 +122,7 @@ def test_test_1_reaches_the_papers_figure():
 # ---- one result, however it is cut ----
 
 
-@pytest.mark.parametrize("name", filters.NAMES)
+@pytest.mark.parametrize("name", [*PAPER, "joint-inertial"])
 def test_blocks_of_any_length_give_the_same_bits(name):
     run, block = recorded(3, 1)
     whole = filters.create(name, run.rig).process(block)
@@ -216,6 +216,8 @@ def test_joint_at_other_rates(rate_hz):
 def test_without_j2s_the_reason_and_the_cure_are_named():
     with pytest.raises(filters.CannotRun, match=r"calibrate joint.*--j2s X,Y,Z"):
         filters.create("joint", Rig())
+    with pytest.raises(filters.CannotRun, match="joint-inertial"):
+        filters.create("joint", Rig(joint=Joint((0.0, 0.0, 0.0), 1.0)))
     with pytest.raises(filters.CannotRun, match="BMP180"):
         filters.create("baro", Rig(), Sensors.MPU6050)
     with pytest.raises(LinkposeError, match="joint, tilt"):

@@ -77,6 +77,8 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST
         raise CannotRun(f"{name} needs the {missing.name}, which does not answer: check its wiring")
     if entry.needs_j2s and rig.joint.j2s_m is None:
         raise CannotRun(f"{name} needs J2S: type `linkpose calibrate joint`, or give it with --j2s X,Y,Z")
+    if name == "joint" and rig.joint.known_j2s_m is None:
+        raise CannotRun("joint needs a J2S that is known; joint-inertial is the filter that estimates it")
     if entry.needs_mice:
         _check_mice(rig, sensors, mice)
     made: Filter = getattr(importlib.import_module(f"linkpose.filters.{entry.module}"), entry.cls)(rig)

@@ -128,6 +128,12 @@ def cross_square(v: Vec, scale: float) -> Sym:
 
 
 @compiled
+def outer(v: Vec) -> Sym:
+    """v vᵀ"""
+    return (v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2])
+
+
+@compiled
 def parallel(a: Sym, b: Sym, a_plus_b_inverse: Sym) -> Sym:
     """a (a + b)⁻¹ b, symmetric, and positive where a and b are: a covariance corrected without a subtraction."""
     i = a_plus_b_inverse

@@ -49,7 +49,7 @@ class BaroFilter:
     def __init__(self, rig: Rig) -> None:
         self.state = StartState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.j2s_m or (0.0, 0.0, 0.0)
+        self._j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
         self._noise_Pa = rig.baro.pressure_noise_Pa
 
     @property

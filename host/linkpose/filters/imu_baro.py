@@ -62,7 +62,7 @@ class ImuBaroFilter:
         self._start = StartState.fresh()
         self._vertical = VerticalState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.j2s_m or (0.0, 0.0, 0.0)
+        self._j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
         self._noise_Pa = rig.baro.pressure_noise_Pa
 
     @property

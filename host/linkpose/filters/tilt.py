@@ -86,7 +86,7 @@ class TiltFilter:
         self.parameters = parameters or TiltParameters()
         self.state = TiltState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.j2s_m or (math.nan, math.nan, math.nan)
+        self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
 
     @property
     def rejected(self) -> int:

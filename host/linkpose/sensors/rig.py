@@ -14,12 +14,20 @@ from linkpose.errors import LinkposeError
 
 Vector = tuple[float, float, float]
 
+_GUESS_M = 0.1  # a J2S known no better is of no use but as a start
+
 
 @dataclass(frozen=True, slots=True)
 class Joint:
     """The link's joint."""
 
     j2s_m: Vector | None = None  # from the joint centre to the sensor, in the sensor's frame (m)
+    j2s_std_m: float = 0.0001  # how well that is known, each axis (m)
+
+    @property
+    def known_j2s_m(self) -> Vector | None:
+        """J2S, None where it is a guess from which it is to be estimated."""
+        return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +136,7 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         values[key] = (
             _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
         )
-        if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "counts_per_m")) and values[key] <= 0:
+        if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "_std_m", "counts_per_m")) and values[key] <= 0:
             raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be above 0")
         if key == "accel_scale" and min(values[key]) <= 0:
             raise LinkposeError(f"{origin}: {name}.{key} is {value}; each axis must be above 0")

@@ -1,0 +1,146 @@
+"""joint-inertial: its figures on the paper's Tests, an unknown J2S, a start in motion, and what no input may do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from linkpose.filters.joint_inertial import JointInertialFilter
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Joint, Rig
+from linkpose.simulation.link import PAPER_J2S_M, LinkRun, LinkTruth
+
+UNKNOWN = Rig(joint=Joint((0.0, 0.0, 0.0), 1.0))
+
+
+@lru_cache(maxsize=40)
+def recorded(test: int, seed: int, errors: str = "calibrated") -> tuple[Measurements, LinkTruth]:
+    run = LinkRun(test, seed, errors=errors)
+    return run.measurements(), run.truth()
+
+
+def rows(block: Measurements, kept) -> Measurements:
+    return Measurements(*(np.ascontiguousarray(getattr(block, name)[kept]) for name in block.__slots__))
+
+
+def rmse_cm(estimate, height_m) -> float:
+    return 100 * float(np.sqrt(np.mean((estimate[:, 0] - height_m) ** 2)))
+
+
+def errors_cm(test: int, errors: str, rig: Rig, part: slice) -> list[float]:
+    found = []
+    for seed in range(5):
+        block, truth = recorded(test, seed, errors)
+        found.append(rmse_cm(JointInertialFilter(rig).process(block)[part], truth.height_m[part]))
+    return found
+
+
+@pytest.mark.parametrize("test", [1, 2, 3])
+def test_the_papers_tests(test):
+    whole, rig = slice(None), Rig().with_j2s(PAPER_J2S_M)
+    assert np.mean(errors_cm(test, "calibrated", rig, whole)) <= 0.12
+    assert np.mean(errors_cm(test, "datasheet", rig, whole)) <= 2.0
+    assert np.mean(errors_cm(test, "calibrated", UNKNOWN, slice(3250, None))) <= 0.35
+
+
+def test_j2s_is_found_from_nothing():
+    block, _ = recorded(3, 0)
+    f = JointInertialFilter(UNKNOWN)
+    f.process(block)
+    found, covariance = f.j2s_m
+    assert found == pytest.approx(PAPER_J2S_M, abs=0.008)
+    assert np.all(np.linalg.eigvalsh(covariance) > 0)
+
+
+def test_its_standard_deviation_is_true():
+    """Normalised estimation error squared of the height, mean over the runs."""
+    nees = []
+    for test in (1, 2, 3):
+        for seed in range(5):
+            block, truth = recorded(test, seed)
+            estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(block)
+            nees.append(np.mean(((estimate[:, 0] - truth.height_m) / estimate[:, 1]) ** 2))
+    assert 0.5 <= np.mean(nees) <= 2
+
+
+@pytest.mark.parametrize("first", [700, 1000, 2500])
+@pytest.mark.parametrize("test", [1, 2, 3])
+def test_start_in_motion_with_an_unknown_gyro_bias(test, first):
+    block, truth = recorded(test, 3)
+    bias = np.radians([10.0, -10.0, 7.0])
+    part = slice(first, first + 3000)
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    estimate = f.process(replace(block, gyro_rad_s=block.gyro_rad_s + bias)[part])
+    assert rmse_cm(estimate[1500:], truth.height_m[part][1500:]) < 0.5
+    assert f.gyro_bias_rad_s == pytest.approx(bias, abs=np.radians(0.3))
+
+
+@pytest.mark.parametrize("j2s_m", [(0.05, 0.0, 0.0), (0.2, 0.1, -0.3), (0.0, 0.0, 2.0)])
+def test_short_and_long_links(j2s_m):
+    run = LinkRun(2, 1, 30.0, j2s_m=j2s_m)
+    estimate = JointInertialFilter(run.rig).process(run.measurements())
+    assert rmse_cm(estimate, run.truth().height_m) < 0.3 * np.linalg.norm(j2s_m)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 200, 500])
+def test_other_rates(rate_hz):
+    run = LinkRun(2, 1, 20.0, rate_hz)
+    assert rmse_cm(JointInertialFilter(run.rig).process(run.measurements()), run.truth().height_m) < 0.2
+
+
+def test_lost_samples_and_a_hole_of_seconds():
+    block, truth = recorded(1, 0)
+    kept = np.random.default_rng(2).random(len(block)) > 0.1
+    kept[2000:2400] = False
+    estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(rows(block, kept))
+    error = 100 * np.abs(estimate[:, 0] - truth.height_m[kept])
+    at = truth.time_s[kept]
+    assert error[at < 20].max() < 1.0
+    assert error[at > 26].max() < 1.0
+
+
+def test_unusable_readings_are_passed_by_prediction_and_counted():
+    block, truth = recorded(1, 0)
+    rng = np.random.default_rng(1)
+    accel, gyro = block.accel_m_s2.copy(), block.gyro_rad_s.copy()
+    accel[rng.random(len(block)) < 0.05] = np.nan
+    gyro[rng.random(len(block)) < 0.02] = np.inf
+    accel[3000:3030], gyro[4000:4030] = np.nan, np.nan
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    estimate = f.process(replace(block, accel_m_s2=accel, gyro_rad_s=gyro))
+    unusable = ~(np.isfinite(accel).all(axis=1) & np.isfinite(gyro).all(axis=1))
+    assert f.rejected == unusable.sum()
+    assert rmse_cm(estimate, truth.height_m) < 0.5
+
+
+def test_spikes_are_refused():
+    block, truth = recorded(1, 0)
+    accel = block.accel_m_s2.copy()
+    accel[500::200, 0] += 60.0
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    estimate = f.process(replace(block, accel_m_s2=accel))
+    assert f.rejected >= len(accel[500::200])
+    assert rmse_cm(estimate, truth.height_m) < 0.5
+
+
+def test_repeated_stamps_change_nothing():
+    block, _ = recorded(1, 0)
+    twice = np.sort(np.concatenate([np.arange(len(block)), np.arange(500, 600)]))
+    rig = Rig().with_j2s(PAPER_J2S_M)
+    plain, doubled = JointInertialFilter(rig).process(block), JointInertialFilter(rig).process(rows(block, twice))
+    assert np.array_equal(plain[-1], doubled[-1])
+
+
+def test_garbage_is_survived_and_forgotten():
+    block, truth = recorded(1, 0)
+    rng = np.random.default_rng(3)
+    accel, gyro = block.accel_m_s2.copy(), block.gyro_rad_s.copy()
+    accel[:3000], gyro[:3000] = rng.normal(0, 1e3, (3000, 3)), rng.normal(0, 1e3, (3000, 3))
+    estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(
+        replace(block, accel_m_s2=accel, gyro_rad_s=gyro)
+    )
+    assert np.isfinite(estimate).all()
+    assert 100 * np.abs(estimate[-300:, 0] - truth.height_m[-300:]).max() < 2
