@@ -290,7 +290,22 @@ def test_a_reader_that_goes_away_is_no_traceback(recording):
     done = subprocess.run(command, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert done.returncode == 1
-    assert "Traceback" not in done.stderr and "Exception" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1] == "linkpose: the reader of the estimates has gone; stopped"
+
+
+def test_a_recording_ends_well_when_the_reader_of_its_estimates_goes_away(tmp_path):
+    path = tmp_path / "r.csv"
+    command = [*CLI, "estimate", "--live", "--port", "sim://link", "--record", path, "-q"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, env=ENVIRONMENT, text=True, **pipes) as process:
+        assert process.stdout is not None and process.stderr is not None
+        for _ in range(50):
+            process.stdout.readline()
+        process.stdout.close()
+        assert "has gone" in process.stderr.read()
+    assert process.returncode == 1
+    closing = read_table(path, "recording").closing
+    assert closing is not None and closing["ended"] == "failure"
 
 
 def test_kill_9_at_any_moment_leaves_a_readable_file(tmp_path):

@@ -74,9 +74,6 @@ def main() -> None:
     except LinkposeError as error:
         click.echo(f"linkpose: {error}", err=True)
         status = 1
-    except BrokenPipeError:  # the reader of our output has gone, as in `linkpose ... | head`
-        sys.stderr.close()
-        status = 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):
             raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -101,7 +102,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         _tell_left_out(estimator, console)
         estimates = estimator.process(measurements)
     head = {"recording": str(path), "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
-    with _sink(estimator, request, head) as sink:
+    with _Sink(estimator, request, head) as sink:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_rejected(estimator)})
     if request.output:
@@ -133,7 +134,7 @@ def _live(
             estimator.warm_up()
         recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
         head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
-        sink = stack.enter_context(_sink(estimator, request, head))
+        sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress))
 
         def handle(placements: list[Placement]) -> None:
@@ -187,16 +188,15 @@ class _Sink:
             self._file = EstimateWriter(request.output, head, estimator.columns, request.force)
         self._prints = self._file is None and not self._json and not sys.stdout.isatty()
         if self._prints:
-            sys.stdout.write(csv_head("estimate", head, estimator.columns))
+            _print(csv_head("estimate", head, estimator.columns))
 
     def write(self, estimates: Any) -> None:
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
-            sys.stdout.write(self._estimator.text(estimates))
-            sys.stdout.flush()
+            _print(self._estimator.text(estimates))
         if self._json:
-            click.echo("\n".join(json.dumps(row) for row in self._estimator.objects(estimates)))
+            _print("".join(json.dumps(row) + "\n" for row in self._estimator.objects(estimates)))
 
     def close(self, closing: dict[str, Any]) -> None:
         if self._file is not None:
@@ -210,8 +210,11 @@ class _Sink:
             self._file.__exit__()
 
 
-def _sink(estimator: Estimator, request: Request, head: dict[str, Any]) -> _Sink:
+def _print(text: str) -> None:
+    """Puts results on stdout at once. Raises LinkposeError when their reader has gone, as in `linkpose ... | head`."""
     try:
-        return _Sink(estimator, request, head)
-    except OSError as error:
-        raise LinkposeError(f"cannot write the estimates: {error.strerror}") from error
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has nowhere to go
+        raise LinkposeError("the reader of the estimates has gone; stopped") from None

@@ -82,20 +82,22 @@ class Recorder:
         return rows
 
     def close(self, ended: str) -> None:
-        """Writes the closing line."""
-        if self._writer is not None:
+        """Writes the closing line: "duration", "interrupted" or "failure"."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
             health = self._session.health()
             status = health.status
             board = {"frames_dropped": status.frames_dropped, "ticks_missed": status.ticks_missed} if status else None
             timeline = self._session.timeline
-            self._writer.close(closing(timeline, health.corrupt, health.drift_ppm, board=board, ended=ended))
+            with writer:
+                writer.close(closing(timeline, health.corrupt, health.drift_ppm, board=board, ended=ended))
 
     def __enter__(self) -> Recorder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.__exit__()
+        with contextlib.suppress(LinkposeError):  # the failure that brought us here is on its way to the user
+            self.close("failure")
 
 
 def run(session: Session, duration_s: float | None, handle: Callable[[list[Placement]], None]) -> str:
