@@ -20,8 +20,7 @@ Sampler::Sampler(const wire::Configure& settings, Mice& mice)
 
 void Sampler::configure(const wire::Configure& settings) {
   settings_ = settings;
-  imu_.configure(imu_settings(settings));
-  baro_.configure(settings.baro_oversampling);
+  configure_due_ = true;
   clock::set_rate(settings.sample_rate_hz);
 }
 
@@ -62,7 +61,19 @@ void Sampler::take_burst() {
     imu_.accept_burst(state == twi::State::kDone, twi::burst_data(), clock::now_us(), reading_);
   }
   if (twi::down()) twi::free_bus();
+  tell_sensors();
   phase_ = Phase::kImuRequests;
+}
+
+// What the host wants of the sensors waits until no transaction runs, whose answer would be taken for that of another.
+void Sampler::tell_sensors() {
+  if (request_running_) return;
+  if (configure_due_) {
+    imu_.configure(imu_settings(settings_));
+    baro_.configure(settings_.baro_oversampling);
+  }
+  if (self_test_due_) imu_.start_self_test();
+  configure_due_ = self_test_due_ = false;
 }
 
 // Gives the bus to the IMU's driver, then to the barometer's, until neither wants it: what the barometer is told last is

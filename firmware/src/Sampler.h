@@ -17,7 +17,7 @@ class Sampler {
   void configure(const wire::Configure& settings);
   void start();
   void stop() { streaming_ = false; }
-  void self_test() { imu_.start_self_test(); }
+  void self_test() { self_test_due_ = true; }
 
   const wire::Configure& settings() const { return settings_; }
   bool streaming() const { return streaming_; }
@@ -32,6 +32,7 @@ class Sampler {
 
   void begin_tick(const clock::Tick& tick);
   void take_burst();
+  void tell_sensors();
   bool requests_pending();
   void finish_request(bool ok);
   void send_sample();
@@ -48,6 +49,8 @@ class Sampler {
   Phase phase_ = Phase::kQuiet;
   bool sample_due_ = false;
   bool streaming_ = false;
+  bool configure_due_ = false;
+  bool self_test_due_ = false;
   bool request_running_ = false;
   bool request_is_imu_ = false;
 };

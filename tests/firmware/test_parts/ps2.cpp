@@ -257,9 +257,20 @@ TEST_CASE("PS/2 mouse: set up as wanted, and its settings read back") {
   CHECK(rig.driver.counts_per_mm() == 8);
   CHECK(rig.driver.report_rate_hz() == 100);
   CHECK(rig.mouse.log == Bytes{0xF6, 0xF6, 0xF2, 0xE6, 0xE8, 3, 0xF3, 100, 0xF0, 0xE9});
+}
+
+TEST_CASE("PS/2 mouse: a new resolution waits for the poll that runs, and every step of the set-up is taken") {
+  Rig rig;
+  rig.start();
+  rig.mouse.x = 7;
+  const Ps2Mouse::Request poll = rig.driver.next();
   rig.driver.configure(2);
-  rig.step();
-  REQUIRE(rig.start());
+  rig.driver.finish(rig.mouse.play(poll, rig.received));
+  CHECK(rig.driver.dx() == 7);
+  rig.mouse.log.clear();
+  for (int i = 0; i < 9; i++) rig.step();
+  CHECK(rig.mouse.log == Bytes{0xF6, 0xF2, 0xE6, 0xE8, 1, 0xF3, 100, 0xF0, 0xE9});
+  CHECK(rig.driver.valid());
   CHECK(rig.driver.counts_per_mm() == 2);
 }
 

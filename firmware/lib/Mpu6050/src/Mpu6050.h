@@ -34,7 +34,7 @@ class Mpu6050 {
 
   explicit Mpu6050(const Settings& settings) : settings_(settings) {}
 
-  // Takes effect at once: the sensor is set up again.
+  // Both not while a transaction runs. The sensor is set up again; a self-test that runs is given up.
   void configure(const Settings& settings);
   void start_self_test();
   // True once for each self-test that came to its end.

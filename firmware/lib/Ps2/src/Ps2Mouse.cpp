@@ -56,7 +56,7 @@ uint8_t resolution_code(uint8_t counts_per_mm) {
 
 void Ps2Mouse::configure(uint8_t counts_per_mm) {
   wanted_resolution_ = counts_per_mm;
-  if (running()) set_up();
+  set_up_wanted_ = true;
 }
 
 void Ps2Mouse::set_up() {
@@ -77,10 +77,9 @@ uint8_t Ps2Mouse::set_up_byte() const {
 }
 
 Ps2Mouse::Request Ps2Mouse::next() {
-  if (reset_wanted_) {
-    reset_wanted_ = false;
-    begin_reset();
-  }
+  if (set_up_wanted_ && state_ >= State::kSetUp) set_up();
+  if (reset_wanted_) begin_reset();
+  set_up_wanted_ = reset_wanted_ = false;
   switch (state_) {
     case State::kListen: return {false, 0, 2, kPowerOnUs};
     case State::kProbe: return {true, kSetDefaults, 1, kAnswerUs};

@@ -88,6 +88,7 @@ class Ps2Mouse {
   uint8_t partial_count_ = 0;
   uint8_t partial_[3];       // of a packet, before a byte of bad parity
   uint8_t repeat_ = 0;       // bytes expected after a RESEND
+  bool set_up_wanted_ = false;
   bool reset_wanted_ = false;
   bool tried_ = false;
   bool ever_found_ = false;
