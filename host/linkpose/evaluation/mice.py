@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from linkpose.filters.mice import MiceFilter, MiceParameters
-from linkpose.sensors.conversion import Converter, Settings
-from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.simulation import board
+from linkpose.sensors.measurements import Floats
 from linkpose.simulation.mice import PAPER_ERRORS, PAPER_NOISE_M_S, PAPER_SIDE_M, MiceRun, ring
 
 QUANTITIES = ("vx", "vy", "wz")
@@ -51,10 +49,7 @@ def paper_run(mice: int, seed: int) -> PaperRun:
     """The robot of the paper's chapter 4 at (1, 1) cm/s, each mouse with noise within ± 0.25 cm/s."""
     placed = ring(mice, RADIUS_M, COUNTS_PER_M)
     run = MiceRun(seed, DURATION_S, mice=placed, path="paper", errors="none", mouse_errors=PAPER_ERRORS)
-    settings = Settings.of(board.hello(board.DEFAULTS, mice=run.hello_mice))
-    converter = Converter(settings)
-    rows = [converter.row(s, s.seq / run.rate_hz, s.seq, s.flags) for s in run.samples()]
-    measurements = Measurements.of(rows)
+    measurements = run.measurements()
     parameters = MiceParameters(scatter=0.0, floor=0.0, mismatch=0.0, noise_m_s=PAPER_NOISE_M_S / math.sqrt(3))
     fused = MiceFilter(run.rig, parameters).process(measurements)[1:, :3]
     velocity = measurements.mice_counts[1:] / COUNTS_PER_M * run.rate_hz

@@ -216,7 +216,7 @@ def bias_doubt(learnt_s: float) -> float:
 
 @compiled
 def fault_limit(freedom: int) -> float:
-    """χ² that sound mice exceed once in a million tests (Wilson and Hilferty 1931)."""
+    """χ² that sound mice exceed once in a million tests, or less (Wilson and Hilferty 1931)."""
     part = 2.0 / (9.0 * freedom)
     return float(freedom * (1.0 - part + _FAULT_Z * math.sqrt(part)) ** 3)
 

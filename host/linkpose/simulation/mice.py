@@ -15,6 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.sensors import bmp180
+from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation import imu
@@ -290,6 +293,17 @@ class MiceRun:
             count = _BLOCK if self.count is None else min(_BLOCK, self.count - first)
             yield from self.block(first, count)
             first += count
+
+    def measurements(self) -> Measurements:
+        """The whole run as a recording of it would be read. Only of a run that ends."""
+        if self.count is None:
+            raise LinkposeError("a run without an end has no whole recording: give it a duration")
+        no_baro = bmp180.Calibration(*[0] * len(bmp180.Calibration._fields))
+        ranges = (self.accel_range_g, self.gyro_range_deg_s)
+        converter = Converter(Settings(round(self.rate_hz), *ranges, 0, 0, no_baro, len(self.mice)))
+        return Measurements.of(
+            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
+        )
 
 
 def _drive(path: str, seed: int, duration_s: float | None, length_m: float) -> Drive:

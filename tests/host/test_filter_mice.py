@@ -1,0 +1,253 @@
+"""The N-mouse least squares: the paper's equations, what redundancy buys, and the faults that it must find."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from linkpose import filters
+from linkpose.errors import LinkposeError
+from linkpose.evaluation.mice import redundancy
+from linkpose.filters.mice import MiceFilter, MiceParameters, fault_limit
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Mouse, Rig
+from linkpose.simulation.mice import Fault, MiceRun, ring
+from linkpose.wire.messages import SampleFlags, Sensors
+
+VELOCITY = slice(0, 3)
+STD = slice(3, 6)
+POSE = slice(6, 9)
+EXCLUDED = 9
+EVEN = MiceParameters(scatter=0.0, floor=0.0, mismatch=0.0, noise_m_s=1.0)  # all mice alike, and no fault in sight
+
+
+@lru_cache(maxsize=20)
+def recorded(seed: int = 1, faults: tuple[Fault, ...] = (), mice: int = 3) -> tuple[MiceRun, Measurements]:
+    run = MiceRun(seed, 30.0, mice=ring(mice), faults=faults)
+    return run, run.measurements()
+
+
+def estimate(run: MiceRun, block: Measurements, *mice: Mouse) -> np.ndarray:
+    return MiceFilter(Rig(mouse=mice) if mice else run.rig).process(block)
+
+
+def counted(counts, dt: float = 0.01, gyro_z: float = math.nan, flags=None) -> Measurements:
+    """Samples with the given counts (N, M, 2)."""
+    counts = np.ascontiguousarray(counts, float)
+    n = len(counts)
+    gyro = np.full((n, 3), math.nan)
+    if not math.isnan(gyro_z):
+        gyro[:] = (0.0, 0.0, gyro_z)
+    none = np.full(n, math.nan)
+    return Measurements(
+        dt * np.arange(n), np.full((n, 3), math.nan), gyro, none, none, none, np.zeros(n, bool), counts,
+        np.zeros(n, np.uint16) if flags is None else np.asarray(flags, np.uint16),
+    )  # fmt: skip
+
+
+def velocity(mice: tuple[Mouse, ...], each_m_s) -> np.ndarray:
+    """What the filter makes of one sample in which the mice have these velocities (M, 2)."""
+    counts = np.zeros((2, len(mice), 2))
+    counts[1] = np.asarray(each_m_s) * 0.01 * np.array([m.counts_per_m for m in mice])[:, None]
+    return MiceFilter(Rig(mouse=mice), EVEN).process(counted(counts))[1]
+
+
+# ---- the paper's equations ----
+
+
+def test_the_paper_s_triangle_gives_its_inverse_jacobian_column_by_column():
+    d, mice = 0.2, ring(3, 0.2)
+    columns = [velocity(mice, np.eye(6)[k].reshape(3, 2))[VELOCITY] for k in range(6)]
+    expected = np.zeros((3, 6))  # (14), with l² = 3d²
+    for i, mouse in enumerate(mice):
+        expected[0, 2 * i], expected[1, 2 * i + 1] = 1 / 3, 1 / 3
+        expected[2, 2 * i : 2 * i + 2] = -mouse.y_m / (3 * d**2), mouse.x_m / (3 * d**2)
+    np.testing.assert_allclose(np.array(columns).T, expected, atol=1e-12)
+
+
+def test_the_estimate_of_three_equal_mice_is_the_mean_of_what_each_says():
+    d, mice = 0.17, ring(3, 0.17)
+    v = np.random.default_rng(0).normal(0, 0.3, (3, 2))
+    theta = 2 * math.pi / 3 * np.arange(3)
+    w = (-np.sin(theta) * v[:, 0] + np.cos(theta) * v[:, 1]) / d  # (17)
+    np.testing.assert_allclose(velocity(mice, v)[VELOCITY], [*v.mean(axis=0), w.mean()], atol=1e-12)  # (16)
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_any_placement_and_any_mounting_angle_gives_the_motion_back(count):
+    rng = np.random.default_rng(count)
+    mice = tuple(
+        Mouse(*rng.uniform(-0.2, 0.2, 2), angle_deg=rng.uniform(-180, 180), counts_per_m=rng.uniform(4000, 16000))
+        for _ in range(count)
+    )
+    vx, vy, w = 0.31, -0.12, 1.4
+    own = []
+    for mouse in mice:
+        v = np.array([vx - w * mouse.y_m, vy + w * mouse.x_m])
+        c, s = math.cos(math.radians(mouse.angle_deg)), math.sin(math.radians(mouse.angle_deg))
+        own.append([c * v[0] + s * v[1], -s * v[0] + c * v[1]])
+    np.testing.assert_allclose(velocity(mice, own)[VELOCITY], [vx, vy, w], atol=1e-9)
+
+
+def test_a_full_circle_closes_by_the_exact_arc():
+    mice = ring(3, 0.2, counts_per_m=1e6)
+    steps, w, v = 400, 2 * math.pi / 4.0, 0.5
+    each = np.array([[v - w * mouse.y_m, w * mouse.x_m] for mouse in mice]) * 0.01 * 1e6
+    counts = np.concatenate([np.zeros((1, 3, 2)), np.tile(each, (steps, 1, 1))])
+    poses = MiceFilter(Rig(mouse=mice), EVEN).process(counted(counts))[:, POSE]
+    np.testing.assert_allclose(poses[-1], [0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(poses[steps // 2, :2], [0, 2 * v / w], atol=1e-9)  # the far side of the circle
+
+
+def test_three_mice_have_one_over_root_three_of_one_mouse_s_noise():
+    for row in redundancy(3, 3):
+        assert row.theory_ratio == pytest.approx(1 / math.sqrt(3))
+        assert row.ratio == pytest.approx(1 / math.sqrt(3), rel=0.05)
+
+
+def test_the_standard_deviation_is_honest():
+    run, block = recorded()
+    out = estimate(run, block)[1:]
+    middle = run.at(block.time_s[1:] - 0.5 / run.rate_hz)
+    truth = np.column_stack([middle.vx_m_s, middle.vy_m_s, middle.wz_rad_s])
+    nees = np.mean(((out[:, VELOCITY] - truth) / out[:, STD]) ** 2, axis=0)
+    assert (nees > 0.5).all() and (nees < 1.5).all()
+
+
+# ---- faults ----
+
+
+@pytest.mark.parametrize("kind", ["lift", "slip", "unplug"])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_faulty_mouse_is_found_within_a_fifth_of_a_second_left_out_and_taken_back(kind, seed):
+    port = seed % 3 + 1
+    run, block = recorded(seed, (Fault(kind, port, 13.0, 18.0),))
+    truth = run.at(block.time_s)
+    moving = np.hypot(truth.vx_m_s, truth.vy_m_s) + 0.1 * np.abs(truth.wz_rad_s) > 0.05
+    t0 = block.time_s[(block.time_s >= 13.0) & moving][0]
+    out = estimate(run, block)
+    during = (block.time_s > t0 + 0.2) & (block.time_s < 18.0)
+    assert (out[during, EXCLUDED] == 1 << (port - 1)).all()
+    assert (out[block.time_s < 13.0, EXCLUDED] == 0).all()
+    assert (out[block.time_s > 20.0, EXCLUDED] == 0).all()
+    # After the finding, the error is that of the two that remain.
+    counts = block.mice_counts.copy()
+    counts[:, port - 1] = math.nan
+    without = estimate(run, replace(block, mice_counts=counts))
+    v = np.column_stack([truth.vx_m_s, truth.vy_m_s])
+    error, least = (np.hypot(*(e[during, :2] - v[during]).T) for e in (out, without))
+    assert np.sqrt(np.mean(error**2)) <= 1.3 * np.sqrt(np.mean(least**2))
+
+
+def test_a_lifted_mouse_is_found_at_the_paper_s_walking_pace_of_a_snail():
+    run = MiceRun(0, 15.0, path="paper", faults=(Fault("lift", 2, 5.0, 10.0),))
+    block = run.measurements()
+    excluded = estimate(run, block)[:, EXCLUDED]
+    assert (excluded[(block.time_s > 5.2) & (block.time_s < 10.0)] == 2).all()
+    assert (excluded[block.time_s < 5.0] == 0).all() and excluded[-1] == 0
+
+
+def test_sound_mice_are_not_accused_though_their_calibration_is_a_few_percent_off():
+    run = MiceRun(0, 60.0, errors="datasheet", mice=ring(4))
+    assert (estimate(run, run.measurements())[:, EXCLUDED] == 0).all()
+
+
+def test_two_mice_that_disagree_are_told_apart_only_with_the_gyro():
+    run, block = recorded(3, (Fault("lift", 1, 13.0, 18.0),), 2)
+    during = (block.time_s > 14.0) & (block.time_s < 18.0)
+    assert (estimate(run, block)[during, EXCLUDED] == 1).all()
+    blind = replace(block, gyro_rad_s=np.full_like(block.gyro_rad_s, math.nan))
+    assert (estimate(run, blind)[during, EXCLUDED] == 0).all()
+
+
+def test_an_overflowed_count_is_not_used():
+    counts = np.full((4, 3, 2), 10.0)
+    counts[2, 1] = 32767.0
+    flags = [0, 0, int(SampleFlags.MOUSE2_OVERFLOW), 0]
+    out = MiceFilter(Rig(mouse=ring(3))).process(counted(counts, flags=flags))
+    assert out[:, EXCLUDED].tolist() == [0, 0, 2, 0]
+    assert out[2, 0] == pytest.approx(out[1, 0])
+
+
+def test_the_fault_limit_is_a_chi_square_quantile():
+    for freedom in (1, 3, 5):
+        assert 1e-7 < chi2.sf(fault_limit(freedom), freedom) < 1.1e-6
+
+
+# ---- one mouse, no mouse, gaps ----
+
+
+def test_one_mouse_takes_the_rate_from_the_gyro():
+    mice = (Mouse(0.1, -0.05),)
+    vx, vy, w = 0.4, 0.0, 0.7
+    each = np.array([[vx - w * mice[0].y_m, vy + w * mice[0].x_m]]) * 0.01 * 8000
+    out = MiceFilter(Rig(mouse=mice)).process(counted(np.tile(each, (5, 1, 1)), gyro_z=w))
+    np.testing.assert_allclose(out[-1, VELOCITY], [vx, vy, w], atol=1e-9)
+    blind = MiceFilter(Rig(mouse=mice)).process(counted(np.tile(each, (5, 1, 1))))
+    assert np.isnan(blind[:, VELOCITY]).all()
+
+
+def test_without_any_mouse_the_velocity_stands_for_half_a_second_and_is_unknown_then():
+    counts = np.full((200, 3, 2), 40.0)
+    counts[100:, :] = math.nan
+    filter_ = MiceFilter(Rig(mouse=ring(3)))
+    out = filter_.process(counted(counts))
+    np.testing.assert_allclose(out[100:149, 0], out[99, 0])
+    assert (np.diff(out[100:149, STD], axis=0) > 0).all()
+    assert np.isnan(out[160:, VELOCITY]).all() and (out[160:, 6] == out[-1, 6]).all()
+    assert (out[100:, EXCLUDED] == 7).all()
+    assert filter_.rejected == 100
+
+
+def test_counts_after_lost_samples_cover_one_interval_and_the_gap_is_bridged():
+    counts = np.full((100, 3, 2), 40.0)
+    whole = counted(counts)
+    keep = np.r_[0:50, 60:100]
+    flags = np.zeros(len(keep), np.uint16)
+    flags[50] = int(SampleFlags.GAP_BEFORE)
+    holey = replace(counted(counts[keep], flags=flags), time_s=whole.time_s[keep])
+    full, out = (MiceFilter(Rig(mouse=ring(3))).process(block) for block in (whole, holey))
+    np.testing.assert_allclose(out[50, VELOCITY], full[60, VELOCITY], atol=1e-9)
+    np.testing.assert_allclose(out[-1, POSE], full[-1, POSE], atol=1e-9)
+
+
+def test_a_time_that_does_not_go_on_changes_nothing():
+    block = counted(np.full((10, 3, 2), 40.0))
+    again = replace(block, time_s=np.r_[block.time_s[:6], block.time_s[5], block.time_s[6:9]])
+    filter_ = MiceFilter(Rig(mouse=ring(3)))
+    out = filter_.process(again)
+    assert filter_.rejected == 1
+    np.testing.assert_array_equal(out[6, POSE], out[5, POSE])
+
+
+@pytest.mark.parametrize("size", [1, 7, 1000])
+def test_blocks_of_any_size_give_the_same_to_the_bit(size):
+    run, block = recorded(2, (Fault("lift", 3, 13.0, 18.0),))
+    whole = estimate(run, block)
+    filter_ = MiceFilter(run.rig)
+    parts = [filter_.process(block[at : at + size]) for at in range(0, len(block), size)]
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+# ---- what can run ----
+
+
+@pytest.mark.parametrize(
+    ("mice", "ports", "sensors", "reason"),
+    [
+        ((), 3, Sensors.MPU6050, "does not say where the mice sit"),
+        (ring(3), 0, Sensors.MPU6050, "no mouse gives counts"),
+        (ring(1), 1, Sensors(0), "cannot tell a turn"),
+        ((Mouse(0.1, 0.2), Mouse(0.1, 0.2)), 2, Sensors.MPU6050, r"mice 1, 2 all sit at \(0.1, 0.2\) m"),
+    ],
+)
+@pytest.mark.parametrize("name", ["mice", "planar-ekf", "planar-ukf"])
+def test_what_cannot_run_says_why(name, mice, ports, sensors, reason):
+    with pytest.raises(filters.CannotRun, match=reason) as raised:
+        filters.create(name, Rig(mouse=mice), sensors, ports)
+    assert isinstance(raised.value, LinkposeError)
