@@ -109,7 +109,7 @@ def test_options_that_cannot_be_are_refused(dive, refused, options, reason):
         ("", "holds no measurements"),
         ("0,pose,0,0,0\n1,range,9,5,\n", "line 3: range to beacon 9, whose place is not known (known are 1, 2, 3, 4)"),
         ("0,odometry,1,0,\n1,range,1,5,\n", "add --start X,Y,HEADING"),
-        ("0,pose,0,0,0\n0,odometry,1,0,\n1,depth,5,,\n", "mixes a wheeled robot's odometry with a vehicle's depth"),
+        ("0,pose,0,0,0\n0,odometry,1,0,\n1,depth,5,,\n", "mixes a robot's odometry with a vehicle's depth"),
         ("0,pose,0,0,0\n1,range,1,nan,\n", "line 3: 'nan' is not a number"),
         ("1,pose,0,0,0\n0,range,1,5,\n", "line 3: time runs backwards"),
     ],
@@ -137,3 +137,33 @@ def test_the_same_seed_gives_the_same_files(linkpose, tmp_path, rig):
         linkpose("simulate", rig, "-o", out, "--truth", tmp_path / f"{name}_truth.csv", "--duration", 5, "--seed", seed)
         texts.append(out.read_text())
     assert texts[0] == texts[1] != texts[2]
+
+
+@pytest.mark.parametrize(("rig", "checks"), [("indoor", 0), ("underwater", 14)])
+def test_reproduce_prints_every_variant(linkpose, tmp_path, rig, checks):
+    picture = tmp_path / "variants.png"
+    result = linkpose("reproduce", rig, "--seeds", 1, "--json", "--plot", picture)
+    rows = [json.loads(line) for line in result.out.splitlines()]
+    assert [set(row) for row in rows[:checks]] == [{"check", "asked", "measured"}] * checks
+    variants = rows[checks:]
+    for row in variants:
+        assert {"filter", "noise", "correlation", "gate", "seeds", "position_rmse_m_mean"} <= set(row)
+        assert {"position_rmse_m_max", "heading_rmse_rad_mean"} <= set(row)
+        if row["gate"] is not None:
+            assert row["position_rmse_m_mean"] < 0.2
+    assert {row["filter"] for row in variants} == {"ekf", "ukf"}
+    assert {row["gate"] for row in variants} == {None, 0.997}
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_mice_as_odometry(indoor, linkpose, refused, tmp_path):
+    """The truth's velocities as an estimate of mice: the log's own odometry is not needed."""
+    log, grid, truth = indoor
+    table = read_table(truth)
+    mice = tmp_path / "mice.csv"
+    columns = zip(table.columns["time_s"], table.columns["vx_m_s"], table.columns["wz_rad_s"], strict=True)
+    rows = "".join(f"{t},{v},0,{w}\n" for t, v, w in columns)
+    mice.write_text(f"time_s,mice_vx_m_s,mice_vy_m_s,mice_wz_rad_s\n{rows}")
+    result = linkpose("localize", log, "--map", grid, "--odometry", mice, "--truth", truth, "--json")
+    assert json.loads(result.out)["position_rmse_m"] < 0.1
+    assert "no column mice_vx_m_s" in refused("localize", log, "--map", grid, "--odometry", truth)

@@ -13,15 +13,24 @@ from linkpose.localization import models
 from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
-from linkpose.localization.kalman import PLANAR_TWIST, SUBMERSIBLE, UNICYCLE, KalmanFilter, Measurement, Transform
+from linkpose.localization.kalman import (
+    HOLONOMIC,
+    PLANAR_TWIST,
+    SUBMERSIBLE,
+    UNICYCLE,
+    KalmanFilter,
+    Measurement,
+    Transform,
+)
 from linkpose.localization.linalg import wrap_angle
 from linkpose.localization.localizer import Settings, localize
 from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
+from linkpose.localization.odometry import with_mice_odometry
 from linkpose.simulation.indoor import office_map
 from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, simulate_underwater
 
 CONTROL, HOLD = np.array([0.8, 0.2]), np.array([0.1, 0.1])
-MOTIONS = {"unicycle": UNICYCLE, "submersible": SUBMERSIBLE, "planar_twist": PLANAR_TWIST}
+MOTIONS = {"unicycle": UNICYCLE, "holonomic": HOLONOMIC, "submersible": SUBMERSIBLE, "planar_twist": PLANAR_TWIST}
 
 
 def predicted(model, state, parameters, size, grid=None):
@@ -160,7 +169,7 @@ def test_beam_slopes_of_a_plain_wall():
 
 
 def test_model_numbers_differ():
-    motions = [models.UNICYCLE, models.SUBMERSIBLE, models.PLANAR_TWIST]
+    motions = [models.UNICYCLE, models.HOLONOMIC, models.SUBMERSIBLE, models.PLANAR_TWIST]
     sensors = [
         models.BEAMS,
         models.BEACON_RANGE,
@@ -169,7 +178,7 @@ def test_model_numbers_differ():
         models.MOUSE_VELOCITY,
         models.RATE_GYRO,
     ]
-    assert sorted(motions) == [0, 1, 2]
+    assert sorted(motions) == [0, 1, 2, 3]
     assert sorted(sensors) == [0, 1, 2, 3, 4, 5]
 
 
@@ -353,6 +362,26 @@ def test_rides_out_a_silence_of_the_beacons(name):
     error = np.linalg.norm(track.position_m - truth(track.time_s), axis=1)
     assert error[during] < 4 * spread[during]
     assert error[after:].max() < 0.3
+
+
+def test_mice_drive_a_robot_that_slides(tmp_path):
+    """A robot that faces along its circle's radius: all of its speed is aside, and only mice see that."""
+    log, beacons, truth = drive_among_beacons()
+    rows = "".join(f"{0.1 * i},{0 if i % 50 else ''},-1.0,0.2\n" for i in range(600))
+    path = tmp_path / "mice.csv"
+    path.write_text(f"time_s,mice_vx_m_s,mice_vy_m_s,mice_wz_rad_s\n{rows}")
+    slid = with_mice_odometry(log, path)
+    assert sum(isinstance(event, Event) and event.kind == "twist" for event in slid) == 588
+    for name in ("ekf", "ukf"):
+        settings = Settings(
+            RangeNoise("fixed", 0.1), start=(10.0, 5.0, math.pi / 2), speed_std_m_s=0.02, turn_std_rad_s=0.02
+        )
+        track = localize(slid, name, settings, None, beacons)
+        assert np.linalg.norm(track.position_m - truth(track.time_s), axis=1).max() < 0.2
+        assert wrap_angle(track.heading_rad[-1] - 0.2 * track.time_s[-1] - math.pi / 2) == pytest.approx(0.0, abs=0.05)
+    path.write_text("time_s,mice_vx_m_s,mice_vy_m_s,mice_wz_rad_s\n1000,0,0,0\n")
+    with pytest.raises(LinkposeError, match="no velocity between 0 and 59"):
+        with_mice_odometry(log, path)
 
 
 def test_a_wrong_start_is_opened_again():

@@ -70,6 +70,13 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
     help="Places of beacons or landmarks: id,x_m,y_m[,z_m].",
 )
 @click.option(
+    "--odometry",
+    "odometry_path",
+    type=options.FILE,
+    metavar="MICE.csv",
+    help="Take the odometry from this estimate of the mice filter, on the log's clock.",
+)
+@click.option(
     "--filter",
     "filters",
     type=click.Choice(["ekf", "ukf"]),
@@ -150,6 +157,7 @@ def command(
     log: Path,
     map_path: Path | None,
     beacons_path: Path | None,
+    odometry_path: Path | None,
     filters: tuple[str, ...],
     output: Path | None,
     truth_path: Path | None,
@@ -174,6 +182,10 @@ def command(
     beacons = read_beacons(beacons_path) if beacons_path else None
     truth = read_truth(truth_path) if truth_path else None
     events, own_start = read_carmen(log) if is_carmen(log) else (read_events(log), None)
+    if odometry_path is not None:
+        from linkpose.localization.odometry import with_mice_odometry
+
+        events = with_mice_odometry(events, odometry_path)
     chosen = _settings(settings, own_start)
     tracks = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
     for name, track in tracks.items():

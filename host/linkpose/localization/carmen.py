@@ -21,7 +21,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.localization.events import Event, Log, Scan, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
-from linkpose.localization.models.unicycle import sinc
+from linkpose.localization.models.se2 import sinc
 
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams

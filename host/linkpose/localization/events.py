@@ -60,7 +60,7 @@ def read_events(path: Path) -> Log:
     header_seen = False
     last = -math.inf
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             for line, row in enumerate(csv.reader(file), 1):
                 if not row or row[0].startswith("#"):
                     continue

@@ -42,6 +42,7 @@ class Motion:
 
 
 UNICYCLE = Motion(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
+HOLONOMIC = Motion(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
 SUBMERSIBLE = Motion(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
 PLANAR_TWIST = Motion(
     models.PLANAR_TWIST, ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s", "gyro_bias_rad_s"), 0, 4

@@ -14,6 +14,7 @@ from linkpose.localization import models
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.kalman import (
+    HOLONOMIC,
     SUBMERSIBLE,
     UNICYCLE,
     FilterName,
@@ -29,13 +30,12 @@ from linkpose.localization.tables import Beacons
 
 Pose = tuple[float, float, float]
 DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
+CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
 # When the gate has refused most of so many measurements of a kind, the pose is taken to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # of the pose's standard deviations, then
-CONSTANTS = {
-    "scale": ("range_scale_error", 0.1),
-    "bias": ("range_bias_m", 0.3),
-}  # state's name and standard deviation at the start
+# What can be estimated -> the state's name and its standard deviation at the start.
+CONSTANTS = {"scale": ("range_scale_error", 0.1), "bias": ("range_bias_m", 0.3)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +117,8 @@ class _Run:
 
     def __init__(self, log: Log, name: FilterName, settings: Settings, grid: GridMap, beacons: Beacons) -> None:
         self.log, self.settings, self.beacons = log, settings, beacons
-        diving = bool(_kinds(log) & DIVING)
-        constants = tuple(CONSTANTS[word][0] for word in settings.estimate)
-        motion = (SUBMERSIBLE if diving else UNICYCLE).extended(constants)
+        vehicle = _vehicle(_kinds(log))
+        motion = vehicle.extended(tuple(CONSTANTS[word][0] for word in settings.estimate))
         self.prior = _first_pose(log) if settings.start is None else None
         state, std = _start(log, settings, motion, self.prior)
         self.filter = KalmanFilter(
@@ -127,14 +126,14 @@ class _Run:
             motion,
             state,
             np.diag(std**2),
-            _noise_root(settings, diving),
+            _noise_root(settings, vehicle),
             settings.gate,
             settings.transform,
             grid,
         )
         self.control = np.zeros(motion.controls)
         self.hold = np.ones(motion.noises)
-        self.control_kind = "velocity" if diving else "odometry"
+        self.control_kind = CONTROLS[vehicle.model]
         self.holds = _holds(
             [event.time_s for event in log if isinstance(event, Event) and event.kind == self.control_kind]
         )
@@ -256,6 +255,11 @@ def _kinds(log: Log) -> set[str]:
     return {event.kind for event in log if isinstance(event, Event)}
 
 
+def _vehicle(kinds: set[str]) -> Motion:
+    """The motion model that a log's kinds of measurement call for."""
+    return SUBMERSIBLE if kinds & DIVING else HOLONOMIC if "twist" in kinds else UNICYCLE
+
+
 def _one_measurement(first: Event | Scan, other: Event | Scan) -> bool:
     """Ranges of one instant belong together: their errors may correlate."""
     both = isinstance(first, Event) and isinstance(other, Event) and first.kind == other.kind == "range"
@@ -286,9 +290,9 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
         raise LinkposeError(f"{origin} holds laser scans, which need the map they were taken in; add --map MAP.yaml")
     if kinds & set(NAMED) and not beacons:
         raise LinkposeError(f"{origin} holds ranges to beacons, whose places must be known; add --beacons BEACONS.csv")
-    if "odometry" in kinds and kinds & DIVING:
+    if kinds & {"odometry", "twist"} and kinds & DIVING:
         raise LinkposeError(
-            f"{origin} mixes a wheeled robot's odometry with a vehicle's {' and '.join(sorted(kinds & DIVING))}; "
+            f"{origin} mixes a robot's odometry with a vehicle's {' and '.join(sorted(kinds & DIVING))}; "
             "delete the rows of the one or of the other"
         )
     if settings.estimate and "range" not in kinds:
@@ -300,8 +304,9 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
                 f"(known are {', '.join(beacons)}); add it to the beacon file or delete the row"
             )
     check_correlation(settings.ranges.correlation, _widest(log), "the correlation of the ranges")
-    axes = 3 if kinds & DIVING else 2
-    check_correlation(settings.motion_correlation, axes, "the correlation of the motion's noises")
+    check_correlation(
+        settings.motion_correlation, 2 if _vehicle(kinds) is UNICYCLE else 3, "the correlation of the motion's noises"
+    )
 
 
 def _widest(log: Log) -> int:
@@ -336,14 +341,16 @@ def _start(log: Log, settings: Settings, motion: Motion, prior_event: Event | No
     return state, std
 
 
-def _noise_root(settings: Settings, diving: bool) -> Floats:
-    """The lower Cholesky factor of Q, (16): off-diagonal between speed and turn rate, or between the axes of the
-    velocity.
+def _noise_root(settings: Settings, vehicle: Motion) -> Floats:
+    """The lower Cholesky factor of Q, (16): off-diagonal between the errors of speed and turn rate, or of a velocity's
+    axes.
     """
-    if not diving:
-        q = equicorrelated(np.array([settings.speed_std_m_s, settings.turn_std_rad_s]), settings.motion_correlation)
-    else:
-        q = np.zeros((4, 4))
-        q[:3, :3] = equicorrelated(np.full(3, settings.velocity_std_m_s), settings.motion_correlation)
+    speed, turn, velocity = settings.speed_std_m_s, settings.turn_std_rad_s, settings.velocity_std_m_s
+    std = {UNICYCLE: (speed, turn), HOLONOMIC: (speed, speed, turn), SUBMERSIBLE: (velocity, velocity, velocity)}[
+        vehicle
+    ]
+    q = np.zeros((vehicle.noises, vehicle.noises))
+    q[: len(std), : len(std)] = equicorrelated(np.array(std), settings.motion_correlation)
+    if vehicle is SUBMERSIBLE:
         q[3, 3] = settings.yaw_acceleration_std_rad_s2**2
     return covariance_root(q, "Q, the covariance of the motion's noises,")

@@ -20,7 +20,7 @@ LONGEST_TRUTH_GAP_S = 1.0  # between two true poses: an estimate inside a longer
 def read_beacons(path: Path) -> Beacons:
     """Reads `id,x_m,y_m[,z_m]` into name -> (x, y, z) in m. Raises LinkposeError with file, line and cure."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise LinkposeError(
             f"{path} is not a CSV file: {error}; give the header id,x_m,y_m and one row a beacon"

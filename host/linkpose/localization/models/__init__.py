@@ -16,6 +16,7 @@ from linkpose.localization.models import (
     beacon_range,
     beams,
     direct,
+    holonomic,
     landmark,
     mouse_velocity,
     planar_twist,
@@ -24,7 +25,7 @@ from linkpose.localization.models import (
     unicycle,
 )
 
-UNICYCLE, SUBMERSIBLE, PLANAR_TWIST = unicycle.ID, submersible.ID, planar_twist.ID
+UNICYCLE, HOLONOMIC, SUBMERSIBLE, PLANAR_TWIST = unicycle.ID, holonomic.ID, submersible.ID, planar_twist.ID
 BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
 MOUSE_VELOCITY, RATE_GYRO = mouse_velocity.ID, rate_gyro.ID
 
@@ -34,6 +35,8 @@ def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interv
     """Fills `out` with the state after `interval` seconds."""
     if motion == UNICYCLE:
         unicycle.propagate(state, control, noise, interval, out)
+    elif motion == HOLONOMIC:
+        holonomic.propagate(state, control, noise, interval, out)
     elif motion == SUBMERSIBLE:
         submersible.propagate(state, control, noise, interval, out)
     else:
@@ -47,6 +50,8 @@ def motion_jacobians(
     """Fills two zeroed matrices, (n, n) and (n, q), with the slopes of `propagate`."""
     if motion == UNICYCLE:
         unicycle.jacobians(state, control, interval, by_state, by_noise)
+    elif motion == HOLONOMIC:
+        holonomic.jacobians(state, control, interval, by_state, by_noise)
     elif motion == SUBMERSIBLE:
         submersible.jacobians(state, control, interval, by_state, by_noise)
     else:
