@@ -1,0 +1,35 @@
+"""Time of each filter for one sample of a recording, beside the C++ VQF's on the same samples.
+
+    python tests/bench/filters.py [--json]
+
+The recording is ten minutes of the simulated link, Test 1. Compilation is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from _report import Row, best_of, report
+from vqf import VQF
+
+from linkpose import filters
+from linkpose.simulation.link import LinkRun
+
+DURATION_S = 600.0
+TIMES = 15
+BENCHES = ("joint", "joint-inertial", "tilt", "imu-baro", "baro")
+
+
+def rows() -> Iterator[Row]:
+    """The peer is timed anew beside each filter, so that both see the same load of the machine."""
+    run = LinkRun(1, 0, DURATION_S)
+    block = run.measurements()
+    filters.warm_up(BENCHES)
+    for name in BENCHES:
+        ours = best_of(lambda name=name: filters.create(name, run.rig).process(block), TIMES)  # type: ignore[misc]
+        peer = best_of(lambda: VQF(0.01).updateBatch(block.gyro_rad_s, block.accel_m_s2), TIMES)
+        yield Row(name, ours / len(block), "vqf", peer / len(block))
+
+
+if __name__ == "__main__":
+    report(rows())
