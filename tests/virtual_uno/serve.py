@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import select
 import signal
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,6 +19,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 sys.path.insert(0, str(HERE.parents[1] / "host"))
 
+from bootloader import BOOT_ADDRESS, build_optiboot  # noqa: E402
 from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
 
@@ -45,13 +48,18 @@ faults, at a time in seconds of the board (--fault 5:imu-unplug) or as lines on 
 
 def main() -> int:
     options = _parse()
-    if not options.hex.is_file():
+    if not options.blank and not options.hex.is_file():
         print(f"there is no {options.hex}: type `pio run -e uno_distro`, or give --hex", file=sys.stderr)
         return 1
     try:
         disturbed = {"disturbancePa": options.disturbance}
-        with VirtualUno(
-            options.hex, seed=options.seed, bmp180=disturbed, mice=MICE[: options.mice], bootloader_s=options.bootloader
+        with _program(options) as (program, boot_address), VirtualUno(
+            program,
+            seed=options.seed,
+            bmp180=disturbed,
+            mice=MICE[: options.mice],
+            bootloader_s=options.bootloader,
+            boot_address=boot_address,
         ) as uno:
             statistics = _serve(uno, options)
     except (VirtualUnoError, LinkposeError) as error:
@@ -66,6 +74,7 @@ def _parse() -> argparse.Namespace:
         description=__doc__, epilog=FAULTS_HELP, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--hex", type=Path, default=DEFAULT_HEX, help="the firmware")
+    parser.add_argument("--blank", action="store_true", help="Optiboot and no firmware: a board for `linkpose flash`")
     parser.add_argument("--link", type=Path, default=Path("virtual-uno"), help="symbolic link to the port")
     parser.add_argument("--rig", choices=("link", "mice"), default="link", help="what is simulated (default: the link)")
     parser.add_argument("--test", type=int, default=1, help="Test of the link: 1, 2 or 3")
@@ -85,6 +94,16 @@ def _parse() -> argparse.Namespace:
     if options.mice is None:
         options.mice = 3 if options.rig == "mice" else 0
     return options
+
+
+@contextlib.contextmanager
+def _program(options: argparse.Namespace) -> Iterator[tuple[Path, int]]:
+    """The .hex that the board begins with, and where in it a reset begins."""
+    if not options.blank:
+        yield options.hex, 0
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield build_optiboot(Path(folder)), BOOT_ADDRESS
 
 
 def _run(options: argparse.Namespace) -> LinkRun | MiceRun:
