@@ -1,6 +1,6 @@
 """`linkpose flash` up to the bootloader: which images it refuses, which port it takes, and what each failure says.
 
-The upload itself is tested with avrdude and the emulated board, in tests/virtual_uno/test_flash.py.
+The upload itself is tested with avrdude and the emulated board, in tests/virtual_uno/test_bootloader.py.
 """
 
 from __future__ import annotations
