@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -242,3 +243,42 @@ def test_four_mice(board: MakeBoard) -> None:
     link.run_ms(3000)
     assert totals(link.samples).tolist() == (reported(link) - before).tolist()
     assert lost(link.samples) == 0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_everything_goes_wrong_at_once(board: MakeBoard, seed: int) -> None:
+    """Half a minute of faults of every kind at random: never a SAMPLE lost nor a reset, and all well soon after."""
+    link = stream(board(mice=MICE[:3], seed=seed))
+    uno = link.uno
+    rng = np.random.default_rng(seed)
+    actions: list[Callable[[], object]] = [
+        uno.hold_sda, lambda: uno.hold_sda(int(rng.integers(1, 10))), uno.release_sda,
+        uno.imu.unplug, uno.imu.plug, uno.baro.unplug, uno.baro.plug,
+        lambda: uno.imu.nack(data=True), uno.imu.nack,
+        lambda: uno.corrupt_i2c(0.02), lambda: uno.corrupt_i2c(0.0),
+        lambda: uno.send(rng.bytes(60)),
+    ]  # fmt: skip
+    for mouse in uno.mice:
+        actions += [mouse.unplug, mouse.plug, partial(mouse.lose_clocks, 1), partial(mouse.spoil_parity, 2)]
+    move_all(link, 30.0)
+    uno.watch(["reset"])
+    for _ in range(300):
+        actions[rng.integers(len(actions))]()
+        link.run_ms(float(rng.uniform(20, 180)))
+    uno.release_sda()
+    uno.corrupt_i2c(0.0)
+    for part in (uno.imu, uno.baro, *uno.mice):
+        part.plug()
+    uno.imu.nack()
+    uno.send(b"\0")
+    link.run_ms(2500)
+    assert len(uno.events()) == 0
+    assert lost(link.samples) == 0
+    assert link.status.ticks_missed == 0
+    before = reported(link)
+    link.forget()
+    move_all(link, 1.5)
+    link.run_ms(2000)
+    assert totals(link.samples).tolist() == (reported(link) - before).tolist()
+    every = SampleFlags.IMU_VALID | SampleFlags.BARO_VALID | MOUSE_VALID[0] | MOUSE_VALID[1] | MOUSE_VALID[2]
+    assert all(sample.flags & every == every for sample in link.samples)
