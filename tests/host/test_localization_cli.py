@@ -92,6 +92,7 @@ def test_words_without_json(dive, linkpose):
         (["--beacons", "BEACONS", "--gate", "1.5"], "'1.5' is neither `off` nor a probability"),
         (["--beacons", "BEACONS", "--range-std", "0"], "0"),
         (["--beacons", "BEACONS", "--start", "1,2"], "X,Y,HEADING"),
+        (["--beacons", "BEACONS", "--start-std", "0,-1"], "both must be above 0"),
         (["--beacons", "BEACONS", "--map", "gone.yaml"], "gone.yaml"),
         (["--beacons", "gone.csv"], "gone.csv"),
         (["--beacons", "BEACONS", "--truth", "gone.csv"], "gone.csv"),
@@ -121,6 +122,13 @@ def test_logs_that_cannot_be_are_refused(dive, refused, tmp_path, rows, reason):
     assert reason in sentence
     if "start" not in reason:
         assert "log.csv" in sentence
+
+
+def test_a_velocity_beyond_all_numbers_is_refused(dive, refused, tmp_path):
+    log = tmp_path / "log.csv"
+    log.write_text("time_s,kind,a,b,c\n0,pose,0,0,0\n0,velocity,1e308,1e308,0\n9,depth,1,,\n")
+    assert "left all numbers at 9 s" in refused("localize", log, "--beacons", dive[1], "--filter", "ekf")
+    assert "no longer positive definite" in refused("localize", log, "--beacons", dive[1], "--filter", "ukf")
 
 
 def test_what_a_log_needs_is_named(indoor, dive, refused):

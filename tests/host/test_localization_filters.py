@@ -364,6 +364,15 @@ def test_rides_out_a_silence_of_the_beacons(name):
     assert error[after:].max() < 0.3
 
 
+def test_a_hopeless_log_ends_without_failure():
+    """Ranges that fit nowhere: the pose is opened again and again, but never beyond what a filter can hold."""
+    log, beacons, _ = drive_among_beacons(scale=7.0, bias=30.0)
+    for name in ("ekf", "ukf"):
+        track = localize(log, name, Settings(RangeNoise("fixed", 0.01)), None, beacons)
+        assert track.widened > 5
+        assert np.isfinite(track.state).all()
+
+
 def test_mice_drive_a_robot_that_slides(tmp_path):
     """A robot that faces along its circle's radius: all of its speed is aside, and only mice see that."""
     log, beacons, truth = drive_among_beacons()

@@ -6,10 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.carmen import Reading, as_log, flaser_angles, format_reading, is_carmen, read_carmen
 from linkpose.localization.events import Event, Scan, format_event, read_events
+from linkpose.localization.grid import load_map
 from linkpose.localization.tables import Truth, read_beacons, read_truth, score
 
 HEADER = "time_s,kind,a,b,c\n"
@@ -193,3 +196,24 @@ def test_truth_that_does_not_meet_the_log_is_refused(tmp_path):
         read_truth(written(tmp_path, "time_s,x_m,y_m\n0,,0\n1,1,1\n"))
     with pytest.raises(LinkposeError, match="no column y_m"):
         read_truth(written(tmp_path, "time_s,x_m\n0,0\n"))
+
+
+WORDS = st.sampled_from(
+    [
+        *"0123456789-.,# \n\x00é",
+        *("time_s,kind,a,b,c\n", "id,x_m,y_m\n", "range,", "pose,", "nan", "1e999"),
+        *("ODOM ", "FLASER ", "ROBOTLASER1 ", "image: map.pgm\n", "resolution: ", "origin: [", "]\n"),
+    ]
+)
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(words=st.lists(WORDS, max_size=60))
+def test_whatever_a_file_holds_it_is_read_or_refused(tmp_path, words):
+    """No other exception than the one that the user reads."""
+    path = written(tmp_path, "".join(words))
+    for read in (read_events, read_carmen, read_beacons, read_truth, load_map):
+        try:
+            read(path)
+        except LinkposeError as failure:
+            assert str(path) in str(failure)

@@ -201,6 +201,10 @@ def _settings(given: dict[str, Any], own_start: tuple[float, float, float] | Non
     from linkpose.localization.noise import RangeNoise
 
     scaled = given["transform"] == "scaled"
+    if min(given["start_std"]) <= 0:
+        raise click.BadParameter(
+            "both must be above 0: without any doubt of the start, nothing could correct it", param_hint="--start-std"
+        )
     return Settings(
         ranges=RangeNoise(
             given["noise"], given["range_std"], given["eta"], given["range_growth"], given["correlation"]

@@ -18,6 +18,8 @@ from linkpose.localization.ukf import ukf_step
 
 FilterName = Literal["ekf", "ukf"]
 Bools = NDArray[np.bool_]
+# The spread beyond which a filter that linearises knows no more than "anywhere".
+WIDEST = {"x_m": 50.0, "y_m": 50.0, "heading_rad": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +166,14 @@ class KalmanFilter:
         return self._angle_rows[key]
 
     def widen(self, factor: float) -> None:
-        """Multiplies the standard deviations of the motion model's position and heading, which keeps the covariance
-        positive definite.
+        """Multiplies the standard deviations of x, y and heading, at most up to WIDEST. The covariance stays positive
+        definite.
         """
-        grow = np.array([factor if name in ("x_m", "y_m", "heading_rad") else 1.0 for name in self.motion.states])
+        std = np.sqrt(np.diag(self.covariance))
+        grow = np.ones(len(std))
+        for i, name in enumerate(self.motion.states):
+            if name in WIDEST:
+                grow[i] = max(1.0, min(factor, WIDEST[name] / std[i]))
         self.covariance *= np.outer(grow, grow)
 
 

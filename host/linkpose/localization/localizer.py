@@ -157,6 +157,12 @@ class _Run:
             self._take(self.log[i:j])
             time[row], state[row], covariance[row] = self.now, self.filter.state, self.filter.covariance
             i = j
+        lost = np.flatnonzero(~np.isfinite(state).all(axis=1))
+        if len(lost):
+            raise LinkposeError(
+                f"the estimate left all numbers at {time[lost[0]]:.6g} s of the log; "
+                "correct the odometry or velocity before it"
+            )
         return Track(
             self.filter.motion.states,
             time,
