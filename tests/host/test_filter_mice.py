@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from functools import lru_cache
@@ -251,3 +252,15 @@ def test_what_cannot_run_says_why(name, mice, ports, sensors, reason):
     with pytest.raises(filters.CannotRun, match=reason) as raised:
         filters.create(name, Rig(mouse=mice), sensors, ports)
     assert isinstance(raised.value, LinkposeError)
+
+
+def test_reproduce_prints_what_redundancy_buys(linkpose, tmp_path):
+    done = linkpose("reproduce", "mice", "--seeds", 2, "--json", "--plot", tmp_path / "f.png")
+    rows = [json.loads(line) for line in done.out.splitlines()]
+    assert [(row["quantity"], row["mice"]) for row in rows] == [(q, m) for m in (2, 3) for q in ("vx", "vy", "wz")]
+    for row in rows:
+        assert row["theory_ratio"] == pytest.approx(1 / math.sqrt(row["mice"]))
+        assert row["ratio"] == pytest.approx(row["fused_std"] / row["single_std"])
+        assert row["ratio"] == pytest.approx(row["theory_ratio"], rel=0.05)
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    assert "30 %" in linkpose("reproduce", "mice", "--seeds", 1).out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from linkpose.filters import NAMES
 from linkpose.sensors.measurements import Floats
 
 REDRAW_INTERVAL_S = 0.1
+_SUBJECTS = {"height over the joint centre, live": "height_m", "the robot's motion, live": "x_m"}
 
 
 class View:
@@ -36,17 +38,16 @@ class View:
         self._live.update(self._table(estimates, health_line(health())), refresh=True)
 
     def _table(self, estimates: Floats, caption: str) -> Any:
-        from rich.table import Table
+        """A table for the link and one for the robot, whichever is estimated."""
+        from rich.console import Group
 
         rows = self._by_filter(estimates)
-        table = Table(title=_title(rows), caption=caption, title_justify="left")
-        quantities = list(dict.fromkeys(name for values in rows.values() for name in values))
-        table.add_column("filter")
-        for quantity in quantities:
-            table.add_column(quantity, justify="right", min_width=9)
-        for name, values in rows.items():
-            table.add_row(name, *(_text(q, values[q]) if q in values else "" for q in quantities))
-        return table
+        sections = [
+            _section(title, {name: values for name, values in rows.items() if quantity in values})
+            for title, quantity in _SUBJECTS.items()
+            if any(quantity in values for values in rows.values())
+        ]
+        return Group(*sections, caption)
 
     def _by_filter(self, estimates: Floats) -> dict[str, dict[str, float]]:
         """The row taken apart: filter -> quantity with its unit -> value."""
@@ -70,15 +71,27 @@ class View:
         self.close()
 
 
-def _title(rows: Mapping[str, Mapping[str, float]]) -> str:
-    """What the filters on show are about."""
-    quantities = {name for values in rows.values() for name in values}
-    subjects = {"height_m": "height over the joint centre", "x_m": "the robot's motion"}
-    return " and ".join(text for name, text in subjects.items() if name in quantities) + ", live"
+def _section(title: str, rows: Mapping[str, Mapping[str, float]]) -> Any:
+    """The filters in rows, their quantities in columns; a standard deviation stands behind its value."""
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    table.add_column("filter", no_wrap=True)
+    named = list(dict.fromkeys(name for values in rows.values() for name in values))
+    quantities = [name for name in named if "_std_" not in name]
+    for quantity in quantities:
+        table.add_column(quantity, justify="right", min_width=8)
+    for name, values in rows.items():
+        table.add_row(name, *(_text(quantity, values) for quantity in quantities))
+    return table
 
 
-def _text(quantity: str, value: float) -> str:
+def _text(quantity: str, values: Mapping[str, float]) -> str:
     """A value as it is shown; the excluded mice by their numbers."""
-    if quantity != "excluded":
-        return f"{value:+.4f}"
-    return ", ".join(str(port + 1) for port in range(int(value).bit_length()) if int(value) >> port & 1) or "none"
+    value = values.get(quantity, math.nan)
+    if math.isnan(value):
+        return ""
+    if quantity == "excluded":
+        return ", ".join(str(port + 1) for port in range(int(value).bit_length()) if int(value) >> port & 1) or "none"
+    std = values.get("_std_".join(quantity.split("_", 1)), math.nan)
+    return f"{value:+.3f}" + ("" if math.isnan(std) else f" ±{std:.3f}")
