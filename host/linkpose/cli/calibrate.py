@@ -8,6 +8,8 @@ from linkpose.cli import LazyGroup
 
 # Part of the rig file -> what is found.
 PARTS = {
+    "imu": "Bias, offset, scale and noise of the inertial sensor, from rests in several attitudes.",
+    "joint": "J2S, the vector from the joint's centre to the sensor, from the link in motion.",
     "mice": "Counts per metre and mounting angle of each mouse, from a straight line and a full turn.",
 }
 

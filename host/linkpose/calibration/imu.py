@@ -1,0 +1,143 @@
+"""Gyro bias, accelerometer offset and scale, and the sensors' noise, from rests.
+
+At rest the gyro reads its bias, and the accelerometer a vector of length g. Rests in six attitudes or more tell the
+offset o and the scale k of each axis: ‖(s_A − o) / k‖ = g at every rest, by Gauss-Newton.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from linkpose.calibration.rests import find_rests
+from linkpose.errors import LinkposeError
+from linkpose.recording.reader import Recording
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
+from linkpose.sensors.rig import Rig, Vector
+
+FEWEST_ATTITUDES = 6
+_APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
+_LARGEST_OFFSET_M_S2, _LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
+_WORST_RESIDUAL_M_S2 = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class ImuCalibration:
+    """What was found. Vectors are by axis; None where the recordings do not tell it."""
+
+    rests: int
+    attitudes: int
+    gyro_bias_rad_s: Floats
+    gyro_noise_rad_s: float
+    accel_noise_m_s2: float
+    accel_offset_m_s2: Floats | None
+    accel_scale: Floats | None
+    accel_residual_m_s2: float | None  # rms of ‖(s_A − o) / k‖ − g over the attitudes
+    pressure_noise_Pa: float | None
+
+
+def calibrate_imu(recordings: Sequence[Recording]) -> ImuCalibration:
+    """The calibration from all rests in the recordings. Raises LinkposeError without a rest, or for an ill fit."""
+    rests = [r.measurements[part] for r in recordings for part in find_rests(r.measurements)]
+    if not rests:
+        names = ", ".join(str(r.path) for r in recordings)
+        raise LinkposeError(f"there is no rest of a second or more in {names}: record the sensor lying still")
+    weights = np.array([len(rest) for rest in rests], dtype=np.float64)
+    bias = np.average([rest.gyro_rad_s.mean(axis=0) for rest in rests], axis=0, weights=weights)
+    attitudes = _distinct(np.array([rest.accel_m_s2.mean(axis=0) for rest in rests]))
+    offset = scale = residual = None
+    if len(attitudes) >= FEWEST_ATTITUDES:
+        offset, scale, residual = fit_sphere(attitudes)
+    return ImuCalibration(
+        len(rests),
+        len(attitudes),
+        np.asarray(bias),
+        _noise([rest.gyro_rad_s for rest in rests]),
+        _noise([rest.accel_m_s2 for rest in rests]),
+        offset,
+        scale,
+        residual,
+        _pressure_noise(rests),
+    )
+
+
+def with_calibration(rig: Rig, found: ImuCalibration) -> Rig:
+    """The rig with what was found; the rest of it as it was."""
+    imu = replace(
+        rig.imu,
+        gyro_bias_rad_s=_vector(found.gyro_bias_rad_s),
+        gyro_noise_rad_s=found.gyro_noise_rad_s,
+        accel_noise_m_s2=found.accel_noise_m_s2,
+    )
+    if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
+        imu = replace(
+            imu, accel_offset_m_s2=_vector(found.accel_offset_m_s2), accel_scale=_vector(found.accel_scale)
+        )
+    baro = rig.baro if found.pressure_noise_Pa is None else replace(rig.baro, pressure_noise_Pa=found.pressure_noise_Pa)
+    return replace(rig, imu=imu, baro=baro)
+
+
+def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
+    """Offset and scale (3,) that put the mean forces (N, 3) of N attitudes on the sphere of radius g, and the residual.
+
+    Raises LinkposeError where the attitudes do not tell all axes apart, or what they tell cannot be.
+    """
+    offset, scale = np.zeros(3), np.ones(3)
+    for _ in range(20):
+        true = (forces - offset) / scale
+        length = np.linalg.norm(true, axis=1)
+        along = true / length[:, None]
+        jacobian = np.hstack([-along / scale, -along * true / scale])
+        if np.linalg.cond(jacobian) > 300:
+            raise LinkposeError(
+                "the attitudes do not tell all axes apart: lay the sensor on each of its six sides, and record them"
+            )
+        change = np.linalg.lstsq(jacobian, STANDARD_GRAVITY - length, rcond=None)[0]
+        offset, scale = offset + change[:3], scale + change[3:]
+        if np.abs(change).max() < 1e-12:
+            break
+    residual = float(np.sqrt(np.mean((np.linalg.norm((forces - offset) / scale, axis=1) - STANDARD_GRAVITY) ** 2)))
+    if np.abs(offset).max() > _LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > _LARGEST_SCALE:
+        raise LinkposeError(
+            f"the rests give an offset of {np.round(offset, 2)} m/s² and a scale of {np.round(scale, 3)}, which no "
+            "MPU-6050 has: was it moved slowly, or is the range set wrong?"
+        )
+    if residual > _WORST_RESIDUAL_M_S2:
+        raise LinkposeError(
+            f"the rests do not fit one sphere ({residual:.2f} m/s² rms are left over): keep the sensor still at each"
+        )
+    return offset, scale, residual
+
+
+def _distinct(forces: Floats) -> Floats:
+    """One mean force for each attitude (M, 3)."""
+    groups: list[list[Floats]] = []
+    for force in forces:
+        for group in groups:
+            if force @ group[0] > _APART_COSINE * np.linalg.norm(force) * np.linalg.norm(group[0]):
+                group.append(force)
+                break
+        else:
+            groups.append([force])
+    return np.array([np.mean(group, axis=0) for group in groups])
+
+
+def _noise(rests: Sequence[Floats]) -> float:
+    """Standard deviation of one sample, from differences of neighbours, so that a slow drift is not in it."""
+    squares = np.concatenate([np.diff(rest, axis=0).ravel() ** 2 for rest in rests])
+    return max(float(np.sqrt(np.mean(squares) / 2)), 1e-6)
+
+
+def _pressure_noise(rests: Sequence[Measurements]) -> float | None:
+    steps = [np.diff(rest.pressure_Pa[rest.baro_fresh]) for rest in rests]
+    together = np.concatenate(steps)
+    together = together[np.isfinite(together)]
+    return max(float(np.sqrt(np.mean(together**2) / 2)), 0.1) if len(together) >= 20 else None
+
+
+def _vector(values: Floats) -> Vector:
+    x, y, z = (round(float(value), 8) for value in values)
+    return x, y, z

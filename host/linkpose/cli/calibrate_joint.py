@@ -1,0 +1,41 @@
+"""`linkpose calibrate joint`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from linkpose.cli import options
+
+_LARGE_RESIDUAL_M_S2 = 0.3
+
+
+@click.command("joint")
+@click.argument("recordings", type=options.FILE, nargs=-1, required=True)
+@click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write J2S into.")
+@options.as_json
+def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> None:
+    """Find J2S, the vector from the joint's centre to the sensor in its axes, and write it into the rig file.
+
+    Record the link on its fixed joint, swung for half a minute or more in all directions. The rig file's calibration of
+    the inertial sensor is applied; make it first with `linkpose calibrate imu`.
+    """
+    from linkpose.calibration.joint import calibrate_joint, with_calibration
+    from linkpose.recording.reader import load_recording
+
+    loaded = [load_recording(path) for path in recordings]
+    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    found = calibrate_joint(loaded, rig)
+    options.save_rig(rig_file, with_calibration(rig, found))
+    (x, y, z), (sx, sy, sz) = found.j2s_m.tolist(), found.std_m.tolist()
+    if json_lines:
+        values = {"j2s_m": [x, y, z], "std_m": [sx, sy, sz], "residual_m_s2": found.residual_m_s2}
+        click.echo(json.dumps({**values, "samples": found.samples}))
+    else:
+        click.echo(f"J2S {x:.4f} ± {sx:.4f}, {y:.4f} ± {sy:.4f}, {z:.4f} ± {sz:.4f} m")
+        click.echo(f"residual {found.residual_m_s2:.3f} m/s² over {found.samples} samples in motion")
+    if found.residual_m_s2 > _LARGE_RESIDUAL_M_S2:
+        click.echo("a large residual: type `linkpose calibrate imu` first, and see that the joint is fixed", err=True)
+    click.echo(f"written to {rig_file}", err=True)
