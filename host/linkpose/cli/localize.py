@@ -137,7 +137,13 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 @click.option(
     "--start-std", type=Numbers("M,RAD"), default="0.5,0.1", show_default=True, help="How far the start may be off."
 )
-@click.option("--transform", type=click.Choice(["unscented", "scaled"]), default="unscented", show_default=True)
+@click.option(
+    "--transform",
+    type=click.Choice(["unscented", "scaled"]),
+    default="unscented",
+    show_default=True,
+    help="Sigma points √(n + κ) σ out, as the thesis has them, or α times that: better in a map with many edges.",
+)
 @click.option(
     "--alpha",
     type=click.FloatRange(0, 1, min_open=True),

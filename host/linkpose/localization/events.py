@@ -7,6 +7,7 @@ import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
@@ -49,6 +50,7 @@ class Scan:
     mount: tuple[float, float, float]
     max_range_m: float
     line: int = 0
+    kind: ClassVar[str] = "scan"
 
 
 Log = list[Event | Scan]

@@ -134,12 +134,10 @@ class _Run:
         self.control = np.zeros(motion.controls)
         self.hold = np.ones(motion.noises)
         self.control_kind = CONTROLS[vehicle.model]
-        self.holds = _holds(
-            [event.time_s for event in log if isinstance(event, Event) and event.kind == self.control_kind]
-        )
+        self.holds = _holds([event.time_s for event in log if event.kind == self.control_kind])
         self.now = log[0].time_s
         self.last_range: dict[str, float] = {}
-        self.lately_refused: dict[int, deque[bool]] = {}
+        self.lately_refused: dict[str, deque[bool]] = {}
         self.applied = self.rejected = self.widened = 0
         self.rejected_ranges: set[tuple[float, str]] = set()
 
@@ -180,7 +178,7 @@ class _Run:
         passed = self.filter.step(event.time_s - self.now, self.control, self.hold, measurement)
         self.now = event.time_s
         if measurement is not None:
-            self._count(events, measurement.model, passed)
+            self._count(events, passed)
         if isinstance(event, Event):
             self._steer(event)
 
@@ -238,18 +236,14 @@ class _Run:
         self.last_range[event.beacon] = event.values[0]
         return sum(self.last_range.values()) / len(self.last_range)
 
-    def _count(
-        self, events: Sequence[Event | Scan], model: int, passed: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    ) -> None:
-        good = int(passed.sum())
+    def _count(self, events: Sequence[Event | Scan], passed: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> None:
+        kind, good = events[0].kind, int(passed.sum())
         self.applied += good
         self.rejected += len(passed) - good
-        if model == models.BEACON_RANGE and good < len(passed):
-            refused = [
-                event for event, fits in zip(events, passed, strict=True) if not fits and isinstance(event, Event)
-            ]
-            self.rejected_ranges.update((event.time_s, event.beacon) for event in refused)
-        lately = self.lately_refused.setdefault(model, deque(maxlen=PATIENCE))
+        if kind == "range":
+            refused = [event for event, fits in zip(events, passed, strict=True) if not fits]
+            self.rejected_ranges.update((event.time_s, event.beacon) for event in refused if isinstance(event, Event))
+        lately = self.lately_refused.setdefault(kind, deque(maxlen=PATIENCE))
         lately.append(2 * good <= len(passed))
         if len(lately) == PATIENCE and 2 * sum(lately) > PATIENCE:
             self.filter.widen(WIDENING)
@@ -258,7 +252,7 @@ class _Run:
 
 
 def _kinds(log: Log) -> set[str]:
-    return {event.kind for event in log if isinstance(event, Event)}
+    return {event.kind for event in log}
 
 
 def _vehicle(kinds: set[str]) -> Motion:
@@ -268,8 +262,7 @@ def _vehicle(kinds: set[str]) -> Motion:
 
 def _one_measurement(first: Event | Scan, other: Event | Scan) -> bool:
     """Ranges of one instant belong together: their errors may correlate."""
-    both = isinstance(first, Event) and isinstance(other, Event) and first.kind == other.kind == "range"
-    return both and other.time_s == first.time_s
+    return first.kind == other.kind == "range" and other.time_s == first.time_s
 
 
 def _direct(
@@ -292,7 +285,7 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
     kinds = _kinds(log)
     if not log:
         raise LinkposeError(f"{origin} holds no measurements; record some first")
-    if any(isinstance(event, Scan) for event in log) and grid is None:
+    if "scan" in kinds and grid is None:
         raise LinkposeError(f"{origin} holds laser scans, which need the map they were taken in; add --map MAP.yaml")
     if kinds & set(NAMED) and not beacons:
         raise LinkposeError(f"{origin} holds ranges to beacons, whose places must be known; add --beacons BEACONS.csv")
@@ -320,7 +313,7 @@ def _widest(log: Log) -> int:
     beams = max((len(event.ranges_m) for event in log if isinstance(event, Scan)), default=1)
     counts: dict[float, int] = {}
     for event in log:
-        if isinstance(event, Event) and event.kind == "range":
+        if event.kind == "range":
             counts[event.time_s] = counts.get(event.time_s, 0) + 1
     return max(beams, *counts.values()) if counts else beams
 
