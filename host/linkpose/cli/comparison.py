@@ -4,13 +4,19 @@ a picture.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
+
+import click
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.tables import Score
+
+Item = TypeVar("Item")
 
 
 @dataclass(slots=True)
@@ -42,6 +48,15 @@ class Variant:
             "position_rmse_m_max": max(score.position_rmse_m for score in self.scores),
             "heading_rmse_rad_mean": sum(headings) / len(headings),
         }
+
+
+def progress(items: Iterable[Item], label: str) -> Iterator[Item]:
+    """The items, with a bar on stderr where that is a terminal."""
+    if sys.stderr.isatty():
+        with click.progressbar(list(items), label=label, file=sys.stderr) as bar:
+            yield from bar
+    else:
+        yield from items
 
 
 def as_table(rows: Sequence[dict[str, object]]) -> str:

@@ -194,11 +194,11 @@ def command(
         events = with_mice_odometry(events, odometry_path)
     chosen = _settings(settings, own_start)
     tracks = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
+    if output is not None:
+        write_tracks(output, tracks, log, force)
     for name, track in tracks.items():
         result = score(track.time_s, track.position_m, track.heading_rad, truth) if truth else None
         click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
-    if output is not None:
-        write_tracks(output, tracks, log, force)
 
 
 def _settings(given: dict[str, Any], own_start: tuple[float, float, float] | None) -> Settings:

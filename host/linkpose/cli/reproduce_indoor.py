@@ -34,7 +34,7 @@ def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
 
     The thesis's own logs and result tables are not public: these are simulated drives through a floor of the same size.
     """
-    from linkpose.cli.comparison import as_table, plot
+    from linkpose.cli.comparison import as_table, plot, progress
     from linkpose.localization.carmen import as_log
     from linkpose.localization.localizer import localize
     from linkpose.localization.tables import score
@@ -42,7 +42,7 @@ def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
 
     variants = list(_variants())
     grid = office_map()
-    for seed, unmapped in itertools.product(range(seeds), UNMAPPED):
+    for seed, unmapped in progress(itertools.product(range(seeds), UNMAPPED), "drives"):
         errors = IndoorErrors(outlier_fraction=unmapped)
         run = simulate_indoor(seed, errors, None, grid)
         log = as_log(run.readings)

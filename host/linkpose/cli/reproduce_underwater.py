@@ -80,14 +80,14 @@ def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
     Synchronous and asynchronous sensors, with and without a common error of the ranges and outliers, with and without
     gate. The thesis's own values and result tables are not public.
     """
-    from linkpose.cli.comparison import as_table, plot
+    from linkpose.cli.comparison import as_table, plot, progress
 
     cases = [
         _case(timing, correlated, n)
         for timing, correlated, n in itertools.product(TIMINGS, (False, True), (0, OUTLIERS))
     ]
     checks = list(_checks(seeds))
-    for case, seed in itertools.product(cases, range(seeds)):
+    for case, seed in progress(itertools.product(cases, range(seeds)), "dives"):
         _dive(case, seed)
     variants = [variant for case in cases for variant in case.variants]
     rows = [
