@@ -1,4 +1,4 @@
-"""`linkpose reproduce`: the papers' tables and figures, measured anew. Each paper's rig is a module `reproduce_<rig>`."""
+"""`linkpose reproduce`: the papers' tables and figures, measured anew. Each rig is a module `reproduce_<rig>`."""
 
 from __future__ import annotations
 
