@@ -60,7 +60,7 @@ def test_resolution_is_configurable(board: MakeBoard) -> None:
 def test_counts_out_are_counts_in_for_a_minute(board: MakeBoard) -> None:
     """Three mice at up to 1 m/s, a parity error of each every 2 s, full traffic: nothing lost, nothing twice."""
     link = stream(board(mice=MICE[:3]))
-    before = reported(link)
+    before, state = reported(link), link.uno.state()
     link.uno.watch(WATCHED_BUS)
     move_all(link, 59.5)
     for mouse in link.uno.mice:
@@ -78,7 +78,9 @@ def test_counts_out_are_counts_in_for_a_minute(board: MakeBoard) -> None:
     status = link.status
     assert (status.ticks_missed, status.frames_dropped) == (0, 0)
     assert [mouse.parity_errors for mouse in status.mice[:3]] == pytest.approx([29] * 3, abs=1)
-    assert link.uno.state()["contentions"] == 0
+    after = link.uno.state()
+    assert after["conversions_disturbed"] - state["conversions_disturbed"] <= 12  # of 6000
+    assert after["contentions"] == 0
 
 
 def test_load_and_stack_with_three_mice(board: MakeBoard) -> None:
