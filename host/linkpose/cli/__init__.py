@@ -24,6 +24,7 @@ COMMANDS = {
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
     "reproduce": "Measure the papers' tables and figures anew.",
+    "plot": "Draw recordings, estimates and references.",
     "localize": "Find where a robot was, in a map or among beacons.",
 }
 

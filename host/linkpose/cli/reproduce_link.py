@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
-from linkpose.errors import LinkposeError
 
 if TYPE_CHECKING:
     from linkpose.evaluation.link import Entry, Traces
@@ -71,11 +70,9 @@ def _show(entries: list[Entry], seeds: int, errors: str) -> None:
 
 
 def _plot(path: Path, runs: list[Traces]) -> None:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise LinkposeError("plots need matplotlib; type `pip install linkpose[plot]`") from None
-    figure = Figure(figsize=(10, 9), layout="constrained")
+    from linkpose import plotting
+
+    figure = plotting.new_figure(10, 9)
     for test, (axes, run) in enumerate(zip(figure.subplots(3, 1), runs, strict=True), 1):
         for name in ("baro", "imu-baro", "tilt", "joint", "joint-inertial"):
             axes.plot(run.time_s, 100 * run.height_m[name], linewidth=0.8, label=f"{name} {_LETTERS[name]}".strip())
@@ -86,7 +83,4 @@ def _plot(path: Path, runs: list[Traces]) -> None:
             axes.set_xlim(*_SHOWN_S)
     figure.axes[0].legend(loc="upper right", ncols=3, fontsize=8)
     figure.axes[-1].set_xlabel("time (s)")
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise LinkposeError(f"cannot write {path}: {error}; name a .png in a folder you may write to") from error
+    plotting.save(figure, path)
