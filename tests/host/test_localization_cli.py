@@ -87,10 +87,12 @@ def test_words_without_json(dive, linkpose):
     [
         ([], "add --map MAP.yaml or --beacons BEACONS.csv"),
         (["--beacons", "BEACONS", "--correlation", "1.0"], "not positive definite"),
-        (["--beacons", "BEACONS", "--correlation", "nan"], "not positive definite"),
+        (["--beacons", "BEACONS", "--correlation", "nan"], "'nan' is not finite"),
         (["--beacons", "BEACONS", "--motion-correlation", "-0.9"], "not positive definite"),
         (["--beacons", "BEACONS", "--gate", "1.5"], "'1.5' is neither `off` nor a probability"),
         (["--beacons", "BEACONS", "--range-std", "0"], "0"),
+        (["--beacons", "BEACONS", "--range-std", "nan"], "'nan' is not finite"),
+        (["--beacons", "BEACONS", "--turn-std", "inf"], "'inf' is not finite"),
         (["--beacons", "BEACONS", "--start", "1,2"], "X,Y,HEADING"),
         (["--beacons", "BEACONS", "--start-std", "0,-1"], "both must be above 0"),
         (["--beacons", "BEACONS", "--map", "gone.yaml"], "gone.yaml"),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from linkpose.localization.tables import Score
 
 RANGE_STD_M = 0.1
-POSITIVE = click.FloatRange(min=0, min_open=True)
+POSITIVE = options.FiniteRange(min=0, min_open=True)
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
@@ -92,7 +92,13 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
     show_default=True,
     help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)².",
 )
-@click.option("--correlation", type=float, default=0.0, show_default=True, help="Between ranges taken at one instant.")
+@click.option(
+    "--correlation",
+    type=options.FiniteRange(),
+    default=0.0,
+    show_default=True,
+    help="Between ranges taken at one instant.",
+)
 @click.option(
     "--gate",
     callback=gate_probability,
@@ -103,7 +109,11 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 )
 @click.option("--range-std", type=POSITIVE, default=RANGE_STD_M, show_default=True, help="σ of a range (m).")
 @click.option(
-    "--range-growth", type=click.FloatRange(min=0), default=0.02, show_default=True, help="k of --noise affine (m/m)."
+    "--range-growth",
+    type=options.FiniteRange(min=0),
+    default=0.02,
+    show_default=True,
+    help="k of --noise affine (m/m).",
 )
 @click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
 @click.option("--bearing-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a bearing (rad).")
@@ -120,7 +130,7 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 )
 @click.option(
     "--motion-correlation",
-    type=float,
+    type=options.FiniteRange(),
     default=0.0,
     show_default=True,
     help="Between the errors of speed and turn rate.",
@@ -146,13 +156,15 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
 )
 @click.option(
     "--alpha",
-    type=click.FloatRange(0, 1, min_open=True),
+    type=options.FiniteRange(0, 1, min_open=True),
     default=0.1,
     show_default=True,
     help="α of --transform scaled.",
 )
-@click.option("--beta", type=click.FloatRange(min=0), default=2.0, show_default=True, help="β of --transform scaled.")
-@click.option("--kappa", type=click.FloatRange(min=0), default=0.0, show_default=True, help="κ of either transform.")
+@click.option(
+    "--beta", type=options.FiniteRange(min=0), default=2.0, show_default=True, help="β of --transform scaled."
+)
+@click.option("--kappa", type=options.FiniteRange(min=0), default=0.0, show_default=True, help="κ of either transform.")
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."

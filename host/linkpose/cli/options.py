@@ -46,6 +46,16 @@ class SecondsType(click.ParamType[float]):
         return seconds
 
 
+class FiniteRange(click.FloatRange):
+    """A number within bounds. click's own range lets NaN and infinity pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not finite", param, ctx)
+        return number
+
+
 FILE = click.Path(path_type=Path)
 
 

@@ -16,17 +16,17 @@ from linkpose.errors import LinkposeError
 @click.option("--map", "map_path", type=options.FILE, help="Map to write. Default: OUT's name with .yaml.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Motion, errors and noise.")
 @click.option(
-    "--duration", type=click.FloatRange(min=5, max=3600), help="Length in seconds. Default: one round, some 200 s."
+    "--duration", type=options.FiniteRange(min=5, max=3600), help="Length in seconds. Default: one round, some 200 s."
 )
 @click.option(
-    "--range-std", type=click.FloatRange(min=0), default=0.03, show_default=True, help="σ of a beam at range 0 (m)."
+    "--range-std", type=options.FiniteRange(min=0), default=0.03, show_default=True, help="σ of a beam at range 0 (m)."
 )
 @click.option(
-    "--range-growth", type=click.FloatRange(min=0), default=0.02, show_default=True, help="And its growth (m/m)."
+    "--range-growth", type=options.FiniteRange(min=0), default=0.02, show_default=True, help="And its growth (m/m)."
 )
 @click.option(
     "--outliers",
-    type=click.FloatRange(0, 1),
+    type=options.FiniteRange(0, 1),
     default=0.02,
     show_default=True,
     help="Share of beams that end at something that the map does not know.",

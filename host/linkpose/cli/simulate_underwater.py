@@ -10,7 +10,7 @@ import click
 
 from linkpose.cli import options
 
-NON_NEGATIVE = click.FloatRange(min=0)
+NON_NEGATIVE = options.FiniteRange(min=0)
 
 
 @click.command("underwater")
@@ -19,7 +19,7 @@ NON_NEGATIVE = click.FloatRange(min=0)
 @click.option("--beacons", type=options.FILE, help="Beacons to write. Default: OUT's name with _beacons.csv.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Motion, errors and noise.")
 @click.option(
-    "--duration", type=click.FloatRange(min=5, max=3600), default=120.0, show_default=True, help="Length in seconds."
+    "--duration", type=options.FiniteRange(min=5, max=3600), default=120.0, show_default=True, help="Length in seconds."
 )
 @click.option("--synchronous", is_flag=True, help="All sensors read at once, every 0.2 s (Table 2.3).")
 @click.option("--range-std", type=NON_NEGATIVE, default=0.2, show_default=True, help="σ of a range (m), Table 2.6.")
@@ -34,7 +34,7 @@ NON_NEGATIVE = click.FloatRange(min=0)
     "--correlation-interval", type=options.SecondsType(), default=1.0, show_default=True, help="How long it stays (s)."
 )
 @click.option("--outliers", type=click.IntRange(min=0), default=60, show_default=True, help="How many, Table 2.9.")
-@click.option("--outlier-size", type=float, default=5.0, show_default=True, help="What each adds (m).")
+@click.option("--outlier-size", type=options.FiniteRange(min=0.1), default=5.0, show_default=True, help="What each adds (m).")
 @options.force
 @options.as_json
 def command(

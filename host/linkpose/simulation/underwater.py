@@ -240,9 +240,10 @@ class Check:
 
 
 def self_check(run: UnderwaterRun) -> list[Check]:
-    """The noise's statistics computed back from the measurements and the true path alone, as chapter 3.2 does.
+    """The noise's statistics computed back from the measurements and the true path, as chapter 3.2 does.
 
-    The common error is told from the Gaussian noise by the variance between the intervals against that within them.
+    The common error is told from the Gaussian noise by the variance between the intervals against that within them;
+    the instants of outliers are left out of both. An error beyond half an outlier's size counts as one.
     """
     errors, motion = run.errors, run.motion
     spread = np.std(run.velocity_m_s - motion.twist[motion.index(run.times_s["dvl"]), :3])
@@ -253,18 +254,18 @@ def self_check(run: UnderwaterRun) -> list[Check]:
         for k, (b, place) in enumerate(BEACONS.items(), 1)
     ]
     error, clock = np.concatenate(off), np.concatenate([run.times_s[f"range{k}"] for k in range(1, len(off) + 1)])
-    far = np.abs(error) > 0.5 * errors.outlier_m
-    within, between = _split_variance(error[~far], (clock[~far] / errors.correlation_interval_s).astype(int))
+    drawn = np.concatenate(list(run.outlier.values()))
+    within, between = _split_variance(error[~drawn], (clock[~drawn] / errors.correlation_interval_s).astype(int))
     rows = [
         Check("velocity_std_m_s", errors.velocity_m_s, float(spread)),
         Check("attitude_std_rad", errors.attitude_rad, float(np.std(turned))),
         Check("depth_std_m", errors.depth_m, float(np.std(sunk))),
         Check("range_std_m", errors.range_m, math.sqrt(within)),
         Check("correlation_std_m", errors.correlation_m, math.sqrt(max(between, 0.0))),
-        Check("outliers", float(errors.outliers), float(far.sum())),
+        Check("outliers", float(errors.outliers), float((np.abs(error) > 0.5 * errors.outlier_m).sum())),
     ]
-    if far.any():
-        rows.append(Check("outlier_m", errors.outlier_m, float(np.mean(error[far]))))
+    if drawn.any():
+        rows.append(Check("outlier_m", errors.outlier_m, float(np.mean(error[drawn]))))
     if not run.synchronous:
         rows += [_jitter_check(run, sensor) for sensor in PERIODS_S]
     return rows
