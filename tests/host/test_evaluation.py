@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from linkpose.cli.evaluate import command
 from linkpose.errors import LinkposeError
+from linkpose.simulation.link import LinkRun
 
 T = np.arange(0, 30, 0.01)
 
@@ -141,3 +142,59 @@ def test_files_that_do_not_fit_are_refused_by_name(tmp_path, ours, theirs, says)
     with pytest.raises(LinkposeError, match=says) as error:
         scores(str(tmp_path / "ours.csv"), str(tmp_path / "theirs.csv"))
     assert str(tmp_path) in str(error.value)
+
+
+# ---- OptiTrack Motive ----
+
+
+def motive(path, run, time_s, unit="Millimeters", markers=3):
+    """The export of three markers on the sensor of a simulated link: in millimetres, Y up, with a hidden marker."""
+    tilt = run.at(time_s).tilt
+    x = np.cross(np.cross(tilt, [1.0, 0, 0]), tilt)  # heading does not matter to the tilt
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    axes = np.stack([x, np.cross(tilt, x), tilt], axis=1)  # n's axes seen in s
+    place = [np.array(run.j2s_m) + offset for offset in ([0, 0, 0], [0.1, 0, 0], [0.02, 0.08, 0])]
+    rows = []
+    for t, rotation in zip(time_s, axes, strict=True):
+        cells = [f"{len(rows)}", f"{t:.6f}"]
+        for d in place[:markers]:
+            east, north, up = rotation @ d + [0.3, -0.2, 0.7]
+            cells += [f"{1000 * value:.4f}" for value in (east, up, -north)]
+        rows.append(cells)
+    rows[40][5] = ""
+    head = [
+        ["Format Version", "1.23", "Take Name", "link", "Length Units", unit, "Coordinate Space", "Global"],
+        [],
+        ["", "Type", *["Marker"] * 3 * markers],
+        ["", "Name", *[f"Plate:{i}" for i in range(markers) for _ in "xyz"]],
+        ["", "", *["Position"] * 3 * markers],
+        ["Frame", "Time (Seconds)", *["X", "Y", "Z"] * markers],
+    ]
+    path.write_text("\n".join(",".join(row) for row in head + rows) + "\n")
+    return str(path)
+
+
+def test_motive_export_as_reference(tmp_path):
+    """Another clock, another rate, another origin, millimetres, Y up."""
+    run = LinkRun(2, 1, 30.0)
+    truth = run.truth()
+    path = write(
+        tmp_path / "estimate.csv",
+        {"time_s": truth.time_s, "joint_height_m": truth.height_m + 0.01, "joint_roll_deg": truth.roll_deg,
+         "joint_pitch_deg": truth.pitch_deg + 0.5},
+    )  # fmt: skip
+    found = scores(path, motive(tmp_path / "take.csv", run, np.arange(0, 30, 1 / 120)))["joint"]
+    assert found["height_rmse_cm"] == pytest.approx(1.0, abs=0.02)
+    assert found["roll_rmse_deg"] == pytest.approx(0, abs=0.02)
+    assert found["pitch_rmse_deg"] == pytest.approx(0.5, abs=0.01)
+
+
+def test_motive_exports_that_do_not_do(tmp_path):
+    run, path = LinkRun(2, 1, 30.0), estimate(tmp_path)
+    t = np.arange(0, 20, 0.05)
+    with pytest.raises(LinkposeError, match="2 markers"):
+        scores(path, motive(tmp_path / "two.csv", run, t, markers=2))
+    with pytest.raises(LinkposeError, match="furlongs"):
+        scores(path, motive(tmp_path / "unit.csv", run, t, unit="Furlongs"))
+    with pytest.raises(LinkposeError, match="tells no joint"):
+        scores(path, motive(tmp_path / "still.csv", run, np.arange(0, 1, 0.02)))

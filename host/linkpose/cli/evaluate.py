@@ -27,16 +27,23 @@ _HEADINGS = {
 @click.command("evaluate")
 @click.argument("estimate", type=options.FILE)
 @click.argument("reference", type=options.FILE)
+@click.option(
+    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Upward axis of a Motive export."
+)
 @options.as_json
-def command(estimate: Path, reference: Path, json_lines: bool) -> None:
+def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
     """Root mean square errors of each filter in ESTIMATE.csv against REFERENCE.csv.
 
-    The two are aligned in time by cross-correlation where that fits clearly better than their stamps.
+    The two are aligned in time by cross-correlation where that fits clearly better than their stamps. The reference
+    is a truth of `linkpose simulate`, any CSV with such columns, or OptiTrack Motive's export of three markers: the
+    first at the sensor, the second along its x axis, the third on the side of its y axis.
     """
+    from linkpose.evaluation.motive import is_motive, read_motive
     from linkpose.evaluation.scores import evaluate
     from linkpose.recording.table import read_table
 
-    scores = evaluate(read_table(estimate), read_table(reference))
+    truth = read_motive(reference, up) if is_motive(reference) else read_table(reference)
+    scores = evaluate(read_table(estimate), truth)
     if json_lines:
         for score in scores:
             click.echo(json.dumps(score.as_dict()))

@@ -11,7 +11,7 @@ from linkpose.cli import options
 
 @click.command("plot")
 @click.argument("files", type=options.FILE, nargs=-1, required=True)
-@click.option("-o", "--output", type=options.FILE, metavar="FILE.png", help="Picture; default: named as the first file.")
+@click.option("-o", "--output", type=options.FILE, metavar="FILE.png", help="Picture; default: the first file's name.")
 def command(files: tuple[Path, ...], output: Path | None) -> None:
     """Draw recordings, estimates and references over time, those of one quantity in one panel."""
     from linkpose import plotting

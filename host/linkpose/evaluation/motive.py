@@ -1,0 +1,119 @@
+"""References from OptiTrack: the CSV that Motive exports, with three markers on the sensor's plate.
+
+Marker 1 is at the sensor, marker 2 lies in the direction of its x axis and marker 3 on the side of its y axis, as on
+the paper's set square. They give the sensor's axes, and with the direction upwards the tilt Z. Marker 1 moves on a
+sphere about the joint's centre, which is fitted: the height is that of marker 1 over it, wherever the origin is.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from linkpose.errors import LinkposeError
+from linkpose.recording.table import Table, check_times, read_bytes
+from linkpose.sensors.measurements import Floats
+
+_SIGNATURE = b"Format Version,"
+_METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
+_WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker moves
+
+
+def is_motive(path: Path) -> bool:
+    """Whether the file begins as Motive's exports do. Raises LinkposeError where it cannot be read."""
+    return read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+
+
+def read_motive(path: Path, up: str = "y") -> Table:
+    """Time, height, roll and pitch of the plate as a reference; rows with a hidden marker are NaN.
+
+    `up` is the axis of the room that points upwards: "y" unless Motive was told to export with Z up.
+    Raises LinkposeError naming the file and what is missing in it.
+    """
+    rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
+    header = next((i for i, row in enumerate(rows) if row[:2] == ["Frame", "Time (Seconds)"]), None)
+    if header is None:
+        raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
+    scale = _unit(path, rows[0])
+    places = _marker_columns(rows[:header], rows[header])
+    if len(places) < 3:
+        raise LinkposeError(f"{path} has {len(places)} markers with X, Y, Z; three are needed: export Markers as well")
+    body = [row for row in rows[header + 1 :] if row]
+    width = max(column + 3 for column in places[:3])
+    time_s = np.array([_number(path, row, 1, header + 2 + i) for i, row in enumerate(body)])
+    check_times(path, time_s, header + 2)
+    values = [[_number(path, row, j, header + 2 + i) for j in range(2, width)] for i, row in enumerate(body)]
+    table = scale * np.array(values)
+    markers = np.stack([table[:, column - 2 : column + 1] for column in places[:3]], axis=1)
+    tilt = _tilt(markers, np.eye(3)["xyz".index(up)])
+    height = (markers[:, 0] - _centre(path, markers[:, 0]))[:, "xyz".index(up)]
+    columns = {
+        "time_s": time_s,
+        "height_m": height,
+        "roll_deg": np.degrees(np.arctan2(tilt[:, 1], tilt[:, 2])),
+        "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
+    }
+    columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
+    return Table(path, "motive", columns, {}, None, header + 2)
+
+
+def _unit(path: Path, head: list[str]) -> float:
+    """Metres in a unit of the file, from the pairs of its first line."""
+    pairs = dict(zip(head[::2], head[1::2], strict=False))
+    name = pairs.get("Length Units", "Meters").strip().lower()
+    if name not in _METRES:
+        raise LinkposeError(f"{path}, line 1: unknown length unit {name!r}; export in {', '.join(_METRES)}")
+    return _METRES[name]
+
+
+def _marker_columns(above: list[list[str]], header: list[str]) -> list[int]:
+    """First column of each marker's position. Rigid bodies, which also have one, are not markers."""
+    kinds = next((row for row in above if row[1:2] == ["Type"]), [])
+    found = []
+    for i in range(2, len(header) - 2):
+        is_marker = "marker" in (kinds[i].lower() if i < len(kinds) else "marker")
+        if is_marker and [name.strip().upper() for name in header[i : i + 3]] == ["X", "Y", "Z"]:
+            found.append(i)
+    return found
+
+
+def _number(path: Path, row: list[str], column: int, line: int) -> float:
+    text = row[column].strip() if column < len(row) else ""
+    if not text:
+        return float("nan")
+    try:
+        return float(text)
+    except ValueError:
+        raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number") from None
+
+
+def _tilt(markers: Floats, up: Floats) -> Floats:
+    """Z (N, 3) from markers (N, 3 markers, 3)."""
+    x = markers[:, 1] - markers[:, 0]
+    z = np.cross(x, markers[:, 2] - markers[:, 0])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        x = x / np.linalg.norm(x, axis=1, keepdims=True)
+        z = z / np.linalg.norm(z, axis=1, keepdims=True)
+    return np.column_stack([x @ up, np.cross(z, x) @ up, z @ up])
+
+
+def _centre(path: Path, positions: Floats) -> Floats:
+    """Centre of the sphere on which the positions (N, 3) lie: |p|² = 2 p·c + (r² − |c|²) is linear in both."""
+    seen = positions[np.isfinite(positions).all(axis=1)]
+    if len(seen) < 10:
+        raise LinkposeError(f"{path}: marker 1 is seen in {len(seen)} frames only; no joint can be fitted to that")
+    middle = seen.mean(axis=0)
+    p = seen - middle
+    design = np.column_stack([2 * p, np.ones(len(p))])
+    solution, _, rank, singular = np.linalg.lstsq(design, (p**2).sum(axis=1), rcond=None)
+    if rank < 4 or singular[-1] < 1e-4 * singular[0]:
+        raise LinkposeError(f"{path}: marker 1 hardly leaves a circle, which tells no joint: swing it both ways")
+    distance = np.linalg.norm(p - solution[:3], axis=1)
+    if distance.std() > _WORST_SPHERE_M:
+        raise LinkposeError(
+            f"{path}: marker 1 is {100 * distance.std():.1f} cm rms off any sphere: is the joint fixed to the ground?"
+        )
+    return np.asarray(middle + solution[:3])
