@@ -92,8 +92,8 @@ def test_carmen_lines(tmp_path):
     log, start = read_carmen(path)
     assert start == (1.0, 2.0, 0.0)
     first, second, scan, third, wide = log
-    assert (first.kind, first.time_s, first.values) == ("odometry", 0.0, pytest.approx((0.5, 0.0)))
-    assert second.time_s == pytest.approx(0.2)
+    assert (first.kind, first.time_s, first.values) == ("odometry", 100.0, pytest.approx((0.5, 0.0)))
+    assert second.time_s == pytest.approx(100.2)
     assert second.values[1] == pytest.approx(0.5)  # 0.1 rad in 0.2 s
     assert third.values == (0.0, 0.0)
     assert isinstance(scan, Scan) and len(scan.ranges_m) == 19
@@ -151,7 +151,7 @@ def test_formatted_readings_read_back(tmp_path):
     ]
     log, start = read_carmen(written(tmp_path, "\n".join(map(format_reading, readings)) + "\n", "run.log"))
     assert start == (1.0, 2.0, 0.25)
-    assert [event.time_s for event in log] == [0.0, 0.5, 0.5]
+    assert [event.time_s for event in log] == [5.0, 5.5, 5.5]
     assert log[2].ranges_m == pytest.approx(as_log(readings)[2].ranges_m, abs=1e-3)
 
 

@@ -193,7 +193,7 @@ def command(
     from linkpose.localization.carmen import is_carmen, read_carmen
     from linkpose.localization.events import read_events
     from linkpose.localization.grid import load_map
-    from linkpose.localization.localizer import localize
+    from linkpose.localization.localizer import localize, most_at_once
     from linkpose.localization.tables import read_beacons, read_truth, score
 
     grid = load_map(map_path) if map_path else None
@@ -205,6 +205,8 @@ def command(
 
         events = with_mice_odometry(events, odometry_path)
     chosen = _settings(settings, own_start)
+    if chosen.ranges.correlation and most_at_once(events) == 1:
+        click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
     tracks = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
     if output is not None:
         write_tracks(output, tracks, log, force)

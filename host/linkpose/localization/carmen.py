@@ -60,7 +60,7 @@ def is_carmen(path: Path) -> bool:
 
 
 def read_carmen(path: Path) -> tuple[Log, Pose]:
-    """Reads a log into events in order of time, which starts at 0, and the odometry's first pose.
+    """Reads a log into events in order of its own time, and the odometry's first pose.
 
     Lines of other sensors are passed over. Raises LinkposeError with file, line and cure for a damaged line.
     """
@@ -92,10 +92,10 @@ def _check_order(path: Path, pair: list[Reading]) -> None:
 
 
 def as_log(readings: list[Reading]) -> Log:
-    """Controls between the odometry's poses, and the scans, on a clock that starts at 0."""
+    """Controls between the odometry's poses, and the scans."""
     log: Log = []
     for i, reading in enumerate(readings):
-        time = reading.time_s - readings[0].time_s
+        time = reading.time_s
         if i == len(readings) - 1:
             log.append(Event(time, "odometry", (0.0, 0.0)))
         elif readings[i + 1].time_s > reading.time_s:  # of two lines at one instant the second has the control

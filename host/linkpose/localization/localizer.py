@@ -302,13 +302,13 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
                 f"{origin} line {event.line}: {event.kind} to beacon {event.beacon}, whose place is not known "
                 f"(known are {', '.join(beacons)}); add it to the beacon file or delete the row"
             )
-    check_correlation(settings.ranges.correlation, _widest(log), "the correlation of the ranges")
+    check_correlation(settings.ranges.correlation, most_at_once(log), "the correlation of the ranges")
     check_correlation(
         settings.motion_correlation, 2 if _vehicle(kinds) is UNICYCLE else 3, "the correlation of the motion's noises"
     )
 
 
-def _widest(log: Log) -> int:
+def most_at_once(log: Log) -> int:
     """The most ranges that one measurement has."""
     beams = max((len(event.ranges_m) for event in log if isinstance(event, Scan)), default=1)
     counts: dict[float, int] = {}
