@@ -145,6 +145,14 @@ def test_a_faulty_mouse_is_found_within_a_fifth_of_a_second_left_out_and_taken_b
     assert np.sqrt(np.mean(error**2)) <= 1.3 * np.sqrt(np.mean(least**2))
 
 
+def test_three_mice_find_the_lifted_one_without_a_gyro():
+    run, block = recorded(2, (Fault("lift", 3, 13.0, 18.0),))
+    blind = replace(block, gyro_rad_s=np.full_like(block.gyro_rad_s, math.nan))
+    excluded = estimate(run, blind)[:, EXCLUDED]
+    assert (excluded[(block.time_s > 13.2) & (block.time_s < 18.0)] == 4).all()
+    assert (excluded[block.time_s < 13.0] == 0).all() and excluded[-1] == 0
+
+
 def test_a_lifted_mouse_is_found_at_the_paper_s_walking_pace_of_a_snail():
     run = MiceRun(0, 15.0, path="paper", faults=(Fault("lift", 2, 5.0, 10.0),))
     block = run.measurements()
@@ -167,12 +175,28 @@ def test_two_mice_that_disagree_are_told_apart_only_with_the_gyro():
 
 
 def test_an_overflowed_count_is_not_used():
-    counts = np.full((4, 3, 2), 10.0)
+    counts = np.full((5, 3, 2), 10.0)
     counts[2, 1] = 32767.0
-    flags = [0, 0, int(SampleFlags.MOUSE2_OVERFLOW), 0]
+    flags = [0, 0, int(SampleFlags.MOUSE2_OVERFLOW), 0, 0]
     out = MiceFilter(Rig(mouse=ring(3))).process(counted(counts, flags=flags))
-    assert out[:, EXCLUDED].tolist() == [0, 0, 2, 0]
-    assert out[2, 0] == pytest.approx(out[1, 0])
+    assert out[:, EXCLUDED].tolist() == [0, 0, 2, 2, 0]
+    np.testing.assert_allclose(out[2:, 0], out[1, 0])
+
+
+@pytest.mark.parametrize("missing", [0.0, math.nan], ids=["flagged valid", "flagged invalid"])
+def test_counts_that_come_late_from_a_mouse_that_had_to_repeat_a_packet_harm_nothing(missing):
+    run, block = recorded(1)
+    counts, late = block.mice_counts, block.mice_counts.copy()
+    for k in range(1500, 2000, 100):  # said again at the next sample; what moved meanwhile comes with the one after
+        late[k, 1] = missing
+        if missing == 0.0:
+            late[k + 1, 1], late[k + 2, 1] = counts[k, 1], counts[k + 1, 1] + counts[k + 2, 1]
+        else:
+            late[k + 1, 1] = counts[k, 1] + counts[k + 1, 1]
+    sound, out = estimate(run, block), estimate(run, replace(block, mice_counts=late))
+    assert set(out[:, EXCLUDED]) <= {0, 2} and (out[:, EXCLUDED] == 2).sum() <= 15
+    assert np.abs(out[1:, :2] - sound[1:, :2]).max() < 0.03
+    assert np.hypot(*(out[-1, 6:8] - sound[-1, 6:8])) < 0.02
 
 
 def test_the_fault_limit_is_a_chi_square_quantile():

@@ -14,8 +14,9 @@ to all mice alike cannot be told from motion: it is not in W, and adds (κ_c ‖
 A mouse that slips, is lifted or dies shows in the residual over a short, exponentially forgetting window, in which the
 roundings cancel: Σ ‖S_i − A_i X‖² / σ_i² against χ² with 2N − 3 degrees of freedom. Each mouse is then left out in
 turn. Two mice that are left explain many a fault of the third as a turn, so the explanation that wins is the one that
-also agrees with the gyro and with what a robot can do in so short a time. A mouse that is excluded is watched, and
-taken back when it has agreed over a time and a distance; at rest everything agrees.
+also agrees with the gyro and with what a robot can do in so short a time. The same test over a single step leaves a
+mouse out for that step: one that must repeat a packet says nothing first, and all at once then. What lasts longer is a
+fault. The mouse is excluded, watched, and taken back when it has agreed over a time and a distance; at rest all agree.
 
 Source: the redundant-mice paper, equations (1)-(17).
 """
@@ -48,6 +49,7 @@ _WINDOW_S = 0.05  # what the window remembers: long enough for a few counts, sho
 _FAULT_Z = 4.75  # of the standard normal: one false alarm in a million tests
 _DECISIVE = 12.0  # by how much of χ² the best explanation must beat the second
 _UNDECIDED_S = 0.1  # after which the best one is taken all the same
+_LATE_S = 0.035  # a packet that is asked for again brings its counts within three samples: so long a fault is forgiven
 _SILENT_S = 0.04  # a mouse without a single count for so long, while the others move, is lifted or dead ...
 _SILENT_BONUS = 25.0  # ... rather than right, and so much of χ² says so
 _AGREES = 9.2  # χ² with two degrees of freedom, 99 %
@@ -96,7 +98,8 @@ class MiceState(NamedTuple):
     reference: Floats  # (3,) mean velocity over the window when the mice last agreed
     gyro: Floats  # (3,) last usable rate (rad/s, NaN for none), its bias beyond the rig's (rad/s), learnt over (s)
     window: Floats  # (M + 1, 2) m: each mouse's motion S_i; last row: the window's time (s) and the gyro's turn (rad)
-    watch: Floats  # (M + 1, 3) s without a count, s and m of agreement; last row: s of disagreement, of all mice
+    watch: Floats  # (M + 1, 4) s without a count, s and m of agreement, s of suspicion; last row: s of disagreement
+    away: Bools  # (M,) whether a mouse had no counts at the last sample
     distrusted: Bools  # (M,)
     rejected: NDArray[np.int64]  # (1,) samples in which no mouse was of use, or time did not go on
 
@@ -104,7 +107,8 @@ class MiceState(NamedTuple):
     def fresh(mice: int) -> MiceState:
         return MiceState(
             np.full(3, np.nan), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.array([np.nan, 0.0, 0.0]),
-            np.zeros((mice + 1, 2)), np.zeros((mice + 1, 3)), np.zeros(mice, np.bool_), np.zeros(1, np.int64),
+            np.zeros((mice + 1, 2)), np.zeros((mice + 1, 4)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_),
+            np.zeros(1, np.int64),
         )  # fmt: skip
 
 
@@ -166,9 +170,19 @@ class Reading(NamedTuple):
     """What one sample says, made usable. Arrays are room that every sample fills anew."""
 
     moved: Floats  # (M, 2) m: motion of each mouse in b over the step
-    sound: Bools  # (M,) whether a mouse has counts
+    sound: Bools  # (M,) whether a mouse has counts of this step
+    trusted: Bools  # (M,) whether they count for the window
     use: Bools  # (M,) whether they count for the estimate
     weight: Floats  # (M,) 1/σ_i² over the window (1/m²)
+
+
+@compiled
+def room(mice: int) -> Reading:
+    """A reading to be filled."""
+    return Reading(
+        np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_),
+        np.zeros(mice),
+    )  # fmt: skip
 
 
 @compiled
@@ -250,30 +264,30 @@ def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MicePa
 
 
 @compiled
-def usable(reading: Reading) -> int:
-    """How many mice count for the estimate."""
+def number(mice: Bools) -> int:
+    """How many are True."""
     count = 0
-    for i in range(reading.use.shape[0]):
-        count += reading.use[i]
+    for i in range(mice.shape[0]):
+        count += mice[i]
     return count
 
 
 @compiled
-def explain(left_out: int, reading: Reading, place: Placement, state: MiceState) -> tuple[float, Vec]:
-    """χ² of the window without one mouse (M: with all), and the motion X that fits it best.
+def explain(left_out: int, sums: Floats, reading: Reading, place: Placement, state: MiceState) -> tuple[float, Vec]:
+    """χ² of some motion without one mouse (M: with all), and the X that fits it best; `sums` are as the window is.
 
     Where too few mice are left for themselves, X has to agree also with the gyro, and with the reference as far as a
     robot keeps its velocity.
     """
-    mice = reading.use.shape[0]
-    span, turn = state.window[mice, 0], state.window[mice, 1] - state.gyro[1] * state.window[mice, 0]
+    mice = reading.trusted.shape[0]
+    span, turn = sums[mice, 0], sums[mice, 1] - state.gyro[1] * sums[mice, 0]
     normal, right, chi2 = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
     for i in range(mice):
-        if reading.use[i] and i != left_out:
-            s = state.window[i]
+        if reading.trusted[i] and i != left_out:
+            s = sums[i]
             normal, right = add_mouse(normal, right, reading.weight[i], place.position[i], s[0], s[1])
     r, linear, angular, by_gyro = vec.load(state.reference), 0.0, 0.0, 0.0
-    if left_out < mice or usable(reading) < 2:
+    if left_out < mice or number(reading.trusted) < 2:
         linear = 1.0 / (_ACCEL_M_S2 * _WINDOW_S * span) ** 2
         angular = 1.0 / (_ANGULAR_RAD_S2 * _WINDOW_S * span) ** 2
         if math.isfinite(state.gyro[0]):
@@ -285,35 +299,42 @@ def explain(left_out: int, reading: Reading, place: Placement, state: MiceState)
         )
     x, _ = solve(normal, (linear, linear, angular + by_gyro), right)
     for i in range(mice):
-        if reading.use[i] and i != left_out:
-            chi2 += reading.weight[i] * misfit(x, place.position[i], state.window[i])
+        if reading.trusted[i] and i != left_out:
+            chi2 += reading.weight[i] * misfit(x, place.position[i], sums[i])
     chi2 += linear * ((x[0] - r[0] * span) ** 2 + (x[1] - r[1] * span) ** 2)
     chi2 += angular * (x[2] - r[2] * span) ** 2 + by_gyro * (x[2] - turn) ** 2
     return chi2, x
 
 
 @compiled
-def find_fault(reading: Reading, step: float, place: Placement, state: MiceState) -> int:
-    """The mouse to exclude, −1 for none (yet)."""
-    mice, count = reading.use.shape[0], usable(reading)
+def find_fault(
+    sums: Floats, span: float, noise: float, p: MiceParameters, reading: Reading, place: Placement, state: MiceState
+) -> tuple[bool, int, bool]:
+    """Whether the mice disagree on some motion, who is most likely at fault, and whether that is beyond doubt.
+
+    `span` is the time of the motion (s); `noise` is the variance (m²) that it has from sample to sample.
+    """
+    mice, count = reading.sound.shape[0], number(reading.trusted)
+    usual = (state.reference[0] * span, state.reference[1] * span, state.reference[2] * span)
+    for i in range(mice):
+        per_count, at = place.metres_per_count[i], place.position[i]
+        reading.weight[i] = 1.0 / variance(per_count, usual, at, p.mismatch, noise)
     # Of two mice one can go only where the gyro takes its part.
     if count < 2 or (count == 2 and not math.isfinite(state.gyro[0])):
-        return -1
-    if not explain(mice, reading, place, state)[0] > fault_limit(2 * count - 3):
-        state.watch[mice, 0] = 0.0
-        return -1
-    state.watch[mice, 0] += step
-    best, second, worst = math.inf, math.inf, -1
+        return False, 0, False
+    if not explain(mice, sums, reading, place, state)[0] > fault_limit(2 * count - 3):
+        return False, 0, False
+    best, second, worst = math.inf, math.inf, 0
     for i in range(mice):
-        if reading.use[i]:
-            chi2, _ = explain(i, reading, place, state)
+        if reading.trusted[i]:
+            chi2, _ = explain(i, sums, reading, place, state)
             if state.watch[i, 0] >= _SILENT_S:
                 chi2 -= _SILENT_BONUS
             if chi2 < best:
                 best, second, worst = chi2, best, i
             else:
                 second = min(second, chi2)
-    return worst if second - best > _DECISIVE or state.watch[mice, 0] >= _UNDECIDED_S else -1
+    return True, worst, second - best > _DECISIVE
 
 
 @compiled
@@ -337,9 +358,9 @@ def remember(reading: Reading, dt: float, step: float, rate: float, place: Place
 @compiled
 def agree(reading: Reading, step: float, rate: float, place: Placement, state: MiceState) -> None:
     """What follows from mice that agree: the reference, the gyro's bias, and excluded mice that are taken back."""
-    mice, count = reading.sound.shape[0], usable(reading)
+    mice, count = reading.sound.shape[0], number(reading.trusted)
     span = state.window[mice, 0]
-    _, x = explain(mice, reading, place, state)
+    _, x = explain(mice, state.window, reading, place, state)
     for j in range(3):
         state.reference[j] = x[j] / span
     if count >= 2 and math.isfinite(rate):
@@ -359,26 +380,53 @@ def agree(reading: Reading, step: float, rate: float, place: Placement, state: M
 
 
 @compiled
+def leave_out_for_now(
+    reading: Reading, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
+) -> None:
+    """A mouse whose counts of this one step cannot be: late, and all at once when they come."""
+    mice = reading.sound.shape[0]
+    sums = np.empty((mice + 1, 2))
+    for i in range(mice):
+        sums[i, 0], sums[i, 1] = reading.moved[i, 0], reading.moved[i, 1]
+    sums[mice, 0], sums[mice, 1] = step, rate * step if math.isfinite(rate) else 0.0
+    disagree, worst, beyond_doubt = find_fault(sums, step, (step * p.noise_m_s) ** 2, p, reading, place, state)
+    if disagree and beyond_doubt:
+        reading.use[worst] = False
+
+
+@compiled
+def exclude(reading: Reading, step: float, place: Placement, p: MiceParameters, state: MiceState) -> bool:
+    """Takes the trust from a mouse that has been at fault in the window for long enough; whether there is one."""
+    mice = reading.sound.shape[0]
+    span = state.window[mice, 0]
+    noise = 0.5 * span * step * p.noise_m_s**2
+    disagree, worst, beyond_doubt = find_fault(state.window, span, noise, p, reading, place, state)
+    state.watch[mice, 0] = state.watch[mice, 0] + step if disagree else 0.0
+    is_found = disagree and (beyond_doubt or state.watch[mice, 0] >= _UNDECIDED_S)
+    for i in range(mice):
+        state.watch[i, 3] = state.watch[i, 3] + step if is_found and i == worst else 0.0
+    if not (is_found and state.watch[worst, 3] >= _LATE_S):
+        return False
+    state.distrusted[worst], reading.trusted[worst], reading.use[worst] = True, False, False
+    state.watch[worst, 1] = state.watch[worst, 2] = state.watch[worst, 3] = state.watch[mice, 0] = 0.0
+    return True
+
+
+@compiled
 def correct(
     reading: Reading, dt: float, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
 ) -> bool:
     """Velocity from counts that cover the last `step` of `dt` (s); False where they do not tell it."""
     mice = reading.sound.shape[0]
+    if dt == step:
+        leave_out_for_now(reading, step, rate, place, p, state)
     if not (step > 0.0 and fuse(reading, step, rate, place, p, state)):
         return False
     remember(reading, dt, step, rate, place, state)
     if dt > step:  # a gap: what the robot did before it tells little of what it does now
         for j in range(3):
             state.reference[j] = state.velocity[j]
-    span = state.window[mice, 0]
-    usual = (state.reference[0] * span, state.reference[1] * span, state.reference[2] * span)
-    for i in range(mice):
-        count, at = place.metres_per_count[i], place.position[i]
-        reading.weight[i] = 1.0 / variance(count, usual, at, p.mismatch, 0.5 * span * step * p.noise_m_s**2)
-    faulty = find_fault(reading, step, place, state)
-    if faulty >= 0:
-        state.distrusted[faulty], reading.use[faulty] = True, False
-        state.watch[faulty, 1] = state.watch[faulty, 2] = state.watch[mice, 0] = 0.0
+    if exclude(reading, step, place, p, state):
         fuse(reading, step, rate, place, p, state)
     if state.watch[mice, 0] == 0.0:
         agree(reading, step, rate, place, state)
@@ -430,7 +478,10 @@ def advance(
     """One sample. After a gap its counts cover one usual interval only: what the lost samples counted is lost."""
     dt = time_s - state.time[0]
     for i in range(reading.sound.shape[0]):
-        reading.use[i] = reading.sound[i] and not state.distrusted[i]
+        was_away, state.away[i] = state.away[i], not reading.sound[i]
+        reading.sound[i] = reading.sound[i] and not was_away  # who knows since when its first counts were gathered
+        reading.trusted[i] = reading.sound[i] and not state.distrusted[i]
+        reading.use[i] = reading.trusted[i]
     if not dt > 0.0:  # also the first sample, whose interval nobody knows
         if math.isnan(state.time[0]):
             state.time[0] = time_s
@@ -468,7 +519,7 @@ def _process(
     out: Floats,
 ) -> None:
     mice = place.position.shape[0]
-    reading = Reading(np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice))
+    reading = room(mice)
     for i in range(len(time_s)):
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
         read_mice(counts[i], flags[i], place, reading)

@@ -136,7 +136,7 @@ def _measure(
     reading: Reading, step: float, place: Placement, p: MiceParameters, mean: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Velocities of the mice that count (2 m,), their R (2 m, 2 m), and their places (m, 2)."""
-    count = mice.usable(reading)
+    count = mice.number(reading.use)
     values, covariance, places = np.empty(2 * count), np.zeros((2 * count, 2 * count)), np.empty((count, 2))
     square = mean[3] * mean[3] + mean[4] * mean[4]
     common, apart = p.floor * p.floor * square, p.mismatch * p.mismatch * square * _LASTS_S / step
@@ -195,7 +195,7 @@ def _process(
     out: Floats,
 ) -> None:
     count = place.position.shape[0]
-    reading = Reading(np.zeros((count, 2)), np.zeros(count, np.bool_), np.zeros(count, np.bool_), np.zeros(count))
+    reading = mice.room(count)
     rate, rate_noise, nothing = np.empty(1), np.full((1, 1), imu.gyro_variance), np.empty((0, 2))
     for i in range(len(time_s)):
         dt = time_s[i] - state.mice.time[0]
