@@ -62,9 +62,9 @@ class JointInertialParameters(NamedTuple):
     """What the filter assumes."""
 
     gyro_bias_std_rad_s: float = 0.35  # at switch-on: the data sheet's ±20 °/s
-    accel_bias_std_m_s2: float = 0.3
+    accel_bias_std_m_s2: float = 0.1
     gyro_bias_walk_rad_s: float = 1e-4  # in a second
-    accel_bias_walk_m_s2: float = 1e-3  # in a second
+    accel_bias_walk_m_s2: float = 1e-4  # in a second
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
     accel_misfit: float = 0.003  # noise in proportion to the force: scale and alignment
     lever_misfit: float = 0.005  # of the lever that the gyro tells, as a share of ‖d₀‖
