@@ -103,18 +103,35 @@ def test_angles_are_compared_on_the_circle(tmp_path):
     assert scores(path, reference)["tilt"]["roll_rmse_deg"] == pytest.approx(2.0, abs=1e-3)
 
 
-def test_planar_filters_have_their_own_keys(tmp_path):
+def planar_truth():
     columns = {"x_m": np.sin(T), "y_m": T, "heading_rad": T, "vx_m_s": np.cos(T), "vy_m_s": np.sin(T)}
-    columns["wz_rad_s"] = np.cos(0.3 * T)
-    reference = write(tmp_path / "truth.csv", {"time_s": T} | columns)
-    off = {f"mice_{name}": value + 0.3 for name, value in columns.items()}
-    path = write(tmp_path / "estimate.csv", {"time_s": T, "mice_excluded": 0 * T} | off)
-    found = scores(path, reference)["mice"]
+    return columns | {"wz_rad_s": np.cos(0.3 * T)}
+
+
+def test_planar_filters_have_their_own_keys(tmp_path):
+    reference = write(tmp_path / "truth.csv", {"time_s": T} | planar_truth())
+    off = {f"ekf_{name}": value + 0.3 for name, value in planar_truth().items()}
+    path = write(tmp_path / "estimate.csv", {"time_s": T} | off)
+    found = scores(path, reference)["ekf"]
     assert found == {
-        "filter": "mice", "rows": 3000, "velocity_rmse_m_s": pytest.approx(0.3 * 2**0.5),
+        "filter": "ekf", "rows": 3000, "velocity_rmse_m_s": pytest.approx(0.3 * 2**0.5),
         "rate_rmse_rad_s": pytest.approx(0.3), "position_rmse_m": pytest.approx(0.3 * 2**0.5),
         "heading_rmse_rad": pytest.approx(0.3),
     }  # fmt: skip
+
+
+def test_odometry_counts_from_where_the_reference_stood_at_its_start(tmp_path):
+    """Moved and turned as a whole, it is right; stretched by a hundredth, it is wrong by a hundredth of the way."""
+    truth = planar_truth()
+    reference = write(tmp_path / "truth.csv", {"time_s": T} | truth)
+    turned = np.exp(2.5j) * (truth["x_m"] + 1j * truth["y_m"]) + (3 - 4j)
+    heading = np.angle(np.exp(1j * (truth["heading_rad"] + 2.5)))
+    for stretch, error in ((1.0, 0.0), (1.01, 0.01 * np.sqrt(np.mean(np.sin(T) ** 2 + T**2)))):
+        estimate = {"time_s": T, "mice_x_m": stretch * turned.real, "mice_y_m": stretch * turned.imag}
+        path = write(tmp_path / f"{stretch}.csv", estimate | {"mice_heading_rad": heading, "mice_excluded": 0 * T})
+        found = scores(path, reference)["mice"]
+        assert found["position_rmse_m"] == pytest.approx(error, rel=0.01, abs=1e-6)
+        assert found["heading_rmse_rad"] == pytest.approx(0, abs=1e-6)
 
 
 def test_the_table_for_people(tmp_path, reference):

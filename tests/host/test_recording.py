@@ -247,6 +247,11 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
     assert "has no closing line" in part.remarks[0]
 
 
+def test_a_plain_file_needs_no_newline_at_its_end(tmp_path):
+    (tmp_path / "truth.csv").write_text("time_s,x_m\n0,1\n1,2")
+    assert read_table(tmp_path / "truth.csv").columns["x_m"].tolist() == [1.0, 2.0]
+
+
 def test_an_existing_file_is_kept_unless_forced(linkpose, refused, tmp_path):
     (tmp_path / "r.csv").write_text("precious")
     assert "exists already" in refused("record", tmp_path / "r.csv", "--port", "sim://link", "--duration", 0.1)

@@ -125,6 +125,7 @@ def _live(
         capture = stack.enter_context(live.raw_capture(raw, request.force))
         session = stack.enter_context(Session(port or choose_port(), console.say, capture))
         rig = options.resolve_rig(request.rig_file, request.j2s, session.rig)
+        session.wait_for_mice(len(rig.mouse))
         with _patience(console):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 

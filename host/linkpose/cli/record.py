@@ -40,6 +40,7 @@ def command(
     console = live.Console(quiet, verbose)
     with live.raw_capture(raw, force) as capture, Session(port or choose_port(), console.say, capture) as session:
         rig = options.resolve_rig(rig_file, None, session.rig)
+        session.wait_for_mice(len(rig.mouse))
         console.detail(f"firmware {session.hello}")
         with live.Recorder(session, path, rig, force) as recorder:
             console.say(f"recording to {path}" + ("" if duration else ", Ctrl-C ends"))

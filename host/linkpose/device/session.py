@@ -44,6 +44,7 @@ HANDSHAKE_TIMEOUT_S = 4.0  # a bootloader waits for up to two seconds before it 
 ASK_INTERVAL_S = 0.4
 ANSWER_TIMEOUT_S = 1.0
 SELF_TEST_TIMEOUT_S = 3.0
+MICE_TIMEOUT_S = 1.5
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
@@ -167,6 +168,14 @@ class Session:
         self._link.send(GetInfo())
         self.hello = self._await(Hello, "GET_INFO")
         return self.hello
+
+    def wait_for_mice(self, count: int) -> None:
+        """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
+        deadline = time.monotonic() + MICE_TIMEOUT_S
+        while Settings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
+            time.sleep(ASK_INTERVAL_S)
+            self._link.send(GetInfo())
+            self.hello = self._await(Hello, "GET_INFO")
 
     def self_test(self) -> SelfTestResult:
         """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""

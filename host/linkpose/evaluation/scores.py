@@ -15,6 +15,8 @@ from linkpose.sensors.measurements import Floats
 # What an estimate's column ends with is what the reference's column is called. Longest first: `_vx_m_s` is not `_x_m`.
 _LINK = ("height_m", "roll_deg", "pitch_deg")
 _PLANAR = ("vx_m_s", "vy_m_s", "wz_rad_s", "x_m", "y_m", "heading_rad")
+_POSE = ("x_m", "y_m", "heading_rad")
+_ODOMETRIC = ("mice", "planar-ekf", "planar-ukf")  # their poses count from where the robot stood at their first sample
 _ANGLES = {"roll_deg": np.pi / 180, "pitch_deg": np.pi / 180, "heading_rad": 1.0}  # radians in a unit
 
 
@@ -91,6 +93,8 @@ def _score(
 ) -> Score:
     errors = {quantity: difference(ours, theirs, offset_s) for quantity, (ours, theirs) in both.items()}
     is_planar = not any(quantity in _LINK for quantity in errors)
+    if name in _ODOMETRIC and all(quantity in errors for quantity in _POSE):
+        errors |= _from_common_start({quantity: both[quantity][0].value for quantity in _POSE}, errors)
     compared = np.logical_or.reduce([np.isfinite(error) for error in errors.values()])
     if not compared.any():
         raise LinkposeError(
@@ -99,6 +103,22 @@ def _score(
         )
     rms = _planar(errors) if is_planar else _link(errors)
     return Score(name, int(compared.sum()), rms, offset_s, is_planar)
+
+
+def _from_common_start(pose: Mapping[str, Floats], errors: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Errors of a pose (x, y, heading) moved as a whole to agree with the reference at the first common instant."""
+    both = np.flatnonzero(np.logical_and.reduce([np.isfinite(errors[quantity]) for quantity in _POSE]))
+    if not len(both):
+        return {}
+    first = both[0]
+    turn = -errors["heading_rad"][first]
+    x, y = (pose[quantity] - pose[quantity][first] for quantity in ("x_m", "y_m"))
+    moved_x, moved_y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
+    return {
+        "x_m": moved_x - x + errors["x_m"] - errors["x_m"][first],
+        "y_m": moved_y - y + errors["y_m"] - errors["y_m"][first],
+        "heading_rad": (errors["heading_rad"] + turn + np.pi) % (2 * np.pi) - np.pi,
+    }
 
 
 def _link(errors: Mapping[str, Floats]) -> dict[str, float]:

@@ -47,7 +47,7 @@ def read_bytes(path: Path) -> bytes:
 def read_table(path: Path, kind: str | None = None) -> Table:
     """Reads a linkpose CSV (of one kind, when `kind` names it) or a plain CSV with a header of names.
 
-    An incomplete last line, as a killed program leaves it, is left out. Raises LinkposeError naming the file and the
+    An incomplete last line of linkpose's own, as a killed program leaves it, is left out. Raises LinkposeError naming the file and the
     line for anything else that is not a number, a row of another length, or a time that runs backwards.
     """
     data = read_bytes(path)
@@ -62,6 +62,8 @@ def read_table(path: Path, kind: str | None = None) -> Table:
         raise LinkposeError(f"{path} ends before its first row; it holds no data")
     names = [name.strip() for name in data[offset:header_end].decode("utf-8", "replace").strip().split(",")]
     _check_names(path, names, lines_before + 1)
+    if not found and not data.endswith(b"\n"):  # typed by hand, not cut by a kill
+        data += b"\n"
     body, closing = _closing(data[header_end + 1 :])
     values = _numbers(path, body, len(names), lines_before + 2)
     columns = {name: np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
