@@ -13,6 +13,10 @@ Mpu6050::Settings imu_settings(const wire::Configure& settings) {
 // The SAMPLE does not wait longer for the requests of a tick than this: at 500 Hz a tick is 2 ms.
 constexpr uint32_t kSampleDeadlineUs = 1500;
 
+// A conversion begins at the end of its request, and after a tick not before this.
+constexpr uint32_t kConversionRequestUs = 120;
+constexpr uint32_t kConversionsBeginUs = 1000;
+
 }  // namespace
 
 Sampler::Sampler(const wire::Configure& settings, Mice& mice)
@@ -89,11 +93,18 @@ bool Sampler::requests_pending() {
     I2cRequest request;
     const uint32_t now = clock::now_us();
     if (phase_ == Phase::kImuRequests && !imu_.next(now, request)) phase_ = Phase::kBaroRequests;
-    if (phase_ == Phase::kBaroRequests && !baro_.next(now, request)) return false;
+    if (phase_ == Phase::kBaroRequests && (too_late_to_convert() || !baro_.next(now, request))) return false;
     if (!twi::begin_request(request)) return false;  // at the next tick, then
     request_running_ = true;
     request_is_imu_ = phase_ == Phase::kImuRequests;
   }
+}
+
+// A conversion that would fit between two bursts, but not any more before the next one, waits for the next tick.
+bool Sampler::too_late_to_convert() const {
+  const uint32_t needed_us = baro_.conversion_ahead_us();
+  if (needed_us == 0 || clock::steps_left() / 2 >= needed_us + kConversionRequestUs) return false;
+  return (needed_us + kConversionsBeginUs) * settings_.sample_rate_hz < 1000000;
 }
 
 void Sampler::finish_request(bool ok) {

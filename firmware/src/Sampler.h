@@ -34,6 +34,7 @@ class Sampler {
   void take_burst();
   void tell_sensors();
   bool requests_pending();
+  bool too_late_to_convert() const;
   void finish_request(bool ok);
   void send_sample();
   void send_self_test_result();

@@ -86,6 +86,24 @@ TEST_CASE("BMP180: valid two conversions after power-on") {
   CHECK(driver.valid());
 }
 
+TEST_CASE("BMP180: says how long the conversion takes that it is about to start") {
+  Bmp180 driver(1);
+  FakeSensor sensor;
+  uint8_t data[I2cRequest::kMaxRead];
+  I2cRequest request;
+  CHECK(driver.conversion_ahead_us() == 0);  // first it asks who answers
+  for (int i = 0; i < 2; i++) {
+    REQUIRE(driver.next(0, request));
+    driver.finish(sensor.carry_out(request, 0, data), data, 0);
+  }
+  CHECK(driver.conversion_ahead_us() == 4500);  // a temperature comes first
+  tick(driver, sensor, 0);
+  CHECK(driver.conversion_ahead_us() == 0);  // it is under way
+  REQUIRE(driver.next(10000, request));
+  driver.finish(sensor.carry_out(request, 10000, data), data, 10000);
+  CHECK(driver.conversion_ahead_us() == 7500);
+}
+
 TEST_CASE("BMP180: every oversampling is read no sooner than it is ready, at every rate") {
   for (uint8_t oversampling = 0; oversampling < 4; oversampling++) {
     for (uint32_t rate : {50, 100, 125, 200, 500}) {

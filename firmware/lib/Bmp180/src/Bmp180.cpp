@@ -26,6 +26,12 @@ uint8_t Bmp180::command() const {
   return pressures_left_ == 0 ? kMeasureTemperature : kMeasurePressure | converting_oversampling_ << 6;
 }
 
+uint32_t Bmp180::conversion_us(uint8_t oversampling) const {
+  return pressures_left_ == 0 ? kTemperatureUs : pressure_time_us(oversampling);
+}
+
+uint32_t Bmp180::conversion_ahead_us() const { return state_ == State::kStart ? conversion_us(oversampling_) : 0; }
+
 bool Bmp180::next(uint32_t now_us, I2cRequest& request) {
   const bool due = static_cast<int32_t>(now_us - due_us_) >= 0;
   switch (state_) {
@@ -52,7 +58,7 @@ void Bmp180::finish(bool ok, const uint8_t* data, uint32_t now_us) {
       state_ = State::kStart;
       break;
     case State::kStart:
-      due_us_ = now_us + (pressures_left_ == 0 ? kTemperatureUs : pressure_time_us(converting_oversampling_));
+      due_us_ = now_us + conversion_us(converting_oversampling_);
       state_ = State::kConvert;
       break;
     default:

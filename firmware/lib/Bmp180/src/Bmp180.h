@@ -21,6 +21,8 @@ class Bmp180 {
   // The next transaction wanted now, if any; finish() must be called before it is asked again.
   bool next(uint32_t now_us, I2cRequest& request);
   void finish(bool ok, const uint8_t* data, uint32_t now_us);
+  // How long the conversion takes that the next transaction starts, us; 0 when it starts none.
+  uint32_t conversion_ahead_us() const;
 
   bool present() const { return present_; }
   bool settled() const { return present_ || tried_; }
@@ -39,6 +41,7 @@ class Bmp180 {
   enum class State : uint8_t { kIdentify, kCalibrate, kStart, kConvert };
 
   uint8_t command() const;
+  uint32_t conversion_us(uint8_t oversampling) const;
   void lost(uint32_t now_us);
   bool take_calibration(const uint8_t* data);
   void take_result(const uint8_t* data);
