@@ -15,7 +15,7 @@ from linkpose.sensors.rig import Rig, Vector
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class VectorType(click.ParamType[Vector]):
+class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
     """Three numbers, X,Y,Z."""
 
     name = "X,Y,Z"
@@ -31,7 +31,7 @@ class VectorType(click.ParamType[Vector]):
         return x, y, z
 
 
-class SecondsType(click.ParamType[float]):
+class SecondsType(click.ParamType):  # type: ignore[type-arg]
     """A time of more than 0 s."""
 
     name = "S"
