@@ -34,7 +34,9 @@ NON_NEGATIVE = options.FiniteRange(min=0)
     "--correlation-interval", type=options.SecondsType(), default=1.0, show_default=True, help="How long it stays (s)."
 )
 @click.option("--outliers", type=click.IntRange(min=0), default=60, show_default=True, help="How many, Table 2.9.")
-@click.option("--outlier-size", type=options.FiniteRange(min=0.1), default=5.0, show_default=True, help="What each adds (m).")
+@click.option(
+    "--outlier-size", type=options.FiniteRange(min=0.1), default=5.0, show_default=True, help="What each adds (m)."
+)
 @options.force
 @options.as_json
 def command(
