@@ -48,7 +48,7 @@ def read_table(path: Path, kind: str | None = None) -> Table:
     """Reads a linkpose CSV (of one kind, when `kind` names it) or a plain CSV with a header of names.
 
     An incomplete last line of linkpose's own, as a killed program leaves it, is left out. Raises LinkposeError naming
-    the file and the line for anything else that is not a number, a row of another length, or a time that runs backwards.
+    the file and the line for whatever else is not a number, a row of another length, or a time that runs backwards.
     """
     data = read_bytes(path)
     lines_before, offset, comments = _head_lines(data)
