@@ -37,6 +37,24 @@ def test_scale_and_angle_of_each_mouse_come_back(mice, seed):
         assert mouse.counts_per_m_std < 0.002 * mouse.counts_per_m and mouse.residual_mm < 2
 
 
+@pytest.mark.parametrize("mice", [2, 3])
+def test_a_line_of_unknown_length_will_do_where_the_turn_tells_the_scale(mice):
+    run, line = driven("line", mice=ring(mice))
+    _, turn = driven("turn", mice=ring(mice))
+    found = calibrate_mice([turn, line], run.rig, None)
+    for i, mouse in enumerate(found):
+        assert mouse.counts_per_m == pytest.approx(run.true_counts_per_m[i], rel=0.01)
+        assert abs(mouse.counts_per_m - run.true_counts_per_m[i]) < 4 * mouse.counts_per_m_std
+        assert mouse.angle_deg == pytest.approx(run.true_angle_deg[i], abs=0.2)
+
+
+def test_one_mouse_needs_the_length():
+    run, line = driven("line", mice=ring(1))
+    _, turn = driven("turn", mice=ring(1))
+    with pytest.raises(LinkposeError, match="give it with --length"):
+        calibrate_mice([turn, line], run.rig, None)
+
+
 def test_mice_mounted_at_any_angle_are_told():
     mounted = tuple(replace(mouse, angle_deg=angle) for mouse, angle in zip(ring(3), (0, 120, -95), strict=True))
     run, line = driven("line", errors="none", mice=mounted)

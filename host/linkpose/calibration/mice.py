@@ -7,7 +7,8 @@ g_i = e^{jφ_i} / (counts per metre), (6) and (7) integrated are linear in all t
     a turn of Θ about wherever             g_i c_i − D = jΘ p_i
 
 D, by how far the robot's centre went (in its own, turning axes), is found as well: the robot need not turn on the spot.
-The ahead of the robot's frame is by definition the way along which the line goes.
+So is L where nobody measured it: the scale then comes from the turn and from where two or more mice sit. The ahead of
+the robot's frame is by definition the way along which the line goes.
 
 Source: the redundant-mice paper, (6), (7).
 """
@@ -59,8 +60,8 @@ class _DriveSums:
     turns: int  # full ones
 
 
-def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float) -> list[MouseCalibration]:
-    """Each mouse of the rig. `length_m` is that of every line; the rig says where the mice sit.
+def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | None) -> list[MouseCalibration]:
+    """Each mouse of the rig. `length_m` is that of every line, None where it is not known; the rig places the mice.
 
     Raises LinkposeError naming the drive and the cure for a rig without mice, a motion that is missing or is neither a
     line nor full turns, a recording that did not see it all, and mice that contradict their places.
@@ -69,11 +70,14 @@ def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float) -
         raise LinkposeError("the rig file does not say where the mice sit: add [[mouse]] with x_m, y_m, port by port")
     drives = [_sums(recording, len(rig.mouse)) for recording in recordings]
     if all(drive.turns for drive in drives):
-        raise LinkposeError(f"no recording is of a straight line; drive one of {length_m:g} m and add its recording")
+        line = f"one of {length_m:g} m" if length_m else "one of a metre or more"
+        raise LinkposeError(f"no recording is of a straight line; drive {line} and add its recording")
     if not any(drive.turns for drive in drives):
         raise LinkposeError("no recording is of a full turn; turn the robot once round and add its recording")
     places = np.array([complex(mouse.x_m, mouse.y_m) for mouse in rig.mouse])
     design, target = _equations(drives, places, length_m)
+    if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
+        raise LinkposeError("these drives do not tell the scale; measure the line and give it with --length M")
     solution, covariance, residual = _least_squares(design, target)
     _check_fit(residual, len(rig.mouse))
     return [_described(i, solution, covariance, _own(residual, i, drives, len(places))) for i in range(len(places))]
@@ -146,13 +150,16 @@ def _turned(name: str, m: Measurements, first: int, last: int) -> float:
 # ---- least squares ----
 
 
-def _equations(drives: Sequence[_DriveSums], places: NDArray[np.complex128], length_m: float) -> tuple[Floats, Floats]:
+def _equations(
+    drives: Sequence[_DriveSums], places: NDArray[np.complex128], length_m: float | None
+) -> tuple[Floats, Floats]:
     """Design matrix and right-hand side, each row over its standard deviation. The rows of a drive are 2 to a mouse.
 
-    Unknowns: real and imaginary part of each g_i; for each drive δ (a line) or the two parts of D (a turn).
+    Unknowns: real and imaginary part of each g_i; for each drive δ (a line) or the two parts of D (a turn); last the
+    lines' length where it is not given.
     """
     mice = len(places)
-    width = 2 * mice + sum(2 if drive.turns else 1 for drive in drives)
+    width = 2 * mice + sum(2 if drive.turns else 1 for drive in drives) + (length_m is None)
     rows, target = [], []
     own = 2 * mice
     for drive in drives:
@@ -160,7 +167,7 @@ def _equations(drives: Sequence[_DriveSums], places: NDArray[np.complex128], len
         for i in range(mice):
             std = PLACE_STD_M * FULL_TURN * abs(drive.turns) if drive.turns else LINE_STD_M
             c = drive.counts[i]
-            aim = FULL_TURN * drive.turns * arm[i] if drive.turns else complex(length_m)
+            aim = FULL_TURN * drive.turns * arm[i] if drive.turns else complex(length_m or 0.0)
             for part, of_g, of_arm, value in (
                 (0, (c.real, -c.imag), arm[i].real, aim.real),
                 (1, (c.imag, c.real), arm[i].imag, aim.imag),
@@ -168,6 +175,8 @@ def _equations(drives: Sequence[_DriveSums], places: NDArray[np.complex128], len
                 row = np.zeros(width)
                 row[2 * i : 2 * i + 2] = of_g
                 row[own + (part if drive.turns else 0)] = -1.0 if drive.turns else -of_arm
+                if length_m is None and not drive.turns and part == 0:
+                    row[-1] = -1.0
                 rows.append(row / std)
                 target.append(value / std)
         if not drive.turns:

@@ -17,9 +17,14 @@ if TYPE_CHECKING:
 @click.command("mice")
 @click.argument("recordings", type=options.FILE, nargs=-1, required=True)
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to complete: it places the mice.")
-@click.option("--length", type=float, required=True, metavar="M", help="Length of the straight line (m).")
+@click.option(
+    "--length",
+    type=options.FiniteRange(min=0, min_open=True),
+    metavar="M",
+    help="Length of the straight line (m). Without it the scale comes from the turn and from where the mice sit.",
+)
 @options.as_json
-def command(recordings: tuple[Path, ...], rig_file: Path, length: float, json_lines: bool) -> None:
+def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, json_lines: bool) -> None:
     """Find counts per metre and mounting angle of each mouse, and write them into the rig file.
 
     Measure where each mouse sits (x_m ahead, y_m to the left of the robot's centre) and write it into the rig file.
@@ -29,8 +34,6 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float, json_li
     from linkpose.calibration.mice import calibrate_mice, with_calibration
     from linkpose.recording.reader import load_recording
 
-    if not 0 < length < float("inf"):
-        raise click.UsageError("--length is that of the line in metres, above 0")
     loaded = [load_recording(path) for path in recordings]
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_mice(loaded, rig, length)
