@@ -18,7 +18,7 @@ from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
 from linkpose.wire.frames import encode
-from linkpose.wire.messages import Configure, Hello
+from linkpose.wire.messages import Ack, Command, Configure, Hello
 
 
 @pytest.fixture
@@ -166,8 +166,25 @@ def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
         reset = (0.3, lambda: board.reset(says_hello=False))
         said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 2.5, reset)
-    assert "was reset" in said[0]
+    assert "no sample for 1.5 s" in said[0] and "was reset" in said[1]
     check_one_gap(tmp_path / "r.csv", "reset")
+
+
+def test_a_port_that_goes_during_the_handshake_is_a_sentence(impatient, refused, tmp_path):
+    with stranger(tmp_path / "port", b"") as board:
+        pull = threading.Timer(0.3, board.pull)
+        pull.start()
+        said = refused("info", "--port", tmp_path / "port")
+        pull.join()
+    assert "is gone" in said and "check the cable" in said
+
+
+def test_an_ack_of_start_that_is_lost_costs_no_sample(tmp_path):
+    start_ack = encode(Ack(Command.START))
+    port = tmp_path / "port"
+    with PtyBoard(port, spoil=lambda data: data.replace(start_ack, b"")), Session(str(port), print) as session:
+        seqs = [p.place.seq for placements in session.stream(0.3) for p in placements]
+    assert seqs == list(range(30))
 
 
 def test_corrupt_bytes_are_counted_and_lost_samples_too(tmp_path, linkpose):

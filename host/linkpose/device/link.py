@@ -21,8 +21,12 @@ from linkpose.wire.messages import Message
 READ_SIZE = 4096
 
 
-class Disconnected(Exception):
-    """The port has gone: the cable was pulled, or the simulated board was switched off."""
+class Disconnected(LinkposeError):
+    """The port has gone: the cable was pulled, or what was behind it has ended."""
+
+    def __init__(self, port: str, reason: Exception) -> None:
+        super().__init__(f"{port} is gone ({reason}); check the cable and try again")
+        self.reason = reason
 
 
 @dataclass(slots=True)
@@ -43,6 +47,7 @@ class Link:
 
     def __init__(self, port: str, capture: BinaryIO | None = None) -> None:
         self.decoder = StreamDecoder(from_board=True)
+        self._name = port
         self._port = open_port(port)
         self._capture = capture
         self.now: Callable[[], float] = getattr(self._port, "clock", time.monotonic)
@@ -71,7 +76,7 @@ class Link:
         try:
             self._port.write(encode(message))
         except (serial.SerialException, OSError) as error:
-            raise Disconnected(str(error)) from error
+            raise Disconnected(self._name, error) from error
         return sent
 
     def receive(self, timeout_s: float) -> Arrival | None:
@@ -82,7 +87,7 @@ class Link:
             return None
         if isinstance(item, Exception):
             self._arrived.put(item)  # whoever asks again hears it again
-            raise Disconnected(str(item)) from item
+            raise Disconnected(self._name, item) from item
         time_s, data = item
         if self._capture is not None:
             try:

@@ -43,6 +43,7 @@ from linkpose.wire.messages import (
 HANDSHAKE_TIMEOUT_S = 4.0  # a bootloader waits for up to two seconds before it starts the firmware
 ASK_INTERVAL_S = 0.4
 ANSWER_TIMEOUT_S = 1.0
+ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 1.5
 FIRST_PINGS = 5
@@ -128,25 +129,22 @@ class Session:
         link = self._link
         heard = bytearray()
         deadline, ask_at = time.monotonic() + HANDSHAKE_TIMEOUT_S, 0.0
-        try:
-            while time.monotonic() < deadline:
-                if time.monotonic() >= ask_at:
-                    link.send(Stop())
-                    link.send(GetInfo())
-                    ask_at = time.monotonic() + ASK_INTERVAL_S
-                arrival = link.receive(0.05)
-                if arrival is None:
-                    continue
-                heard += arrival.data[: 512 - len(heard)]
-                for message in arrival.messages:
-                    if isinstance(message, OtherProtocol):
-                        raise WrongBoard(_other_protocol(message))
-                    if isinstance(message, Hello) and not message.streaming:
-                        self._check_versions(message)
-                        link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
-                        return message
-        except Disconnected as error:
-            raise LinkposeError(f"{self.port} went away during the handshake ({error}); check the cable") from error
+        while time.monotonic() < deadline:
+            if time.monotonic() >= ask_at:
+                link.send(Stop())
+                link.send(GetInfo())
+                ask_at = time.monotonic() + ASK_INTERVAL_S
+            arrival = link.receive(0.05)
+            if arrival is None:
+                continue
+            heard += arrival.data[: 512 - len(heard)]
+            for message in arrival.messages:
+                if isinstance(message, OtherProtocol):
+                    raise WrongBoard(_other_protocol(message))
+                if isinstance(message, Hello) and not message.streaming:
+                    self._check_versions(message)
+                    link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    return message
         raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
 
     def _check_versions(self, hello: Hello) -> None:
@@ -183,14 +181,20 @@ class Session:
         return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
 
     def _command(self, message: Message, command: Command) -> Arrival:
-        """Sends a command; the arrival that holds its ACK, from the ACK on. Raises LinkposeError on a NAK."""
-        self._link.send(message)
-        for arrival in self._arrivals(ANSWER_TIMEOUT_S):
-            for at, answer in enumerate(arrival.messages):
-                if isinstance(answer, Nak) and answer.command == command:
-                    raise LinkposeError(f"the board refused {command.name}: {_reason(answer.reason)}")
-                if isinstance(answer, Ack) and answer.command == command:
-                    return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
+        """Sends a command, again where its answer is lost; the arrival that holds the ACK, from behind the ACK on.
+
+        A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
+        """
+        for _ in range(ATTEMPTS):
+            self._link.send(message)
+            for arrival in self._arrivals(ANSWER_TIMEOUT_S):
+                for at, answer in enumerate(arrival.messages):
+                    if isinstance(answer, Nak) and answer.command == command:
+                        raise LinkposeError(f"the board refused {command.name}: {_reason(answer.reason)}")
+                    if isinstance(answer, Ack) and answer.command == command:
+                        return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
+                    if isinstance(answer, Sample) and command == Command.START:
+                        return Arrival(arrival.time_s, arrival.messages[at:], b"")
         raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
 
     def _await(
@@ -254,7 +258,7 @@ class Session:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} is gone ({error}); waiting for the board to come back, Ctrl-C ends")
+                self._notify(f"{self.port} is gone ({error.reason}); waiting for the board to come back, Ctrl-C ends")
                 timeline.interrupted("cable")
                 yield []
                 for _ in self._reconnect():
@@ -294,6 +298,8 @@ class Session:
     def _ask_when_silent(self, now: float) -> None:
         """A board that fell silent may have been reset while its HELLO was lost: ask who is there."""
         if now - self._heard_at > SILENCE_S and now - self._asked_at > SILENCE_S:
+            if self._asked_at <= self._heard_at:
+                self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
             self._asked_at = now
             self._link.send(GetInfo())
 
