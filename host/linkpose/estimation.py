@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,21 @@ def mice_of(measurements: Measurements) -> int:
     return int(np.flatnonzero(counted).max(initial=-1)) + 1
 
 
+class FoundJ2s(NamedTuple):
+    """J2S that was not known, as the motion has told it."""
+
+    mean_m: Floats  # (3,)
+    std_m: Floats  # (3,) of each axis
+    worst_std_m: float  # in the direction that is known least
+    worst_axis: str  # x, y or z, the one that this direction is nearest to
+
+    @staticmethod
+    def of(mean_m: Floats, covariance_m2: Floats) -> FoundJ2s:
+        values, vectors = np.linalg.eigh(covariance_m2)
+        axis = "xyz"[int(np.argmax(np.abs(vectors[:, -1])))]
+        return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
+
+
 class Estimator:
     """Runs filters over consecutive blocks of measurements."""
 
@@ -40,6 +55,7 @@ class Estimator:
 
         Raises LinkposeError when a named one cannot run, or none at all; `left_out` tells why others do not.
         """
+        self._rig = rig
         self.left_out: dict[str, str] = {}
         self.filters: list[filters.Filter] = []
         for name in dict.fromkeys(names or filters.NAMES):
@@ -63,6 +79,16 @@ class Estimator:
     def process(self, block: Measurements) -> Floats:
         """The estimates (N, columns) at the next N samples."""
         return np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+
+    @property
+    def found_j2s(self) -> FoundJ2s | None:
+        """J2S as the filters have found it so far; None where it was known, or where none of them looks for it."""
+        if self._rig.joint.known_j2s_m is not None:
+            return None
+        for f in self.filters:
+            if isinstance(f, filters.FindsJ2s):
+                return FoundJ2s.of(*f.j2s_m)
+        return None
 
     def text(self, estimates: Floats) -> str:
         """Estimates as lines of CSV."""

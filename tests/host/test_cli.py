@@ -98,6 +98,37 @@ def test_the_rig_files_j2s_is_used_and_a_wrong_key_is_named(linkpose, refused, t
         assert sentence in said and "rig.toml" in said
 
 
+def closing_line(path: Path) -> dict:
+    return json.loads(path.read_text().splitlines()[-1].removeprefix("# "))
+
+
+def test_j2s_auto_is_estimated_and_told_live_and_over_the_recording(linkpose, refused, tmp_path):
+    live, recording, replay = tmp_path / "live.csv", tmp_path / "rec.csv", tmp_path / "replay.csv"
+    done = linkpose(
+        "estimate", "--live", "--port", SIM, "--duration", 30, "--j2s", "auto", "-o", live, "--record", recording
+    )
+    assert done.status == 0
+    assert "without joint: joint needs a J2S that is known" in done.err
+    found = closing_line(live)
+    assert found["j2s_m"] == pytest.approx([-0.09, -0.04, 1.65], abs=0.01)
+    assert all(0 < std < 0.01 for std in found["j2s_std_m"])
+    x, y, z = found["j2s_m"]
+    assert re.search(rf"J2S {x:.4f} ± 0\.\d{{4}}, {y:.4f} ± 0\.\d{{4}}, {z:.4f} ± 0\.\d{{4}} m\n", done.err)
+    assert linkpose("estimate", recording, "-o", replay, "--j2s", "auto").status == 0
+    assert rows(live) == rows(replay) and closing_line(replay)["j2s_m"] == found["j2s_m"]
+    assert "joint needs a J2S that is known" in refused("estimate", recording, "--j2s", "auto", "--filter", "joint")
+
+
+def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
+    out = tmp_path / "rest.csv"
+    done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1.5, "--j2s", "auto", "-o", out)
+    assert done.status == 0
+    assert re.search(r"the motion did not tell J2S along the sensor's [xyz] axis \(to 1.00 m only\)", done.err)
+    assert closing_line(out)["j2s_std_m"] == pytest.approx([1, 1, 1], abs=0.05)
+    known = linkpose("estimate", "--live", "--port", SIM, "--duration", 1.5, "-o", out, "--force")
+    assert "did not tell" not in known.err and "j2s_m" not in closing_line(out)
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

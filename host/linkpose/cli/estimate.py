@@ -16,7 +16,7 @@ import click
 
 from linkpose.cli import options
 from linkpose.errors import LinkposeError
-from linkpose.sensors.rig import Vector
+from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from linkpose.estimation import EstimateWriter, Estimator
 
 COMPILER_PATIENCE_S = 0.7  # before the user is told what is going on
+WORST_STD_M = 0.03  # of a J2S that the motion has told
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class Request:
     output: Path | None
     filter_names: tuple[str, ...]
     rig_file: Path | None
-    j2s: Vector | None
+    joint: Joint | None
     json_lines: bool
     force: bool
 
@@ -61,7 +62,7 @@ def command(
     raw: Path | None,
     filter_names: tuple[str, ...],
     rig_file: Path | None,
-    j2s: Vector | None,
+    joint: Joint | None,
     force: bool,
     json_lines: bool,
     verbose: bool,
@@ -79,7 +80,7 @@ def command(
     if recording is not None and (port or duration or record or raw):
         raise click.UsageError("--port, --duration, --record and --raw go with --live")
     refuse_same_file(recording, output, record, raw)
-    request = Request(output, filter_names, rig_file, j2s, json_lines, force)
+    request = Request(output, filter_names, rig_file, joint, json_lines, force)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -95,7 +96,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
-    rig = options.resolve_rig(request.rig_file, request.j2s, recording.rig)
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig)
     with _patience(console):
         measurements = recording.measurements
         estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
@@ -104,7 +105,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     head = {"recording": str(path), "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
     with _Sink(estimator, request, head) as sink:
         sink.write(estimates)
-        sink.close({"rows": len(estimates), **_rejected(estimator)})
+        sink.close({"rows": len(estimates), **_outcome(estimator)})
+    _tell_j2s(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
 
@@ -124,7 +126,7 @@ def _live(
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(live.raw_capture(raw, request.force))
         session = stack.enter_context(Session(port or choose_port(), console.say, capture))
-        rig = options.resolve_rig(request.rig_file, request.j2s, session.rig)
+        rig = options.resolve_rig(request.rig_file, request.joint, session.rig)
         session.wait_for_mice(len(rig.mouse))
         with _patience(console):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
@@ -149,7 +151,8 @@ def _live(
         view.close()
         recorder.close(ended)
         health = session.health()
-        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_rejected(estimator)})
+        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
+        _tell_j2s(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
 
 
@@ -159,8 +162,27 @@ def _tell_left_out(estimator: Estimator, console: Console) -> None:
         console.say(f"without {names}: {reason}")
 
 
-def _rejected(estimator: Estimator) -> dict[str, Any]:
-    return {"rejected": {f.name: f.rejected for f in estimator.filters}}
+def _outcome(estimator: Estimator) -> dict[str, Any]:
+    """For the closing line: rejected samples, and J2S where it was to be found."""
+    outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in estimator.filters}}
+    found = estimator.found_j2s
+    if found:
+        outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    return outcome
+
+
+def _tell_j2s(estimator: Estimator, console: Console) -> None:
+    """J2S where it was to be found, and what the motion did not tell of it."""
+    found = estimator.found_j2s
+    if not found:
+        return
+    axes = (f"{value:.4f} ± {std:.4f}" for value, std in zip(found.mean_m, found.std_m, strict=True))
+    console.say(f"J2S {', '.join(axes)} m")
+    if found.worst_std_m > WORST_STD_M:
+        console.say(
+            f"the motion did not tell J2S along the sensor's {found.worst_axis} axis (to {found.worst_std_m:.2f} m "
+            "only), so the heights are rough: swing the link longer, in all directions"
+        )
 
 
 @contextlib.contextmanager

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
 from linkpose.errors import LinkposeError
-from linkpose.sensors.rig import Rig, Vector
+from linkpose.sensors.rig import Joint, Rig
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -20,7 +21,7 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
 
     name = "X,Y,Z"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Vector:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         words = str(value).split(",")
         try:
             x, y, z = (float(word) for word in words)
@@ -29,6 +30,19 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
         if not all(map(math.isfinite, (x, y, z))):
             self.fail(f"{value!r} is not finite", param, ctx)
         return x, y, z
+
+
+# A J2S of which nothing is known but that it is some metres long at the most.
+UNKNOWN_JOINT = Joint((0.0, 0.0, 0.0), 1.0)
+
+
+class JointType(VectorType):
+    """A joint by its J2S: three numbers, or `auto` for one that is to be estimated."""
+
+    name = "X,Y,Z|auto"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Joint:
+        return UNKNOWN_JOINT if value == "auto" else Joint(super().convert(value, param, ctx))
 
 
 class SecondsType(click.ParamType):  # type: ignore[type-arg]
@@ -73,7 +87,10 @@ def duration(function: Function) -> Function:
 
 def rig_and_j2s(function: Function) -> Function:
     function = click.option(
-        "--j2s", type=VectorType(), help="Vector from the joint centre to the sensor, in its axes (m)."
+        "--j2s",
+        "joint",
+        type=JointType(),
+        help="Vector from the joint centre to the sensor, in its axes (m); auto: estimate it.",
     )(function)
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
 
@@ -91,10 +108,10 @@ def verbosity(function: Function) -> Function:
     return click.option("-v", "--verbose", is_flag=True, help="Say more.")(function)
 
 
-def resolve_rig(rig_file: Path | None, j2s: Vector | None, brought: Rig | None) -> Rig:
+def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:
     """The rig file where one is named, or else the one that came along; `--j2s` goes before either's."""
     rig = Rig.load(rig_file) if rig_file else brought or Rig()
-    return rig.with_j2s(j2s) if j2s else rig
+    return replace(rig, joint=joint) if joint else rig
 
 
 def save_rig(path: Path, rig: Rig) -> None:

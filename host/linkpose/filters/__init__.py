@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,15 @@ class Filter(Protocol):
 
     def process(self, block: Measurements) -> Floats:
         """The estimate at each of the block's N samples: (N, len(columns)); NaN where there is none yet."""
+
+
+@runtime_checkable
+class FindsJ2s(Protocol):
+    """What a filter offers beyond that when it estimates J2S."""
+
+    @property
+    def j2s_m(self) -> tuple[Floats, Floats]:
+        """J2S so far, and its covariance: (3,) m, (3, 3) m²."""
 
 
 class CannotRun(LinkposeError):

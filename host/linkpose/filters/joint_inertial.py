@@ -47,6 +47,7 @@ from linkpose.sensors.rig import Rig
 
 _N = 15
 _Z, _V, _BG, _BA, _D = 0, 3, 6, 9, 12  # where each begins in the state
+_CLEAR = 30.0  # ‖ω‖² over its noise's, from which on it tells d; noise that is read as a rotation would, too
 _GATE = 25.0  # χ² with 3 degrees of freedom: one sound sample in 65 000
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of a link, but a spike
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
@@ -130,9 +131,9 @@ class JointInertialFilter:
         self.parameters = parameters or JointInertialParameters()
         self.state = State.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.j2s_m
-        own, gyros = rig.joint.j2s_std_m**2, self.parameters.lever_misfit**2 * sum(c * c for c in self._j2s)
-        self._lever = Lever(self._j2s, own + gyros, own / (own + gyros), gyros * own / (own + gyros))
+        j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.j2s_std_m
+        own, gyros = self._j2s_std**2, self.parameters.lever_misfit**2 * sum(c * c for c in j2s)
+        self._lever = Lever(j2s, own + gyros, own / (own + gyros), gyros * own / (own + gyros))
 
     @property
     def rejected(self) -> int:
@@ -146,10 +147,11 @@ class JointInertialFilter:
 
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
-        """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m²."""
-        _, _, share, rest = self._lever
-        nominal = np.array(self._j2s)
-        mean = nominal + share * (self.state.mean[_D:] - nominal)
+        """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m². Before the first sample, the rig's."""
+        nominal, _, share, rest = self._lever
+        if math.isnan(self.state.time[0]):
+            return np.array(nominal), self._j2s_std**2 * np.eye(3)
+        mean = np.array(nominal) + share * (self.state.mean[_D:] - nominal)
         return mean, share**2 * self.state.covariance[_D:, _D:] + rest * np.eye(3)
 
     @property
@@ -349,7 +351,11 @@ def _correct(
     imu: ImuCalibration,
     q: JointInertialParameters,
 ) -> bool:
-    """The constraint 0 = v − ω×d as a measurement. False where the gate refused it, for a reading that jumped."""
+    """The constraint 0 = v − ω×d as a measurement. False where the gate refused it, for a reading that jumped.
+
+    d is corrected in the part that the rotation stands out of the gyro's noise: K's rows of d are scaled by it, and P
+    follows as P − KHP − PHᵀKᵀ + KSKᵀ.
+    """
     d, velocity = _at(x, _D), _at(x, _V)
     w = _minus(rate, _at(x, _BG))
     lever = vec.cross(w, d)
@@ -375,13 +381,15 @@ def _correct(
         if jumped:
             return False
         inverse = vec.scaled(_GATE / distance, inverse)  # it is the state that is doubted, but with care
+    told = min(max(vec.dot(w, w) / (_CLEAR * 3.0 * imu.gyro_variance) - 1.0, 0.0), 1.0)
     for i in range(_N):
         k = vec.apply(inverse, (ph[i, 0], ph[i, 1], ph[i, 2]))
         gain[i, 0], gain[i, 1], gain[i, 2] = k
-        x[i] += vec.dot(k, y)
+        x[i] += vec.dot(k, y) if i < _D else told * vec.dot(k, y)
     for i in range(_N):
         for j in range(i, _N):
-            p[i, j] -= gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2]
+            part = 1.0 if i < _D else told * (2.0 - told)
+            p[i, j] -= part * (gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2])
             p[j, i] = p[i, j]
     tilt = vec.unit(_at(x, _Z))
     _put(x, _Z, tilt)
