@@ -19,6 +19,8 @@ from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun
 
+pytestmark = pytest.mark.realtime
+
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
 LINK_FILTERS = [word for name in ("joint", "tilt", "imu-baro", "baro") for word in ("--filter", name)]
 J2S = ["--j2s", ",".join(map(str, PAPER_J2S_M))]
