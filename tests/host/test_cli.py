@@ -168,6 +168,25 @@ def test_nothing_heavy_is_imported_for_help_ports_info_and_record():
     assert done.stdout.strip() == "[]"
 
 
+def test_the_boards_settings_are_put_in_force_and_recorded(linkpose, refused, tmp_path):
+    out = tmp_path / "r.csv"
+    typed = ["--rate", 200, "--accel-range", 16, "--gyro-range", 2000, "--dlpf", 2, "--baro-oversampling", 3]
+    assert linkpose("record", out, "--port", SIM, "--duration", 2, *typed).status == 0
+    table = read_table(out, "recording")
+    assert len(table) == 400
+    assert table.metadata["settings"] == {
+        "sample_rate_hz": 200, "accel_range_g": 16, "gyro_range_deg_s": 2000, "dlpf": 2, "baro_oversampling": 3,
+    }  # fmt: skip
+    lsb = 9.80665 * 16 / 32768
+    counts = table.columns["accel_z_m_s2"] / lsb
+    assert abs(counts - counts.round()).max() < 1e-3
+    assert table.columns["accel_z_m_s2"][0] == pytest.approx(9.8, abs=0.5)
+    done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1, "--rate", 50, "-o", tmp_path / "e.csv")
+    assert done.status == 0 and len(read_table(tmp_path / "e.csv")) == 50
+    assert "refused CONFIGURE: sample rate out of range" in refused("record", "--port", SIM, "--rate", 77)
+    assert "--live" in refused("estimate", out, "--rate", 50)
+
+
 def test_info_json(linkpose):
     done = linkpose("info", "--port", "sim://link?drift_ppm=0", "--json")
     info = json.loads(done.out)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from linkpose.cli import options
+from linkpose.cli.board_settings import apply, board_settings
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint
 
@@ -49,6 +50,7 @@ class Request:
 @click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
 @click.option("--filter", "filter_names", multiple=True, metavar="NAME", help="Run this filter; may be repeated.")
 @options.rig_and_j2s
+@board_settings
 @options.force
 @options.as_json
 @options.verbosity
@@ -63,6 +65,7 @@ def command(
     filter_names: tuple[str, ...],
     rig_file: Path | None,
     joint: Joint | None,
+    board: dict[str, int],
     force: bool,
     json_lines: bool,
     verbose: bool,
@@ -77,15 +80,15 @@ def command(
 
     if is_live == (recording is not None):
         raise click.UsageError("name a RECORDING, or add --live to estimate from the board")
-    if recording is not None and (port or duration or record or raw):
-        raise click.UsageError("--port, --duration, --record and --raw go with --live")
+    if recording is not None and (port or duration or record or raw or board):
+        raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     refuse_same_file(recording, output, record, raw)
     request = Request(output, filter_names, rig_file, joint, json_lines, force)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
     else:
-        _live(port, duration, record, raw, request, console)
+        _live(port, duration, record, raw, board, request, console)
 
 
 def _replay(path: Path, request: Request, console: Console) -> None:
@@ -112,7 +115,13 @@ def _replay(path: Path, request: Request, console: Console) -> None:
 
 
 def _live(
-    port: str | None, duration: float | None, record: Path | None, raw: Path | None, request: Request, console: Console
+    port: str | None,
+    duration: float | None,
+    record: Path | None,
+    raw: Path | None,
+    board: dict[str, int],
+    request: Request,
+    console: Console,
 ) -> None:
     """Estimates as the board measures."""
     from linkpose.cli import live
@@ -126,6 +135,7 @@ def _live(
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(live.raw_capture(raw, request.force))
         session = stack.enter_context(Session(port or choose_port(), console.say, capture))
+        apply(board, session)
         rig = options.resolve_rig(request.rig_file, request.joint, session.rig)
         session.wait_for_mice(len(rig.mouse))
         with _patience(console):  # before the board is started: no sample waits for a compiler

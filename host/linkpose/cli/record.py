@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
+from linkpose.cli.board_settings import apply, board_settings
 
 
 @click.command(name="record")
@@ -16,6 +17,7 @@ from linkpose.cli import options
 @options.duration
 @click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Also keep every byte as it came.")
 @click.option("--rig", "rig_file", type=options.FILE, help="Rig file to store with the recording.")
+@board_settings
 @options.force
 @options.as_json
 @options.verbosity
@@ -25,6 +27,7 @@ def command(
     duration: float | None,
     raw: Path | None,
     rig_file: Path | None,
+    board: dict[str, int],
     force: bool,
     json_lines: bool,
     verbose: bool,
@@ -39,6 +42,7 @@ def command(
     live.refuse_same_file(path, raw)
     console = live.Console(quiet, verbose)
     with live.raw_capture(raw, force) as capture, Session(port or choose_port(), console.say, capture) as session:
+        apply(board, session)
         rig = options.resolve_rig(rig_file, None, session.rig)
         session.wait_for_mice(len(rig.mouse))
         console.detail(f"firmware {session.hello}")

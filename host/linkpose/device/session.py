@@ -114,6 +114,11 @@ class Session:
         """The rig that a simulated board brings along; None of a real one."""
         return self._link.rig
 
+    @property
+    def settings(self) -> Configure:
+        """The settings in force."""
+        return _configured(self.hello)
+
     def __enter__(self) -> Session:
         return self
 
