@@ -46,6 +46,7 @@ ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 1.5
+SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
@@ -168,6 +169,7 @@ class Session:
     def configure(self, settings: Configure) -> Hello:
         """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
         self._command(settings, Command.CONFIGURE)
+        time.sleep(SETTLE_S)
         self._link.send(GetInfo())
         self.hello = self._await(Hello, "GET_INFO")
         return self.hello
