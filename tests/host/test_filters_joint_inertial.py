@@ -10,6 +10,7 @@ import pytest
 
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY as GRAVITY
 from linkpose.sensors.rig import Joint, Rig
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun, LinkTruth
 
@@ -132,6 +133,42 @@ def test_repeated_stamps_change_nothing():
     rig = Rig().with_j2s(PAPER_J2S_M)
     plain, doubled = JointInertialFilter(rig).process(block), JointInertialFilter(rig).process(rows(block, twice))
     assert np.array_equal(plain[-1], doubled[-1])
+
+
+@pytest.mark.parametrize("slot", ["whole", "halves"])
+def test_readings_that_are_held_are_read_once(slot):
+    """A logger of 100 Hz over a gyro of 50 Hz and an accelerometer of 25 Hz."""
+    block, truth = recorded(1, 0)
+    at = np.arange(len(block))
+    held = replace(block, accel_m_s2=block.accel_m_s2[at // 4 * 4], gyro_rad_s=block.gyro_rad_s[at // 2 * 2])
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    cuts = [slice(None)] if slot == "whole" else [slice(0, 3001), slice(3001, 3003), slice(3003, None)]
+    estimate = np.concatenate([f.process(held[cut]) for cut in cuts])
+    assert rmse_cm(estimate[::4], truth.height_m[::4]) < 0.2
+    assert rmse_cm(estimate, truth.height_m) < 2.5  # between the readings the rate is an old one
+    assert f.rejected == 0
+
+
+def test_a_plane_motion_does_not_lean_the_link_out_of_its_plane():
+    """A pendulum whose gyro reads 2 % across its axis: nothing tells the accelerometer's bias along it."""
+    time_s = np.arange(0, 120, 0.01)
+    angle, rate, slope = 0.6 * np.sin(6 * time_s), 3.6 * np.cos(6 * time_s), -21.6 * np.sin(6 * time_s)
+    d = np.array([0.0, 0.0, -0.3])
+    nothing = np.zeros(len(time_s))
+    tilt = np.column_stack([nothing, np.sin(angle), np.cos(angle)])
+    omega = np.column_stack([rate, nothing, nothing])
+    alpha = np.column_stack([slope, nothing, nothing])
+    force = GRAVITY * tilt + np.cross(alpha, d) + np.cross(omega, np.cross(omega, d))
+    rng = np.random.default_rng(5)
+    block = replace(
+        recorded(1, 0)[0][:0], time_s=time_s, accel_m_s2=force + rng.normal(0, 0.04, force.shape),
+        gyro_rad_s=omega + 0.02 * omega[:, [1, 0, 0]] + rng.normal(0, 0.001, omega.shape),
+        flags=np.ones(len(time_s), np.uint16),
+    )  # fmt: skip
+    f = JointInertialFilter(Rig(joint=Joint((0.0, 0.0, -0.3), 0.03)))
+    estimate = f.process(block)
+    assert np.abs(f.accel_bias_m_s2).max() < 0.12
+    assert np.abs(estimate[1000:, 3]).max() < 1.5
 
 
 def test_garbage_is_survived_and_forgotten():

@@ -6,14 +6,18 @@ it must be the one that the angular rate gives the sensor. The state, all in the
     Z    tilt, n's Z axis                       Ż = −(s_G − b_g) × Z
     v    velocity of the sensor (m/s)           v̇ = −(s_G − b_g) × v + s_A − b_a − g Z
     b_g  bias of the gyro (rad/s)               random walk
-    b_a  bias of the accelerometer (m/s²)       random walk
+    b_a  bias of the accelerometer (m/s²)       first-order Gauss-Markov
     d    J2S as the gyro tells it (m)           constant
 
 and at every sample the measurement  0 = v − (s_G − b_g) × d + n_G × d + e.  Over a step the frame turns by the exact
 exponential of the mean rate, v is integrated by the trapezoid, and ‖Z‖ = 1 is kept. Nothing is differentiated, no rest
 is needed, and motion tells the biases and d apart; a rest, where there is one, tells b_g outright. The height is Zᵀd.
 
-What the model leaves out is scale and alignment. The accelerometer's is taken for noise in proportion to the force. A
+A motion in a plane does not tell b_a across it from a leaning Z. There b_a keeps to what it can be (Gauss-Markov), and
+Z is as good as that. A reading that repeats the last one to the last bit is an old one, read again by a logger that is
+faster than the sensor: the step waits for the next new force, with the angle summed over the rates that came.
+
+What the model leaves out is scale and alignment. Each sensor's is taken for noise in proportion to what it reads. A
 gyro that reads 1 % more sees a lever that is 1 % shorter: d is J2S with such an error, and the height is
 Zᵀ(d₀ + w(d − d₀)), with w the share of J2S's own doubt in that of d (0 for a J2S that was measured, 1 for one that is
 unknown). What fits neither way (e) is measured: the share of ω×d that was left over in the last seconds.
@@ -33,7 +37,6 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
     LONGEST_GAP_S,
-    LONGEST_STEP_S,
     Floats,
     ImuCalibration,
     read_accel,
@@ -53,6 +56,8 @@ _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
 _NONE_RAD2 = 1e-6  # and has no more than this along it
 _GAP_ACCEL_M_S2 = 10.0  # where the accelerometer did not see
+_SNAP_M_S4 = 500.0  # of a hand's motion, the force's second derivative: between two readings h apart it bends by h²/12
+_LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
 _REST_S = 0.5  # of stillness that tells the gyro's bias
 _REST_STD_RAD_S = 0.001  # of a link that is held still
 _REST_SIGMAS = 5.0  # within which the readings stay at rest
@@ -63,11 +68,14 @@ class JointInertialParameters(NamedTuple):
     """What the filter assumes."""
 
     gyro_bias_std_rad_s: float = 0.35  # at switch-on: the data sheet's ±20 °/s
-    accel_bias_std_m_s2: float = 0.1
     gyro_bias_walk_rad_s: float = 1e-4  # in a second
-    accel_bias_walk_m_s2: float = 1e-4  # in a second
+    # The accelerometer's follows its temperature: the data sheet's ±35 mg over 70 °C are 6 mg in a dozen degrees, and
+    # a board warms up in a minute or two.
+    accel_bias_std_m_s2: float = 0.06
+    accel_bias_time_s: float = 100.0  # after which e⁻¹ of it is left
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
-    accel_misfit: float = 0.003  # noise in proportion to the force: scale and alignment
+    accel_misfit: float = 0.002  # noise in proportion to the force: scale and alignment
+    gyro_misfit: float = 0.003  # noise of the rotation in proportion to it
     lever_misfit: float = 0.005  # of the lever that the gyro tells, as a share of ‖d₀‖
     least_misfit: float = 0.002  # of the constraint, as a share of ‖ω×d‖
     first_misfit: float = 0.03  # before it has been measured
@@ -87,10 +95,10 @@ class Lever(NamedTuple):
 class State(NamedTuple):
     """What the filter remembers from one block to the next; changed in place."""
 
-    time: Floats  # (2,) of the last sample, NaN before the first; how long the rate has been held (s)
+    time: Floats  # (4,) of the last step, NaN before the first; of no rate (s); of the last turn; its variance (rad²)
     mean: Floats  # (15,) Z, v, b_g, b_a, d
     covariance: Floats  # (15, 15)
-    last: Floats  # (2, 3) last usable force (m/s²) and rate (rad/s), calibrated
+    last: Floats  # (4, 3) force and rate at the last step (m/s², rad/s), newest rate, angle turned since (rad)
     rest: Floats  # (7,) for how long it has been still (s), first force, sum over time of the rate
     misfit: Floats  # (2,) mean squares of the excess innovation and of ‖ω‖‖d‖ (m/s)²
     work: Floats  # (6, 15) F P, within a step
@@ -101,10 +109,10 @@ class State(NamedTuple):
     @staticmethod
     def fresh() -> State:
         return State(
-            np.array([np.nan, 0.0]),
+            np.array([np.nan, 0.0, np.nan, 0.0]),
             np.zeros(_N),
             np.zeros((_N, _N)),
-            np.zeros((2, 3)),
+            np.zeros((4, 3)),
             np.zeros(7),
             np.zeros(2),
             np.zeros((6, _N)),
@@ -330,12 +338,23 @@ def _add_noise(
             k += 1
         p[_V + i, _V + i] += accel
         p[_BG + i, _BG + i] += q.gyro_bias_walk_rad_s**2 * h
-        p[_BA + i, _BA + i] += q.accel_bias_walk_m_s2**2 * h
         p[_D + i, _D + i] += j2s
         for j in range(3):
             share = rotation * ((zv if i == j else 0.0) - velocity[i] * tilt[j])
             p[_Z + i, _V + j] += share
             p[_V + j, _Z + i] = p[_Z + i, _V + j]
+
+
+@compiled
+def _forget_bias(x: Floats, p: Floats, h: float, q: JointInertialParameters) -> None:
+    """The accelerometer's bias after a step: first-order Gauss-Markov, so that what no motion tells stays bounded."""
+    kept = math.exp(-h / q.accel_bias_time_s)
+    for i in range(_BA, _D):
+        x[i] *= kept
+        for j in range(_N):
+            p[i, j] *= kept
+            p[j, i] *= kept
+        p[i, i] += (1.0 - kept * kept) * q.accel_bias_std_m_s2**2
 
 
 @inlined
@@ -478,9 +497,9 @@ def _runs_away(x: Floats) -> bool:
 
 
 @inlined
-def _describe(x: Floats, p: Floats, lever: Lever) -> tuple[float, float, float, float]:
+def _describe(tilt: Vec, x: Floats, p: Floats, lever: Lever) -> tuple[float, float, float, float]:
     """Height Zᵀ(d₀ + w(d − d₀)) and its standard deviation (m), roll and pitch (°)."""
-    tilt, w = _at(x, _Z), lever.share
+    w = lever.share
     change = _minus(_at(x, _D), lever.j2s)
     d = (lever.j2s[0] + w * change[0], lever.j2s[1] + w * change[1], lever.j2s[2] + w * change[2])
     variance = lever.rest
@@ -494,6 +513,35 @@ def _describe(x: Floats, p: Floats, lever: Lever) -> tuple[float, float, float, 
         math.degrees(math.atan2(tilt[1], tilt[2])),
         math.degrees(math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))),
     )
+
+
+@inlined
+def _same(a: Vec, b: Vec) -> bool:
+    return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
+
+
+@inlined
+def _add_turn(angle: Vec, before: Vec, rate: Vec, step: float) -> Vec:
+    """The angle turned (rad), the gyro's bias in it, after one more step between two rates."""
+    half = 0.5 * step
+    return (
+        angle[0] + half * (before[0] + rate[0]),
+        angle[1] + half * (before[1] + rate[1]),
+        angle[2] + half * (before[2] + rate[2]),
+    )
+
+
+@inlined
+def _less(angle: Vec, h: float, bias: Vec) -> Vec:
+    return (angle[0] - h * bias[0], angle[1] - h * bias[1], angle[2] - h * bias[2])
+
+
+@inlined
+def _velocity_variance(force: Vec, has_force: bool, h: float, imu: ImuCalibration, q: JointInertialParameters) -> float:
+    """Variance (m²/s²) of the velocity gained over a step: noise, misfit, what a trapezoid leaves of the force."""
+    bent = _SNAP_M_S4 / 12.0 * h * h if has_force else _GAP_ACCEL_M_S2
+    variance = imu.accel_variance + q.accel_misfit**2 * vec.dot(force, force) + min(bent, _GAP_ACCEL_M_S2) ** 2
+    return variance * h * h
 
 
 @compiled
@@ -510,63 +558,76 @@ def _process(
 ) -> None:
     x, p, work, ph, gain, misfit = state.mean, state.covariance, state.work, state.cross, state.gain, state.misfit
     rest = state.rest
-    last, held = state.time[0], state.time[1]
+    last, held, turned_at, spread = state.time[0], state.time[1], state.time[2], state.time[3]
     before_a, before_w = vec.load(state.last[0]), vec.load(state.last[1])
+    newest_w, angle = vec.load(state.last[2]), vec.load(state.last[3])
     rejected, restarts = state.counts[0], state.counts[1]
     for i in range(len(time_s)):
         has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
         h = time_s[i] - last
         good = has_force and has_rate
-        if math.isnan(last):
-            good = good and math.isfinite(time_s[i])
-            if good:
+        begins = math.isnan(last) or (h > LONGEST_GAP_S and good)
+        if begins and good and math.isfinite(time_s[i]):
+            if math.isnan(last):
                 _begin(x, p, misfit, force, rate, imu, q, lever)
-                last, before_a, before_w = time_s[i], force, rate
-        elif h > LONGEST_GAP_S and good:
-            _set_upright(x, p, force, rate, imu)
-            last, held, before_a, before_w = time_s[i], 0.0, force, rate
+            else:
+                _set_upright(x, p, force, rate, imu)
+            last, turned_at, held, spread = time_s[i], time_s[i], 0.0, 0.0
+            before_a, before_w, newest_w, angle = force, rate, rate, (0.0, 0.0, 0.0)
         elif h > 0.0:
             force = force if has_force else before_a
-            held = 0.0 if has_rate else held + h
-            rate = rate if has_rate else before_w
-            bias = _at(x, _BG)
-            turn = (
-                h * (0.5 * (rate[0] + before_w[0]) - bias[0]),
-                h * (0.5 * (rate[1] + before_w[1]) - bias[1]),
-                h * (0.5 * (rate[2] + before_w[2]) - bias[2]),
-            )
-            tilt, velocity = _predict_mean(x, turn, before_a, force, h)
-            _predict_covariance(p, work, turn, tilt, velocity, h)
-            _put(x, _Z, tilt)
-            _put(x, _V, velocity)
-            noise = imu.accel_variance + q.accel_misfit**2 * vec.dot(force, force)
-            if not has_force or h > LONGEST_STEP_S:
-                noise = _GAP_ACCEL_M_S2**2
-            walk = q.j2s_walk**2 * lever.variance * h
-            _add_noise(p, tilt, velocity, rotation_variance(h, held, imu), noise * h * h, walk, h, q)
-            if good and _watch_rest(rest, force, rate, h, imu):
-                _take_bias_from_rest(x, p, rest)
-            if has_rate:
-                jerk, jump = _minus(rate, before_w), _minus(force, before_a)
-                jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2 or vec.dot(jump, jump) > _JUMP_M_S2**2
-                if not _correct(x, p, ph, gain, misfit, jumped, rate, h, imu, q):
-                    # A spike: what it did to this step is in doubt, and the next step goes without it.
-                    good, share = False, 0.25 * h * h
-                    _add_noise(p, tilt, velocity, share * vec.dot(jerk, jerk), share * vec.dot(jump, jump), 0.0, 0.0, q)
-                    rate, force = before_w, before_a
-            last, before_a, before_w = time_s[i], force, rate
-            if _runs_away(x):
-                _begin(x, p, misfit, force, rate, imu, q, lever)
-                restarts += 1
+            rate = rate if has_rate else newest_w
+            step = time_s[i] - turned_at
+            waits = good and _same(force, before_a) and h < _LONGEST_HOLD_S
+            if step > 0.0 and not (waits and _same(rate, newest_w)):
+                held = 0.0 if has_rate else held + step
+                angle = _add_turn(angle, newest_w, rate, step)
+                spread += rotation_variance(step, held, imu)
+                turned_at, newest_w = time_s[i], rate
+            if not waits:
+                turn = _less(angle, h, _at(x, _BG))
+                tilt, velocity = _predict_mean(x, turn, before_a, force, h)
+                _predict_covariance(p, work, turn, tilt, velocity, h)
+                _put(x, _Z, tilt)
+                _put(x, _V, velocity)
+                noise = _velocity_variance(force, has_force, h, imu, q)
+                _forget_bias(x, p, h, q)
+                spread += q.gyro_misfit**2 * vec.dot(turn, turn)
+                _add_noise(p, tilt, velocity, spread, noise, q.j2s_walk**2 * lever.variance * h, h, q)
+                if good and _watch_rest(rest, force, rate, h, imu):
+                    _take_bias_from_rest(x, p, rest)
+                if has_rate:
+                    jerk, jump = _minus(rate, before_w), _minus(force, before_a)
+                    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2 or vec.dot(jump, jump) > _JUMP_M_S2**2
+                    if not _correct(x, p, ph, gain, misfit, jumped, rate, h, imu, q):
+                        # A spike: what it did to this step is in doubt, and the next step goes without it.
+                        good, share = False, 0.25 * h * h
+                        _add_noise(
+                            p, tilt, velocity, share * vec.dot(jerk, jerk), share * vec.dot(jump, jump), 0.0, 0.0, q
+                        )
+                        rate, force = before_w, before_a
+                last, before_a, before_w, newest_w = time_s[i], force, rate, rate
+                angle, spread = (0.0, 0.0, 0.0), 0.0
+                if _runs_away(x):
+                    _begin(x, p, misfit, force, rate, imu, q, lever)
+                    restarts += 1
         else:
             good = False
         rejected += not good
         if math.isnan(last):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = _describe(x, p, lever)
-    state.time[0], state.time[1] = last, held
-    for j in range(3):
-        state.last[0, j], state.last[1, j] = before_a[j], before_w[j]
+            tilt = _at(x, _Z)
+            if time_s[i] > last:  # while the step waits
+                since = _add_turn(angle, newest_w, newest_w, time_s[i] - turned_at)
+                tilt = vec.turn_back(_less(since, time_s[i] - last, _at(x, _BG)), tilt)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = _describe(tilt, x, p, lever)
+    state.time[0], state.time[1], state.time[2], state.time[3] = last, held, turned_at, spread
+    _put(state.last[0], 0, before_a)
+    _put(state.last[1], 0, before_w)
+    _put(state.last[2], 0, newest_w)
+    _put(state.last[3], 0, angle)
     state.counts[0], state.counts[1] = rejected, restarts
+
+
