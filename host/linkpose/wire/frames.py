@@ -59,15 +59,18 @@ def _unpacker(layout: Layout, count: int) -> tuple[int, Unpack]:
     starts = [fields + width * at for at in range(count)]
 
     def plain(payload: bytes) -> Message:
-        return cast(Message, new(cls, unpack_from(payload, 1)))
+        message: Message = new(cls, unpack_from(payload, 1))
+        return message
 
     def without_groups(payload: bytes) -> Message:
-        return cast(Message, new(cls, (*unpack_from(payload, 1), ())))
+        message: Message = new(cls, (*unpack_from(payload, 1), ()))
+        return message
 
     def grouped(payload: bytes) -> Message:
         values = unpack_from(payload, 1)
         groups = tuple([new(group_cls, values[at : at + width]) for at in starts])
-        return cast(Message, new(cls, (*values[:fields], groups)))
+        message: Message = new(cls, (*values[:fields], groups))
+        return message
 
     return whole.size, grouped if count else without_groups if layout.group else plain
 
