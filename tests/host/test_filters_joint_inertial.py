@@ -171,6 +171,22 @@ def test_a_plane_motion_does_not_lean_the_link_out_of_its_plane():
     assert np.abs(estimate[1000:, 3]).max() < 1.5
 
 
+@pytest.mark.parametrize("hole_s", [0.5, 1.5])
+def test_a_hole_in_fast_motion_is_not_bridged_by_a_guess(hole_s):
+    """Readings that are held, isolated spikes of the gyro, and a hole: the tilt comes back by itself."""
+    block, truth = recorded(3, 1)
+    at = np.arange(len(block))
+    gyro = block.gyro_rad_s[at // 2 * 2] + np.radians([10.0, -5.0, 8.0])
+    gyro[1010::700] += [0.0, 20.0, -15.0]
+    held = replace(block, accel_m_s2=block.accel_m_s2[at // 4 * 4], gyro_rad_s=gyro)
+    kept = (truth.time_s < 30) | (truth.time_s > 30 + hole_s)
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    error = 100 * np.abs(f.process(rows(held, kept))[:, 0] - truth.height_m[kept])
+    late = truth.time_s[kept] > 40
+    assert np.sqrt(np.mean(error[late] ** 2)) < 5
+    assert f.gyro_bias_rad_s == pytest.approx(np.radians([10.0, -5.0, 8.0]), abs=np.radians(0.5))
+
+
 def test_garbage_is_survived_and_forgotten():
     block, truth = recorded(1, 0)
     rng = np.random.default_rng(3)

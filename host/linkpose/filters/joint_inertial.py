@@ -36,7 +36,6 @@ from numpy.typing import NDArray
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
-    LONGEST_GAP_S,
     Floats,
     ImuCalibration,
     read_accel,
@@ -57,10 +56,12 @@ _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
 _NONE_RAD2 = 1e-6  # and has no more than this along it
 _GAP_ACCEL_M_S2 = 10.0  # where the accelerometer did not see
 _SNAP_M_S4 = 500.0  # of a hand's motion, the force's second derivative: between two readings h apart it bends by h²/12
+_LONGEST_BLIND_S = 0.3  # without a rate, a moving link has turned by more than its tilt can be guessed to
 _LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
 _REST_S = 0.5  # of stillness that tells the gyro's bias
 _REST_STD_RAD_S = 0.001  # of a link that is held still
 _REST_SIGMAS = 5.0  # within which the readings stay at rest
+_LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, where there is that much: the tilt is wrong
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
 
 
@@ -365,6 +366,7 @@ def _correct(
     gain: Floats,
     misfit: Floats,
     jumped: bool,
+    before: Vec,
     rate: Vec,
     h: float,
     imu: ImuCalibration,
@@ -388,7 +390,8 @@ def _correct(
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
     product = 0.5 * (p[6, 6] + p[7, 7] + p[8, 8]) * (p[12, 12] + p[13, 13] + p[14, 14])
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
-    reach = vec.dot(w, w) * vec.dot(d, d)
+    moved = _minus(before, _at(x, _BG)) if jumped else w  # a spike must not excuse itself
+    reach = vec.dot(moved, moved) * vec.dot(d, d)
     share = min(max(misfit[0] / misfit[1], q.least_misfit**2), 1.0)
     keep = min(h / q.misfit_time_s, 1.0)
     inverse = vec.inverse(vec.plus_diagonal(s, share * reach))
@@ -567,7 +570,7 @@ def _process(
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
         h = time_s[i] - last
         good = has_force and has_rate
-        begins = math.isnan(last) or (h > LONGEST_GAP_S and good)
+        begins = math.isnan(last) or (good and max(h, held) > _LONGEST_BLIND_S)
         if begins and good and math.isfinite(time_s[i]):
             if math.isnan(last):
                 _begin(x, p, misfit, force, rate, imu, q, lever)
@@ -580,10 +583,14 @@ def _process(
             rate = rate if has_rate else newest_w
             step = time_s[i] - turned_at
             waits = good and _same(force, before_a) and h < _LONGEST_HOLD_S
-            if step > 0.0 and not (waits and _same(rate, newest_w)):
+            jerk = _minus(rate, newest_w)
+            jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
+            if step > 0.0 and not (waits and (jumped or _same(rate, newest_w))):
                 held = 0.0 if has_rate else held + step
-                angle = _add_turn(angle, newest_w, rate, step)
+                angle = _add_turn(angle, newest_w, newest_w if jumped else rate, step)
                 spread += rotation_variance(step, held, imu)
+                if jumped:
+                    spread += 0.25 * step * step * vec.dot(jerk, jerk)
                 turned_at, newest_w = time_s[i], rate
             if not waits:
                 turn = _less(angle, h, _at(x, _BG))
@@ -598,18 +605,16 @@ def _process(
                 if good and _watch_rest(rest, force, rate, h, imu):
                     _take_bias_from_rest(x, p, rest)
                 if has_rate:
-                    jerk, jump = _minus(rate, before_w), _minus(force, before_a)
-                    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2 or vec.dot(jump, jump) > _JUMP_M_S2**2
-                    if not _correct(x, p, ph, gain, misfit, jumped, rate, h, imu, q):
+                    jump = _minus(force, before_a)
+                    jumped = jumped or vec.dot(jump, jump) > _JUMP_M_S2**2
+                    if not _correct(x, p, ph, gain, misfit, jumped, before_w, rate, h, imu, q):
                         # A spike: what it did to this step is in doubt, and the next step goes without it.
-                        good, share = False, 0.25 * h * h
-                        _add_noise(
-                            p, tilt, velocity, share * vec.dot(jerk, jerk), share * vec.dot(jump, jump), 0.0, 0.0, q
-                        )
+                        good = False
+                        _add_noise(p, tilt, velocity, 0.0, 0.25 * h * h * vec.dot(jump, jump), 0.0, 0.0, q)
                         rate, force = before_w, before_a
                 last, before_a, before_w, newest_w = time_s[i], force, rate, rate
                 angle, spread = (0.0, 0.0, 0.0), 0.0
-                if _runs_away(x):
+                if _runs_away(x) or misfit[0] > _LOST * max(misfit[1], _LOST_M2_S2):
                     _begin(x, p, misfit, force, rate, imu, q, lever)
                     restarts += 1
         else:
