@@ -17,7 +17,7 @@ from linkpose.simulation.link import LinkRun
 
 DURATION_S = 600.0
 TIMES = 15
-BENCHES = ("joint", "joint-inertial", "tilt", "imu-baro", "baro")
+BENCHES = ("joint", "joint-inertial", "tilt", "tilt-inertial", "imu-baro", "baro")
 
 
 def rows() -> Iterator[Row]:

@@ -123,7 +123,7 @@ def main() -> None:
         for case in read(options.data / name):
             step = (case.time_s[-1] - case.time_s[0]) / (len(case.time_s) - 1)
             peer = _matrices(VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)["quat6D"])[:, 2, :]
-            for used in ("joint-inertial", "joint", "tilt") if case.joint else ("tilt",):
+            for used in (*(("joint-inertial", "joint") if case.joint else ()), "tilt", "tilt-inertial"):
                 ours, vqf = case.error_deg(tilt_of(used, case)), case.error_deg(peer)
                 row = {"data": case.name, "filter": used, "ours_deg": ours, "vqf_deg": vqf, "ratio": ours / vqf}
                 text = f"{case.name:18} {used:15} {ours:7.3f}°   vqf {vqf:7.3f}°   ratio {ours / vqf:.2f}"

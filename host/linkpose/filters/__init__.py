@@ -36,6 +36,7 @@ _FILTERS = {
     "imu-baro": _Entry("imu_baro", "ImuBaroFilter", ALL_SENSORS, False),
     "baro": _Entry("baro", "BaroFilter", Sensors.BMP180, False),
     "joint-inertial": _Entry("joint_inertial", "JointInertialFilter", Sensors.MPU6050, True),
+    "tilt-inertial": _Entry("tilt_inertial", "TiltInertialFilter", Sensors.MPU6050, False),
     "mice": _Entry("mice", "MiceFilter", Sensors(0), False, True),
     "planar-ekf": _Entry("planar", "PlanarEkf", Sensors(0), False, True),
     "planar-ukf": _Entry("planar", "PlanarUkf", Sensors(0), False, True),

@@ -34,6 +34,7 @@ class ImuCalibration(NamedTuple):
     accel_gain: Vec  # 1/scale
     gyro_variance: float  # (rad/s)² of one sample
     accel_variance: float  # (m/s²)² of one sample
+    delay: float  # of the readings (s)
 
     @staticmethod
     def of(imu: Imu) -> ImuCalibration:
@@ -44,6 +45,7 @@ class ImuCalibration(NamedTuple):
             (1 / x, 1 / y, 1 / z),
             imu.gyro_noise_rad_s**2,
             imu.accel_noise_m_s2**2,
+            imu.delay_s,
         )
 
 

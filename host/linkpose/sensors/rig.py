@@ -42,6 +42,7 @@ class Imu:
     accel_scale: Vector = (1.0, 1.0, 1.0)
     gyro_noise_rad_s: float = math.radians(0.05)
     accel_noise_m_s2: float = 0.04
+    delay_s: float = 0.0049  # of the low-pass filter that the readings went through: DLPF_CFG 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,8 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         )
         if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "_std_m", "counts_per_m")) and values[key] <= 0:
             raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be above 0")
+        if key == "delay_s" and not 0.0 <= values[key] <= 0.1:
+            raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be between 0 and 0.1 s")
         if key == "accel_scale" and min(values[key]) <= 0:
             raise LinkposeError(f"{origin}: {name}.{key} is {value}; each axis must be above 0")
     try:

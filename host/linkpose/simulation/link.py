@@ -18,7 +18,7 @@ from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import Converter, Settings
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Joint, Rig, Vector
+from linkpose.sensors.rig import Imu, Joint, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation.motion import HandMotion
 from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
@@ -131,8 +131,8 @@ class LinkRun:
 
     @property
     def rig(self) -> Rig:
-        """The rig file that belongs to the run."""
-        return Rig(joint=Joint(self.j2s_m))
+        """The rig file that belongs to the run. Nothing filters its readings: they have no delay."""
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0))
 
     def at(self, time_s: Floats) -> LinkTruth:
         """The truth at any instants (N,), s. After the end the link stays at rest."""
