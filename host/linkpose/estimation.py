@@ -17,6 +17,7 @@ from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.wire.messages import Sensors
 
+_SMOOTHED = "joint-inertial"
 _DECIMALS = 6  # a micrometre, a microdegree
 
 
@@ -70,6 +71,19 @@ class Estimator:
             raise LinkposeError(f"no filter can run on this ({reasons})")
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
         self._decimals = np.array([TIME_DECIMALS, *(_decimals(name) for name in self.columns[1:])], dtype=np.int64)
+
+    def smooth(self) -> None:
+        """Puts the smoother in the place of joint-inertial: from here on, `process` takes one whole recording.
+
+        Raises LinkposeError where joint-inertial does not run.
+        """
+        names = [f.name for f in self.filters]
+        if _SMOOTHED not in names:
+            reason = f": {self.left_out[_SMOOTHED]}" if _SMOOTHED in self.left_out else ""
+            raise LinkposeError(f"{_SMOOTHED}, which is what can be smoothed, does not run{reason}")
+        from linkpose.filters.smoother import JointInertialSmoother  # and with it the compiler, which is slow to load
+
+        self.filters[names.index(_SMOOTHED)] = JointInertialSmoother(self._rig)
 
     def warm_up(self) -> None:
         """Compiles all that `process` and `text` need, or loads it compiled: no sample waits for a compiler."""

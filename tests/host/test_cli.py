@@ -129,6 +129,34 @@ def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
     assert "did not tell" not in known.err and "j2s_m" not in closing_line(out)
 
 
+def test_smooth_is_better_than_the_filter_with_the_same_columns(linkpose, tmp_path):
+    recording, truth = tmp_path / "r.csv", tmp_path / "t.csv"
+    linkpose("simulate", "link", "--test", 2, "--duration", 30, "-o", recording, "--truth", truth)
+    height = read_table(truth).columns["height_m"]
+    found = {}
+    for mode in ((), ("--smooth",)):
+        out = tmp_path / f"e{len(mode)}.csv"
+        done = linkpose("estimate", recording, "-o", out, "--filter", "joint-inertial", "--filter", "tilt", *mode)
+        assert done.status == 0, done.err
+        found[mode] = read_table(out, "estimate").columns
+    filtered, smoothed = found.values()
+    assert list(filtered) == list(smoothed)
+    assert list(filtered["tilt_roll_deg"]) == list(smoothed["tilt_roll_deg"])
+    errors = [columns["joint_inertial_height_m"] - height for columns in (filtered, smoothed)]
+    assert (errors[1] ** 2).mean() < 0.6 * (errors[0] ** 2).mean()
+
+
+def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("record", recording, "--port", SIM, "--duration", 1)
+    done = linkpose("estimate", recording, "--smooth", "--filter", "tilt")
+    assert done.status == 2 and "joint-inertial, which is what can be smoothed, does not run" in done.err
+    recording.write_text(re.sub(r'"joint": \{.*?\}, ', "", recording.read_text()))
+    done = linkpose("estimate", recording, "--smooth", "-o", tmp_path / "e.csv")
+    assert done.status == 2 and "joint-inertial needs J2S" in done.err
+    assert not (tmp_path / "e.csv").exists()
+
+
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -137,6 +165,7 @@ def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
         "estimate x.csv --port sim://link",
         "estimate --live --port sim://link --j2s 1,2",
         "estimate --live --port sim://link --j2s a,b,c",
+        "estimate --live --port sim://link --smooth",
         "record --port sim://link --duration -1",
         "record --port sim://link --duration never",
         "record --nonsense",

@@ -36,6 +36,7 @@ class Request:
     filter_names: tuple[str, ...]
     rig_file: Path | None
     joint: Joint | None
+    smooth: bool
     json_lines: bool
     force: bool
 
@@ -49,6 +50,7 @@ class Request:
 @click.option("--record", type=options.FILE, metavar="REC.csv", help="Keep the live measurements as a recording.")
 @click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
 @click.option("--filter", "filter_names", multiple=True, metavar="NAME", help="Run this filter; may be repeated.")
+@click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
 @board_settings
 @options.force
@@ -63,6 +65,7 @@ def command(
     record: Path | None,
     raw: Path | None,
     filter_names: tuple[str, ...],
+    smooth: bool,
     rig_file: Path | None,
     joint: Joint | None,
     board: dict[str, int],
@@ -82,8 +85,10 @@ def command(
         raise click.UsageError("name a RECORDING, or add --live to estimate from the board")
     if recording is not None and (port or duration or record or raw or board):
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
+    if smooth and is_live:
+        raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
     refuse_same_file(recording, output, record, raw)
-    request = Request(output, filter_names, rig_file, joint, json_lines, force)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -104,14 +109,24 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         measurements = recording.measurements
         estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
         _tell_left_out(estimator, console)
+        if request.smooth:
+            _smooth(estimator)
         estimates = estimator.process(measurements)
-    head = {"recording": str(path), "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
+    head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
+    head |= {"smooth": request.smooth, "rig": rig.as_dict()}
     with _Sink(estimator, request, head) as sink:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_outcome(estimator)})
     _tell_j2s(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
+
+
+def _smooth(estimator: Estimator) -> None:
+    try:
+        estimator.smooth()
+    except LinkposeError as reason:
+        raise click.UsageError(f"--smooth: {reason}") from None
 
 
 def _live(

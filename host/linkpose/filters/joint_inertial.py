@@ -57,7 +57,7 @@ _NONE_RAD2 = 1e-6  # and has no more than this along it
 _GAP_ACCEL_M_S2 = 10.0  # where the accelerometer did not see
 _SNAP_M_S4 = 500.0  # of a hand's motion, the force's second derivative: between two readings h apart it bends by h²/12
 _LONGEST_BLIND_S = 0.3  # without a rate, a moving link has turned by more than its tilt can be guessed to
-_LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
+LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
 _REST_S = 0.5  # of stillness that tells the gyro's bias
 _REST_STD_RAD_S = 0.001  # of a link that is held still
 _REST_SIGMAS = 5.0  # within which the readings stay at rest
@@ -582,7 +582,7 @@ def _process(
             force = force if has_force else before_a
             rate = rate if has_rate else newest_w
             step = time_s[i] - turned_at
-            waits = good and _same(force, before_a) and h < _LONGEST_HOLD_S
+            waits = good and _same(force, before_a) and h < LONGEST_HOLD_S
             jerk = _minus(rate, newest_w)
             jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
             if step > 0.0 and not (waits and (jumped or _same(rate, newest_w))):
