@@ -111,7 +111,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         _tell_left_out(estimator, console)
         if request.smooth:
             _smooth(estimator)
-        estimates = estimator.process(measurements)
+        estimator.warm_up()
+    estimates = estimator.process(measurements)
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "rig": rig.as_dict()}
     with _Sink(estimator, request, head) as sink:
