@@ -70,8 +70,9 @@ class JointInertialParameters(NamedTuple):
 
     gyro_bias_std_rad_s: float = 0.35  # at switch-on: the data sheet's ±20 °/s
     gyro_bias_walk_rad_s: float = 1e-4  # in a second
-    # The accelerometer's follows its temperature: the data sheet's ±35 mg over 70 °C are 6 mg in a dozen degrees, and
-    # a board warms up in a minute or two.
+    # The accelerometer's follows its temperature: the data sheet's ±35 mg over 70 °C (x, y; ±60 mg for z) are 6 mg in a
+    # dozen degrees. The time is no data sheet's: within what the simulated Tests allow, both were chosen on recordings
+    # of a pendulum.
     accel_bias_std_m_s2: float = 0.06
     accel_bias_time_s: float = 100.0  # after which e⁻¹ of it is left
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
