@@ -95,6 +95,11 @@ def test_gaps_and_missing_values_are_left_out(tmp_path):
     assert found["height_rmse_cm"] == pytest.approx(2.0)
 
 
+def test_a_quantity_that_was_never_estimated_is_left_out(tmp_path, reference):
+    path = estimate(tmp_path, joint_height_m=np.full(len(T), np.nan), joint_roll_deg=0 * T)
+    assert "height_rmse_cm" not in scores(path, reference)["joint"]
+
+
 def test_angles_are_compared_on_the_circle(tmp_path):
     turning = (np.degrees(T) + 180) % 360 - 180
     ahead = (np.degrees(T) + 182) % 360 - 180

@@ -101,6 +101,7 @@ def _score(
             f"{estimate.path} and {reference.path} have no instant in common for {name}: "
             "check that they are of the same run"
         )
+    errors = {quantity: error for quantity, error in errors.items() if np.isfinite(error).any()}
     rms = _planar(errors) if is_planar else _link(errors)
     return Score(name, int(compared.sum()), rms, offset_s, is_planar)
 
