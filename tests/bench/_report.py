@@ -6,7 +6,11 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NamedTuple
+
+# Where the reports look for the recordings of others, which are no part of the project: beside the checkout.
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 class Row(NamedTuple):

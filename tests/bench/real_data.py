@@ -1,9 +1,10 @@
 """Tilt from public recordings of real sensors, beside VQF's in the same run.
 
-    python tests/bench/real_data.py --data FOLDER [--json]
+    python tests/bench/real_data.py [--data FOLDER] [--json]
 
-FOLDER holds repoimu_pendulum, mpu6050_encoder and broad, each as its authors published it; one that is not there is
-named and left out. Nothing is calibrated beforehand. The error is the root mean square angle between the tilts.
+FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder and broad, each as its authors
+published it; one that is not there is named and left out. Nothing is calibrated beforehand. The error is the root mean
+square angle between the tilts.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from _report import RECORDINGS
 from scipy.io import loadmat
 from vqf import VQF
 
@@ -64,7 +66,8 @@ def broad(folder: Path) -> Iterator[Case]:
 
 def encoder(folder: Path) -> Iterator[Case]:
     """An MPU-6050 on a motor's shaft, with an encoder: the angle about the shaft, less its mean error."""
-    for path in sorted(folder.glob("raw_roll_*.mat")):
+    for path in sorted(folder.glob("raw_*.mat")):
+        across = 0 if "pitch" in path.stem else 1  # the shaft lies along y in the trials of pitch, else along x
         data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
         gyro = np.column_stack([data[f"all_gyro_2_{axis}"] for axis in "xyz"])
         accel = np.column_stack([data[f"all_accel_2_{axis}"] for axis in "xyz"])
@@ -72,8 +75,8 @@ def encoder(folder: Path) -> Iterator[Case]:
         use = np.concatenate([[True], np.diff(time_s) > 0]) & (np.abs(gyro).max(1) < 2000) & (np.abs(accel).max(1) < 16)
         angle = np.radians(data["all_encoder"][use])
 
-        def error_deg(tilt: Floats, angle: Floats = angle) -> float:
-            measured = np.unwrap(np.arctan2(tilt[:, 1], tilt[:, 2]))
+        def error_deg(tilt: Floats, angle: Floats = angle, across: int = across) -> float:
+            measured = np.unwrap(np.arctan2(tilt[:, across], tilt[:, 2]))
             both = [sign * measured - angle for sign in (1, -1)]
             return float(np.degrees(min(np.std(difference) for difference in both)))
 
@@ -113,7 +116,7 @@ def tilt_of(name: str, case: Case) -> Floats:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--data", type=Path, default=RECORDINGS)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     for name, read in (("repoimu_pendulum", pendulum), ("mpu6050_encoder", encoder), ("broad", broad)):

@@ -1,9 +1,10 @@
 """`linkpose localize` on public recordings of real robots, beside the figures that tuned filters of others reached.
 
-    python tests/bench/real_localization.py --data FOLDER [--json]
+    python tests/bench/real_localization.py [--data FOLDER] [--json]
 
-FOLDER holds plaza, mrclam, uwb_labyrinth and wean, each as its authors published it. A recording that is not there is
-named and left out. The options of each are what a user would type who knows the sensors: nothing is tuned in the code.
+FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth and wean, each as its authors published
+it. A recording that is not there is named and left out. The options of each are what a user would type who knows the
+sensors: nothing is tuned in the code.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from _report import RECORDINGS
 
 from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD, Reading, flaser_angles, format_reading
@@ -256,7 +258,7 @@ def with_truth(cases: Iterable[Case]) -> Iterable[dict[str, object]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--data", type=Path, default=RECORDINGS, help="folder of the recordings")
     parser.add_argument("--json", action="store_true", help="one object a line")
     options = parser.parse_args()
     sources: dict[str, Callable[[Path, Path], Iterable[dict[str, object]]]] = {
