@@ -165,6 +165,7 @@ def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
         "estimate x.csv --port sim://link",
         "estimate --live --port sim://link --j2s 1,2",
         "estimate --live --port sim://link --j2s a,b,c",
+        "estimate --live --port sim://link --j2s auto --filter tilt",
         "estimate --live --port sim://link --smooth",
         "record --port sim://link --duration -1",
         "record --port sim://link --duration never",

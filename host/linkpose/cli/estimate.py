@@ -87,6 +87,8 @@ def command(
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
+    if joint is not None and joint.known_j2s_m is None and filter_names and "joint-inertial" not in filter_names:
+        raise click.UsageError("--j2s auto is found by joint-inertial; add --filter joint-inertial")
     refuse_same_file(recording, output, record, raw)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
     console = Console(quiet, verbose)
