@@ -117,6 +117,7 @@ def test_j2s_auto_is_estimated_and_told_live_and_over_the_recording(linkpose, re
     assert linkpose("estimate", recording, "-o", replay, "--j2s", "auto").status == 0
     assert rows(live) == rows(replay) and closing_line(replay)["j2s_m"] == found["j2s_m"]
     assert "joint needs a J2S that is known" in refused("estimate", recording, "--j2s", "auto", "--filter", "joint")
+    assert "add --filter joint-inertial" in refused("estimate", recording, "--j2s", "auto", "--filter", "tilt")
 
 
 def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
@@ -165,7 +166,6 @@ def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
         "estimate x.csv --port sim://link",
         "estimate --live --port sim://link --j2s 1,2",
         "estimate --live --port sim://link --j2s a,b,c",
-        "estimate --live --port sim://link --j2s auto --filter tilt",
         "estimate --live --port sim://link --smooth",
         "record --port sim://link --duration -1",
         "record --port sim://link --duration never",

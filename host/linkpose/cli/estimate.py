@@ -87,8 +87,6 @@ def command(
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
-    if joint is not None and joint.known_j2s_m is None and filter_names and "joint-inertial" not in filter_names:
-        raise click.UsageError("--j2s auto is found by joint-inertial; add --filter joint-inertial")
     refuse_same_file(recording, output, record, raw)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
     console = Console(quiet, verbose)
@@ -110,7 +108,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     with _patience(console):
         measurements = recording.measurements
         estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
-        _tell_left_out(estimator, console)
+        _check(estimator, request, console)
         if request.smooth:
             _smooth(estimator)
         estimator.warm_up()
@@ -161,7 +159,7 @@ def _live(
 
             mice = Settings.of(session.hello).mouse_ports
             estimator = Estimator(request.filter_names, rig, Sensors(session.hello.sensors), mice)
-            _tell_left_out(estimator, console)
+            _check(estimator, request, console)
             estimator.warm_up()
         recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
         head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
@@ -184,7 +182,10 @@ def _live(
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
 
 
-def _tell_left_out(estimator: Estimator, console: Console) -> None:
+def _check(estimator: Estimator, request: Request, console: Console) -> None:
+    """Names the filters that cannot run. Raises LinkposeError when J2S is to be found and nobody looks for it."""
+    if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
+        raise LinkposeError("--j2s auto is found by joint-inertial, which does not run; add --filter joint-inertial")
     for reason in dict.fromkeys(estimator.left_out.values()):
         names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
         console.say(f"without {names}: {reason}")
