@@ -108,6 +108,18 @@ def load(a: Floats) -> Vec:
 
 
 @compiled
+def at(a: Floats, k: int) -> Vec:
+    """The vector that an array holds from element k on."""
+    return (a[k], a[k + 1], a[k + 2])
+
+
+@compiled
+def put(a: Floats, k: int, value: Vec) -> None:
+    """Puts a vector into an array from element k on."""
+    a[k], a[k + 1], a[k + 2] = value
+
+
+@compiled
 def load_sym(a: Floats) -> Sym:
     """The symmetric matrix that an array of six holds."""
     return (a[0], a[1], a[2], a[3], a[4], a[5])

@@ -185,16 +185,6 @@ class JointInertialFilter:
 
 
 @compiled
-def _at(x: Floats, k: int) -> Vec:
-    return (x[k], x[k + 1], x[k + 2])
-
-
-@compiled
-def _put(x: Floats, k: int, value: Vec) -> None:
-    x[k], x[k + 1], x[k + 2] = value
-
-
-@compiled
 def _minus(a: Vec, b: Vec) -> Vec:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
@@ -223,7 +213,7 @@ def _begin(
         p[_BG + i, _BG + i] = q.gyro_bias_std_rad_s**2
         p[_BA + i, _BA + i] = q.accel_bias_std_m_s2**2
         p[_D + i, _D + i] = lever.variance
-    _put(x, _D, lever.j2s)
+    vec.put(x, _D, lever.j2s)
     _set_upright(x, p, force, rate, imu)
     misfit[0], misfit[1] = 0.5 * q.first_misfit**2, 0.5
 
@@ -233,9 +223,9 @@ def _set_upright(x: Floats, p: Floats, force: Vec, rate: Vec, imu: ImuCalibratio
     """Tilt from the force, velocity from the constraint, as if nothing had been known of them."""
     variance_a = p[_BA, _BA]
     tilt, s = start(force, rate, imu)
-    _put(x, _Z, tilt)
-    bias, d = _at(x, _BG), _at(x, _D)
-    _put(x, _V, vec.cross(_minus(rate, bias), d))
+    vec.put(x, _Z, tilt)
+    bias, d = vec.at(x, _BG), vec.at(x, _D)
+    vec.put(x, _V, vec.cross(_minus(rate, bias), d))
     for i in range(6):
         for j in range(_N):
             p[i, j] = p[j, i] = 0.0
@@ -273,7 +263,7 @@ def _spread(
 @inlined
 def _predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, h: float) -> tuple[Vec, Vec]:
     """Tilt and velocity after a step `h` that turns the frame by `turn` (rad), with the forces at its ends."""
-    tilt, velocity, bias = _at(x, _Z), _at(x, _V), _at(x, _BA)
+    tilt, velocity, bias = vec.at(x, _Z), vec.at(x, _V), vec.at(x, _BA)
     half = 0.5 * h
     velocity = (
         velocity[0] + half * (before[0] - bias[0] - GRAVITY * tilt[0]),
@@ -378,8 +368,8 @@ def _correct(
     d is corrected in the part that the rotation stands out of the gyro's noise: K's rows of d are scaled by it, and P
     follows as P − KHP − PHᵀKᵀ + KSKᵀ.
     """
-    d, velocity = _at(x, _D), _at(x, _V)
-    w = _minus(rate, _at(x, _BG))
+    d, velocity = vec.at(x, _D), vec.at(x, _V)
+    w = _minus(rate, vec.at(x, _BG))
     lever = vec.cross(w, d)
     y = _minus(lever, velocity)
     for i in range(_N):
@@ -391,7 +381,7 @@ def _correct(
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
     product = 0.5 * (p[6, 6] + p[7, 7] + p[8, 8]) * (p[12, 12] + p[13, 13] + p[14, 14])
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
-    moved = _minus(before, _at(x, _BG)) if jumped else w  # a spike must not excuse itself
+    moved = _minus(before, vec.at(x, _BG)) if jumped else w  # a spike must not excuse itself
     reach = vec.dot(moved, moved) * vec.dot(d, d)
     share = min(max(misfit[0] / misfit[1], q.least_misfit**2), 1.0)
     keep = min(h / q.misfit_time_s, 1.0)
@@ -414,8 +404,8 @@ def _correct(
             part = 1.0 if i < _D else told * (2.0 - told)
             p[i, j] -= part * (gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2])
             p[j, i] = p[i, j]
-    tilt = vec.unit(_at(x, _Z))
-    _put(x, _Z, tilt)
+    tilt = vec.unit(vec.at(x, _Z))
+    vec.put(x, _Z, tilt)
     block = (p[0, 0], p[0, 1], p[0, 2], p[1, 1], p[1, 2], p[2, 2])
     if vec.quadratic(block, tilt) > _NONE_RAD2 and vec.trace(block) < _SMALL_RAD2:
         _flatten(p, tilt)
@@ -459,7 +449,7 @@ def _column(ph: Floats, c: int, d: Vec, w: Vec) -> Vec:
 def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> bool:
     """Follows how long neither force nor rate has left the noise; True when that is long enough to be a rest."""
     still = rest[0]
-    change = _minus(force, _at(rest, 1))
+    change = _minus(force, vec.at(rest, 1))
     drift = (rate[0] * still - rest[4], rate[1] * still - rest[5], rate[2] * still - rest[6])
     width = 3.0 * _REST_SIGMAS**2
     steady = vec.dot(change, change) < width * imu.accel_variance
@@ -468,8 +458,8 @@ def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibrati
         rest[0] = 0.0
         return False
     if still == 0.0:
-        _put(rest, 1, force)
-        _put(rest, 4, (0.0, 0.0, 0.0))
+        vec.put(rest, 1, force)
+        vec.put(rest, 4, (0.0, 0.0, 0.0))
     rest[0] = still + h
     for j in range(3):
         rest[4 + j] += rate[j] * h
@@ -493,7 +483,7 @@ def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
 @inlined
 def _runs_away(x: Floats) -> bool:
     """Whether the state is beyond what can be; NaN is."""
-    bg, ba, d = _at(x, _BG), _at(x, _BA), _at(x, _D)
+    bg, ba, d = vec.at(x, _BG), vec.at(x, _BA), vec.at(x, _D)
     can_be = (
         vec.dot(bg, bg) < _LARGEST[0] ** 2 and vec.dot(ba, ba) < _LARGEST[1] ** 2 and vec.dot(d, d) < _LARGEST[2] ** 2
     )
@@ -504,7 +494,7 @@ def _runs_away(x: Floats) -> bool:
 def _describe(tilt: Vec, x: Floats, p: Floats, lever: Lever) -> tuple[float, float, float, float]:
     """Height Zᵀ(d₀ + w(d − d₀)) and its standard deviation (m), roll and pitch (°)."""
     w = lever.share
-    change = _minus(_at(x, _D), lever.j2s)
+    change = _minus(vec.at(x, _D), lever.j2s)
     d = (lever.j2s[0] + w * change[0], lever.j2s[1] + w * change[1], lever.j2s[2] + w * change[2])
     variance = lever.rest
     for i in range(3):
@@ -594,11 +584,11 @@ def _process(
                     spread += 0.25 * step * step * vec.dot(jerk, jerk)
                 turned_at, newest_w = time_s[i], rate
             if not waits:
-                turn = _less(angle, h, _at(x, _BG))
+                turn = _less(angle, h, vec.at(x, _BG))
                 tilt, velocity = _predict_mean(x, turn, before_a, force, h)
                 _predict_covariance(p, work, turn, tilt, velocity, h)
-                _put(x, _Z, tilt)
-                _put(x, _V, velocity)
+                vec.put(x, _Z, tilt)
+                vec.put(x, _V, velocity)
                 noise = _velocity_variance(force, has_force, h, imu, q)
                 _forget_bias(x, p, h, q)
                 spread += q.gyro_misfit**2 * vec.dot(turn, turn)
@@ -624,16 +614,16 @@ def _process(
         if math.isnan(last):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            tilt = _at(x, _Z)
+            tilt = vec.at(x, _Z)
             if time_s[i] > last:  # while the step waits
                 since = _add_turn(angle, newest_w, newest_w, time_s[i] - turned_at)
-                tilt = vec.turn_back(_less(since, time_s[i] - last, _at(x, _BG)), tilt)
+                tilt = vec.turn_back(_less(since, time_s[i] - last, vec.at(x, _BG)), tilt)
             out[i, 0], out[i, 1], out[i, 2], out[i, 3] = _describe(tilt, x, p, lever)
     state.time[0], state.time[1], state.time[2], state.time[3] = last, held, turned_at, spread
-    _put(state.last[0], 0, before_a)
-    _put(state.last[1], 0, before_w)
-    _put(state.last[2], 0, newest_w)
-    _put(state.last[3], 0, angle)
+    vec.put(state.last[0], 0, before_a)
+    vec.put(state.last[1], 0, before_w)
+    vec.put(state.last[2], 0, newest_w)
+    vec.put(state.last[3], 0, angle)
     state.counts[0], state.counts[1] = rejected, restarts
 
 

@@ -151,16 +151,6 @@ class TiltInertialFilter:
 
 
 @compiled
-def _at(x: Floats, k: int) -> Vec:
-    return (x[k], x[k + 1], x[k + 2])
-
-
-@compiled
-def _put(x: Floats, k: int, value: Vec) -> None:
-    x[k], x[k + 1], x[k + 2] = value
-
-
-@compiled
 def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: TiltInertialParameters) -> None:
     """Tilt from the force, as if nothing had been known of it; a velocity that may be any."""
     x, p = state.mean, state.covariance
@@ -169,8 +159,8 @@ def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: Ti
             p[i, j] = p[j, i] = 0.0
     tilt, s = start(force, rate, imu)
     square = max(q.first_speed_m_s**2, state.speed[3])  # what has been measured of it stays
-    _put(x, _Z, tilt)
-    _put(x, _V, (0.0, 0.0, 0.0))
+    vec.put(x, _Z, tilt)
+    vec.put(x, _V, (0.0, 0.0, 0.0))
     k = 0
     for i in range(3):
         for j in range(i, 3):
@@ -179,8 +169,8 @@ def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: Ti
         p[_V + i, _V + i] = square
     state.speed[0] = state.speed[1] = state.speed[2] = 0.0
     state.speed[3] = square
-    _put(state.calm, 0, force)
-    _put(state.calm, 3, rate)
+    vec.put(state.calm, 0, force)
+    vec.put(state.calm, 3, rate)
     state.calm[6] = 1.0
 
 
@@ -198,14 +188,14 @@ def _begin(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: TiltIner
 @inlined
 def _predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, h: float) -> None:
     """Tilt and velocity after a step `h` that turns the frame by `turn` (rad), with the forces at its ends."""
-    tilt, v, half = _at(x, _Z), _at(x, _V), 0.5 * h
+    tilt, v, half = vec.at(x, _Z), vec.at(x, _V), 0.5 * h
     v = (
         v[0] + half * (before[0] - GRAVITY * tilt[0]),
         v[1] + half * (before[1] - GRAVITY * tilt[1]),
         v[2] + half * (before[2] - GRAVITY * tilt[2]),
     )
     tilt, v = vec.unit(vec.turn_back(turn, tilt)), vec.turn_back(turn, v)
-    _put(x, _Z, tilt)
+    vec.put(x, _Z, tilt)
     x[_V] = v[0] + half * (force[0] - GRAVITY * tilt[0])
     x[_V + 1] = v[1] + half * (force[1] - GRAVITY * tilt[1])
     x[_V + 2] = v[2] + half * (force[2] - GRAVITY * tilt[2])
@@ -292,12 +282,12 @@ def _measure_speed(
     x: Floats, p: Floats, swing: Floats, turn: Vec, force: Vec, h: float, q: TiltInertialParameters
 ) -> None:
     """σ from what the last second's acceleration adds up to, less the share of a tilt that is not known."""
-    u = vec.turn_back(turn, _at(swing, 0))
+    u = vec.turn_back(turn, vec.at(swing, 0))
     keep = min(h / q.swing_time_s, 1.0)
     for j in range(3):
         swing[j] = u[j] - keep * u[j] + h * (force[j] - GRAVITY * x[j])
     own = (p[0, 0] + p[1, 1] + p[2, 2]) * (GRAVITY * q.swing_time_s) ** 2
-    u = _at(swing, 0)
+    u = vec.at(swing, 0)
     square = max(vec.dot(u, u) - own, 0.0) / 3.0
     swing[3] += min(h / q.speed_memory_s, 1.0) * (square - swing[3])
     swing[3] = min(max(swing[3], q.least_speed_m_s**2), q.most_speed_m_s**2)
@@ -306,7 +296,7 @@ def _measure_speed(
 @compiled
 def _correct_by_speed(x: Floats, p: Floats, square: float, h: float, q: TiltInertialParameters) -> None:
     """0 = v + e, one axis after the other, since e's axes are independent."""
-    v = _at(x, _V)
+    v = vec.at(x, _V)
     # A velocity that the covariance does not allow for: tilt or bias were believed too early (a start in motion).
     own = p[_V, _V] + p[_V + 1, _V + 1] + p[_V + 2, _V + 2]
     if vec.dot(v, v) > _DOUBT * (own + 3.0 * square):
@@ -317,7 +307,7 @@ def _correct_by_speed(x: Floats, p: Floats, square: float, h: float, q: TiltIner
     noise = square * max(2.0 * q.correlation_s / h, 1.0)
     for c in range(_V, _B):
         _take(x, p, c, -x[c], noise)
-    _put(x, _Z, vec.unit(_at(x, _Z)))
+    vec.put(x, _Z, vec.unit(vec.at(x, _Z)))
 
 
 @compiled
@@ -338,7 +328,7 @@ def _correct_by_calm(
     calm[6] += keep * (turned + leaning - calm[6])
     moving = max(calm[6] - 6.0 * imu.gyro_variance, 0.0)
     variance = q.swing_share**2 * moving + q.least_turn_rad_s**2
-    steady = _at(calm, 3)
+    steady = vec.at(calm, 3)
     if vec.dot(steady, steady) > _LARGEST_RAD_S**2:
         return  # no bias, but a turn at a constant rate
     noise = variance * max(2.0 * memory / h, 1.0)
@@ -347,20 +337,20 @@ def _correct_by_calm(
         innovation = rate[j] - x[c]
         if innovation * innovation < _GATE * (p[c, c] + variance):  # a bias does not jump
             _take(x, p, c, innovation, noise)
-    _put(x, _Z, vec.unit(_at(x, _Z)))
+    vec.put(x, _Z, vec.unit(vec.at(x, _Z)))
 
 
 @compiled
 def _undelayed(x: Floats, rate: Vec, delay_s: float) -> Vec:
     """Z at the time of the stamp, from the Z that the readings told, and the last rate."""
     turn = (delay_s * (rate[0] - x[_B]), delay_s * (rate[1] - x[_B + 1]), delay_s * (rate[2] - x[_B + 2]))
-    return vec.turn_back(turn, _at(x, _Z))
+    return vec.turn_back(turn, vec.at(x, _Z))
 
 
 @inlined
 def _runs_away(x: Floats) -> bool:
     """Whether the state is beyond what can be; NaN is."""
-    b = _at(x, _B)
+    b = vec.at(x, _B)
     return not (vec.dot(b, b) < _LARGEST_RAD_S**2 and math.isfinite(x[0] + x[3] + x[4] + x[5]))
 
 
@@ -403,7 +393,7 @@ def _process(
                 h * (0.5 * (rate[2] + before_w[2]) - x[_B + 2]),
             )
             _predict_mean(x, turn, before_a, force, h)
-            tilt, velocity = _at(x, _Z), _at(x, _V)
+            tilt, velocity = vec.at(x, _Z), vec.at(x, _V)
             _predict_covariance(p, state.work, turn, tilt, velocity, h)
             lasting = max(2.0 * q.correlation_s / h, 1.0)
             noise = imu.accel_variance + lasting * q.accel_misfit**2 * vec.dot(force, force)
