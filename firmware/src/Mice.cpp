@@ -93,11 +93,11 @@ uint8_t Mice::in_sample() const {
   return count;
 }
 
-uint16_t Mice::flags() const {
-  uint16_t flags = 0;
+uint16_t Mice::flags(bool read) const {
+  uint16_t flags = read ? 0 : wire::sample_flags::kMiceStale;
   for (uint8_t i = 0; i < kPorts; i++) {
     if (mouse(i).valid()) flags |= wire::sample_flags::kMouse1Valid << i;
-    if (mouse(i).overflow()) flags |= wire::sample_flags::kMouse1Overflow << i;
+    if (read && mouse(i).overflow()) flags |= wire::sample_flags::kMouse1Overflow << i;
   }
   return flags;
 }

@@ -22,7 +22,8 @@ class Mice {
   bool settled() const;
   // Of a SAMPLE: ports up to the last at which a mouse was ever found.
   uint8_t in_sample() const;
-  uint16_t flags() const;
+  // `read`: the SAMPLE carries their movement, of the interval between two polls, the same for all.
+  uint16_t flags(bool read) const;
   void forget_movement();
 
  private:

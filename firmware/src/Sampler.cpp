@@ -138,11 +138,16 @@ void Sampler::send_sample() {
   if (reading_.valid && reading_.accel_saturated) sample.flags |= flag::kAccelSaturated;
   if (reading_.valid && reading_.gyro_saturated) sample.flags |= flag::kGyroSaturated;
   if (baro_.valid()) sample.flags |= flag::kBaroValid;
-  sample.flags |= mice_.flags();
+  // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
+  const bool mice_read = tick_.serves_mice;
+  sample.flags |= mice_.flags(mice_read);
   const uint8_t count = mice_.in_sample();
-  for (uint8_t i = 0; i < count; i++) sample.mice[i] = {mice_.mouse(i).dx(), mice_.mouse(i).dy()};
-  // Movement that did not get into the transmit ring goes into the next SAMPLE.
-  if (uart::put(wire::Sample::kType, &sample, wire::Sample::size(count))) mice_.forget_movement();
+  for (uint8_t i = 0; i < count; i++) {
+    const Ps2Mouse& mouse = mice_.mouse(i);
+    sample.mice[i] = {mice_read ? mouse.dx() : int16_t{0}, mice_read ? mouse.dy() : int16_t{0}};
+  }
+  // Movement that did not get into the transmit ring goes into a later SAMPLE.
+  if (uart::put(wire::Sample::kType, &sample, wire::Sample::size(count)) && mice_read) mice_.forget_movement();
 }
 
 void Sampler::send_self_test_result() {

@@ -44,7 +44,7 @@ class Sampler {
   Mpu6050 imu_;
   Bmp180 baro_;
   Mpu6050::Reading reading_ = {};
-  clock::Tick tick_ = {0, 0};
+  clock::Tick tick_ = {0, 0, false};
   uint32_t first_tick_ = 0;  // the one with seq 0
   uint32_t ticks_missed_ = 0;
   Phase phase_ = Phase::kQuiet;

@@ -52,8 +52,8 @@ def framed(payload: bytes) -> bytes:
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
         (random.Random(3).randbytes(60), "only noise came"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.0"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.0, the board's firmware 2.0"),
+        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.1"),
+        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.1, the board's firmware 2.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )

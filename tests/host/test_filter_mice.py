@@ -24,12 +24,15 @@ VELOCITY = slice(0, 3)
 STD = slice(3, 6)
 POSE = slice(6, 9)
 EXCLUDED = 9
+STALE = int(SampleFlags.MICE_STALE)
 EVEN = MiceParameters(scatter=0.0, floor=0.0, mismatch=0.0, noise_m_s=1.0)  # all mice alike, and no fault in sight
 
 
 @lru_cache(maxsize=20)
-def recorded(seed: int = 1, faults: tuple[Fault, ...] = (), mice: int = 3) -> tuple[MiceRun, Measurements]:
-    run = MiceRun(seed, 30.0, mice=ring(mice), faults=faults)
+def recorded(
+    seed: int = 1, faults: tuple[Fault, ...] = (), mice: int = 3, rate_hz: float = 100.0
+) -> tuple[MiceRun, Measurements]:
+    run = MiceRun(seed, 30.0, rate_hz, ring(mice), faults=faults)
     return run, run.measurements()
 
 
@@ -204,6 +207,66 @@ def test_the_fault_limit_is_a_chi_square_quantile():
         assert 1e-7 < chi2.sf(fault_limit(freedom), freedom) < 1.1e-6
 
 
+# ---- mice that are not read for every sample ----
+
+
+def stale_but_every(n: int, count: int) -> np.ndarray:
+    """Flags of so many samples of which every n-th brings movement."""
+    return np.where(np.arange(count) % n, STALE, 0)
+
+
+@pytest.mark.parametrize("ticks", [2, 4])
+def test_between_two_readings_the_velocity_stands_and_the_pose_goes_on(ticks):
+    mice, flags = ring(3), stale_but_every(ticks, 400)
+    counts = np.where(flags[:, None, None], 0.0, ticks * 0.5 * 0.004 * mice[0].counts_per_m * np.array([1.0, 0.0]))
+    block = counted(counts * np.ones((1, 3, 1)), 0.004, flags=flags)
+    out = MiceFilter(Rig(mouse=mice)).process(block)[ticks:]
+    np.testing.assert_allclose(out[:, VELOCITY], np.tile([0.5, 0.0, 0.0], (len(out), 1)), atol=1e-9)
+    np.testing.assert_allclose(out[:, POSE][:, 0], 0.5 * block.time_s[ticks:], atol=1e-9)
+    doubt = out[:, STD][: len(out) // ticks * ticks].reshape(-1, ticks, 3)
+    assert (np.diff(doubt, axis=1) > 0).all()
+    assert (out[:, EXCLUDED] == 0).all()
+
+
+@pytest.mark.parametrize("rate_hz", [160, 250, 500])
+def test_samples_between_two_readings_change_nothing_at_the_readings(rate_hz):
+    run, block = recorded(2, (Fault("lift", 3, 13.0, 18.0), Fault("unplug", 1, 25.0, 28.0)), rate_hz=rate_hz)
+    read = block.flags & STALE == 0
+    alone = replace(
+        block, time_s=block.time_s[read], mice_counts=block.mice_counts[read], gyro_rad_s=block.gyro_rad_s[read],
+        flags=block.flags[read],
+    )  # fmt: skip
+    out = estimate(run, block)
+    np.testing.assert_array_equal(out[read], estimate(run, alone))
+    for column in (*range(3), EXCLUDED):  # held until the next reading
+        held = out[read, column][np.cumsum(read) - 1]
+        np.testing.assert_array_equal(out[:, column], held)
+
+
+def test_at_250_hz_the_velocity_is_as_true_as_at_125_hz():
+    errors = []
+    for rate_hz in (125, 250):
+        run, block = recorded(1, rate_hz=rate_hz)
+        truth = run.at(block.time_s - 0.004)
+        off = estimate(run, block)[10:, :2] - np.column_stack([truth.vx_m_s, truth.vy_m_s])[10:]
+        errors.append(np.sqrt(np.mean(off**2)))
+    assert errors[1] < 1.1 * errors[0] < 0.01
+
+
+def test_a_lost_sample_without_movement_is_no_gap_and_a_lost_reading_is_bridged():
+    counts = np.where(stale_but_every(2, 100)[:, None, None], 0.0, np.full((1, 3, 2), 40.0))
+    whole = counted(counts, 0.005, flags=stale_but_every(2, 100))
+    full = MiceFilter(Rig(mouse=ring(3))).process(whole)
+    for lost, gap in (([51], 52), ([52], 53)):
+        keep = np.setdiff1d(np.arange(100), lost)
+        flags = whole.flags.copy()
+        flags[gap] |= int(SampleFlags.GAP_BEFORE)
+        holey = replace(counted(counts[keep], flags=flags[keep]), time_s=whole.time_s[keep])
+        out = MiceFilter(Rig(mouse=ring(3))).process(holey)
+        np.testing.assert_allclose(out[50:, VELOCITY], full[keep][50:, VELOCITY], atol=1e-9)
+        np.testing.assert_allclose(out[-1, POSE], full[-1, POSE], atol=1e-9)
+
+
 # ---- one mouse, no mouse, gaps ----
 
 
@@ -250,9 +313,10 @@ def test_a_time_that_does_not_go_on_changes_nothing():
     np.testing.assert_array_equal(out[6, POSE], out[5, POSE])
 
 
+@pytest.mark.parametrize("rate_hz", [100, 250])
 @pytest.mark.parametrize("size", [1, 7, 1000])
-def test_blocks_of_any_size_give_the_same_to_the_bit(size):
-    run, block = recorded(2, (Fault("lift", 3, 13.0, 18.0),))
+def test_blocks_of_any_size_give_the_same_to_the_bit(size, rate_hz):
+    run, block = recorded(2, (Fault("lift", 3, 13.0, 18.0),), rate_hz=rate_hz)
     whole = estimate(run, block)
     filter_ = MiceFilter(run.rig)
     parts = [filter_.process(block[at : at + size]) for at in range(0, len(block), size)]

@@ -18,8 +18,10 @@ BOTH = pytest.mark.parametrize("name", ["planar-ekf", "planar-ukf"])
 
 
 @lru_cache(maxsize=10)
-def recorded(seed: int = 1, faults: tuple[Fault, ...] = ()) -> tuple[MiceRun, Measurements]:
-    run = MiceRun(seed, 30.0, faults=faults)
+def recorded(
+    seed: int = 1, faults: tuple[Fault, ...] = (), rate_hz: float = 100.0
+) -> tuple[MiceRun, Measurements]:
+    run = MiceRun(seed, 30.0, rate_hz, faults=faults)
     return run, run.measurements()
 
 
@@ -88,9 +90,22 @@ def test_missing_values_only_widen_the_doubt(name):
     assert (np.diff(out[1001:1049, 9:11], axis=0) > 0).all() and (out[1100, 9:11] < out[1049, 9:11]).all()
 
 
+@BOTH
+@pytest.mark.parametrize("rate_hz", [250, 500])
+def test_between_two_readings_of_the_mice_the_state_is_predicted(name, rate_hz):
+    rms = []
+    for rate in (125, rate_hz):
+        run, block = recorded(1, rate_hz=rate)
+        filter_ = filters.create(name, run.rig)
+        rms.append(np.sqrt(np.mean(errors(run, filter_.process(block), block.time_s)[50:] ** 2, axis=0)))
+        assert filter_.rejected == 0
+    assert (rms[1][3:5] < 1.1 * rms[0][3:5]).all() and np.hypot(*rms[1][:2]) < 0.1
+
+
+@pytest.mark.parametrize("rate_hz", [100, 250])
 @pytest.mark.parametrize("cls", [PlanarEkf, PlanarUkf])
-def test_blocks_of_any_size_give_the_same_to_the_bit(cls):
-    run, block = recorded()
+def test_blocks_of_any_size_give_the_same_to_the_bit(cls, rate_hz):
+    run, block = recorded(rate_hz=rate_hz)
     block = block[1300:1700]
     whole, parts = cls(run.rig).process(block), cls(run.rig)
     np.testing.assert_array_equal(np.concatenate([parts.process(block[i : i + 1]) for i in range(len(block))]), whole)

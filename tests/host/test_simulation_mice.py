@@ -20,6 +20,8 @@ from linkpose.simulation.drive import Manoeuvres, Track
 from linkpose.simulation.mice import LEVELS, Fault, MiceRun, MouseErrors, ring
 from linkpose.wire.messages import SampleFlags
 
+STALE = int(SampleFlags.MICE_STALE)
+
 NO_ERRORS = LEVELS["none"]
 
 
@@ -59,12 +61,21 @@ def test_the_robot_rests_at_the_start_moves_in_every_way_and_not_faster_than_a_m
 @pytest.mark.parametrize("rate_hz", [50, 100, 400])
 def test_the_counts_add_up_to_the_way_whatever_the_sample_rate(rate_hz):
     run = MiceRun(1, 20.0, rate_hz, mouse_errors=NO_ERRORS)
-    moved = run.measurements().mice_counts.sum(axis=0)
-    truth = run.at(np.arange(0.0, 20.0 - 1 / rate_hz + 1e-9, 5e-4))
+    block = run.measurements()
+    moved, last = block.mice_counts.sum(axis=0), block.time_s[block.flags & STALE == 0][-1]
+    truth = run.at(np.arange(0.0, last + 1e-9, 5e-4))
     for i, mouse in enumerate(run.mice):
         vx, vy = truth.vx_m_s - truth.wz_rad_s * mouse.y_m, truth.vy_m_s + truth.wz_rad_s * mouse.x_m
         way = [0.5 * (v[1:] + v[:-1]).sum() * 5e-4 for v in (vx, vy)]
         np.testing.assert_allclose(moved[i], np.array(way) * mouse.counts_per_m, atol=1.0)
+
+
+@pytest.mark.parametrize(("rate_hz", "ticks"), [(100, 1), (125, 1), (160, 2), (250, 2), (500, 4)])
+def test_the_mice_are_read_as_often_as_the_firmware_can(rate_hz, ticks):
+    block = MiceRun(1, 8.0, rate_hz).measurements()
+    stale = block.flags & STALE != 0
+    assert set(np.diff(np.flatnonzero(~stale))) == {ticks}
+    assert not block.mice_counts[stale].any() and block.mice_counts[~stale].any()
 
 
 def test_counts_are_a_function_of_time_and_samples_of_their_number():
@@ -167,19 +178,21 @@ def test_without_an_imu_the_mice_still_do(linkpose, tmp_path):
     assert set(planar_scores(linkpose, out, truth)) == {"mice", "planar-ekf", "planar-ukf"}
 
 
-def test_a_live_board_with_mice_is_estimated_as_its_recording_is(linkpose, tmp_path):
+@pytest.mark.parametrize("rate_hz", [100, 250])
+def test_a_live_board_with_mice_is_estimated_as_its_recording_is(linkpose, tmp_path, rate_hz):
     live, record, replay = (tmp_path / name for name in ("live.csv", "rec.csv", "replay.csv"))
-    port = "sim://mice?seed=1&mice=3&fault=lift:2:3-6&speed=0"
-    done = linkpose("estimate", "--live", "--port", port, "--duration", 8, "-o", live, "--record", record)
+    port, rate = "sim://mice?seed=1&mice=3&fault=lift:2:3-6&speed=0", ("--rate", rate_hz, "--duration", 8)
+    done = linkpose("estimate", "--live", "--port", port, *rate, "-o", live, "--record", record)
     assert done.status == 0, done.err
     assert linkpose("estimate", record, "-o", replay).status == 0
     rows = [[line for line in path.read_text().splitlines() if line[:1].isdigit()] for path in (live, replay)]
-    assert rows[0] == rows[1] and len(rows[0]) == 800
+    assert rows[0] == rows[1] and len(rows[0]) == 8 * rate_hz
     recording = load_recording(record)
     assert [mouse["id"] for mouse in recording.metadata["mice"]] == [0, 0, 0]
     assert recording.rig == MiceRun().rig
-    same = MiceRun(1, faults=(Fault("lift", 2, 3.0, 6.0),)).measurements()
-    np.testing.assert_array_equal(recording.measurements.mice_counts, same.mice_counts[:800])
+    same = MiceRun(1, rate_hz=rate_hz, faults=(Fault("lift", 2, 3.0, 6.0),)).measurements()[: 8 * rate_hz]
+    np.testing.assert_array_equal(recording.measurements.mice_counts, same.mice_counts)
+    np.testing.assert_array_equal(recording.measurements.flags, same.flags)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -26,7 +27,11 @@ from measuring import (
 from rig_signals import RigFeed
 from wire_link import WATCHED_BUS, WireLink, burst_starts
 
-from linkpose.simulation.mice import MiceRun
+from linkpose.filters.mice import MiceFilter
+from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+from linkpose.simulation.mice import MiceRun, ring
 from linkpose.wire.messages import GetInfo, Hello, ResetMice, SampleFlags
 
 MakeBoard = Callable[..., WireLink]
@@ -135,6 +140,30 @@ def test_three_mice_at_200_hz(board: MakeBoard) -> None:
     assert lost(link.samples) == 0
     assert totals(link.samples).tolist() == (reported(link) - before).tolist()
     assert link.status.ticks_missed == 0
+
+
+@pytest.mark.parametrize("rate_hz", [160, 250, 500])
+def test_above_133_hz_a_sample_says_whether_it_brings_movement(board: MakeBoard, rate_hz: int) -> None:
+    """Mice at constant speed: alike in all SAMPLEs that bring movement, and so are the velocities in all of them."""
+    link = stream(board(mice=MICE[:3]), rate_hz)
+    ticks, speed_m_s = math.ceil(0.0075 * rate_hz), 0.25
+    for mouse in link.uno.mice:
+        mouse.feed([0, 10], np.array([[0, 0], [1e4 * speed_m_s, 0]]), start_s=link.uno.time_s)
+    link.run_ms(100)
+    link.forget()
+    link.run_ms(1000)
+    stale = np.array([bool(sample.flags & SampleFlags.MICE_STALE) for sample in link.samples])
+    counts = np.array([sample.mice for sample in link.samples])
+    (read,) = np.nonzero(~stale)
+    assert set(np.diff(read)) == {ticks} and not counts[stale].any()
+    expected = 1e3 * speed_m_s * COUNTS_PER_MM * ticks / rate_hz
+    assert np.abs(counts[~stale] - [expected, 0]).max() <= 1
+    samples = link.samples
+    link.send(GetInfo())
+    converter = Converter(Settings.of(link.expect(Hello, 50)))
+    rows = [converter.row(sample, sample.t_us * 1e-6, sample.seq, sample.flags) for sample in samples]
+    velocity = MiceFilter(Rig(mouse=ring(3))).process(Measurements.of(rows))[2 * ticks :, 0]
+    assert np.abs(velocity - speed_m_s).max() <= 0.02
 
 
 def test_a_mouse_pulled_and_put_back(board: MakeBoard) -> None:

@@ -18,6 +18,8 @@ also agrees with the gyro and with what a robot can do in so short a time. The s
 mouse out for that step: one that must repeat a packet says nothing first, and all at once then. What lasts longer is a
 fault. The mouse is excluded, watched, and taken back when it has agreed over a time and a distance; at rest all agree.
 
+The equations are those of a reading of the mice, T the time between two. At high rates some samples come without one.
+
 Source: the redundant-mice paper, equations (1)-(17).
 """
 
@@ -43,6 +45,7 @@ Bools = NDArray[np.bool_]
 NEAREST_M = 1e-3  # mice closer than this to one another tell no rotation
 
 _GAP_BEFORE = int(SampleFlags.GAP_BEFORE)
+_STALE = int(SampleFlags.MICE_STALE)
 _OVERFLOW = int(SampleFlags.MOUSE1_OVERFLOW)  # that of mouse i is shifted by i
 _ROUNDING = 1.0 / 6.0  # counts²: variance of the difference of two roundings
 
@@ -92,24 +95,26 @@ class Placement(NamedTuple):
 class MiceState(NamedTuple):
     """What the filter remembers from one block to the next; changed in place. Vectors are in b."""
 
-    time: Floats  # (3,) s: of the last sample, the usual interval, of the last sample with a velocity; NaN for none
-    pose: Floats  # (3,) x, y (m), heading (rad) in n
+    time: Floats  # (3,) s: of the last reading, the usual interval, of the last reading with a velocity; NaN for none
+    pose: Floats  # (3,) x, y (m), heading (rad) in n, at the last reading
     velocity: Floats  # (3,) v_bx, v_by (m/s), ω_b (rad/s)
     std: Floats  # (3,) of the velocity
     reference: Floats  # (3,) mean velocity over the window when the mice last agreed
     gyro: Floats  # (3,) last usable rate (rad/s, NaN for none), its bias beyond the rig's (rad/s), learnt over (s)
     window: Floats  # (M + 1, 2) m: each mouse's motion S_i; last row: the window's time (s) and the gyro's turn (rad)
     watch: Floats  # (M + 1, 4) s without a count, s and m of agreement, s of suspicion; last row: s of disagreement
-    away: Bools  # (M,) whether a mouse had no counts at the last sample
+    away: Bools  # (M,) whether a mouse had no counts at the last reading
+    used: Bools  # (M,) whether a mouse counted for the estimate at the last reading
     distrusted: Bools  # (M,)
-    rejected: NDArray[np.int64]  # (1,) samples in which no mouse was of use, or time did not go on
+    lost: Bools  # (1,) whether samples were lost since the last reading
+    rejected: NDArray[np.int64]  # (1,) readings in which no mouse was of use, or time did not go on
 
     @staticmethod
     def fresh(mice: int) -> MiceState:
         return MiceState(
             np.full(3, np.nan), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.array([np.nan, 0.0, 0.0]),
-            np.zeros((mice + 1, 2)), np.zeros((mice + 1, 4)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_),
-            np.zeros(1, np.int64),
+            np.zeros((mice + 1, 2)), np.zeros((mice + 1, 4)), np.zeros(mice, np.bool_), np.ones(mice, np.bool_),
+            np.zeros(mice, np.bool_), np.zeros(1, np.bool_), np.zeros(1, np.int64),
         )  # fmt: skip
 
 
@@ -132,15 +137,16 @@ class MiceFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far in which no mouse could be used, or whose time could not."""
+        """Readings so far in which no mouse could be used, or whose time could not."""
         return int(self.state.rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Velocity in b and its standard deviations, pose in n, excluded mice, at each of the N samples: (N, 10).
 
-        The velocity is the mean over the sample's interval; NaN at the first sample, and when no mouse was of use for
-        half a second. The pose starts at 0, heading in [−π, π). Excluded is a bit mask, bit 0 is mouse 1. The
-        standard deviation is that of the modelled noise; what the calibration of the mice left is not in it.
+        The velocity is the mean over the interval of the last reading, which at a sample between two readings stands
+        with a growing standard deviation; NaN at the first reading, and when no mouse was of use for half a second.
+        The pose starts at 0, heading in [−π, π). Excluded is a bit mask, bit 0 is mouse 1. The standard deviation is
+        that of the modelled noise; what the calibration of the mice left is not in it.
         """
         out = np.empty((len(block), len(self.columns)))
         _process(
@@ -174,22 +180,18 @@ Normal = tuple[float, float, float, float]
 
 
 class Reading(NamedTuple):
-    """What one sample says, made usable. Arrays are room that every sample fills anew."""
+    """What one reading of the mice says, made usable. Arrays are room that every reading fills anew."""
 
     moved: Floats  # (M, 2) m: motion of each mouse in b over the step
     sound: Bools  # (M,) whether a mouse has counts of this step
     trusted: Bools  # (M,) whether they count for the window
-    use: Bools  # (M,) whether they count for the estimate
     weight: Floats  # (M,) 1/σ_i² over the window (1/m²)
 
 
 @_inner
 def room(mice: int) -> Reading:
     """A reading to be filled."""
-    return Reading(
-        np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_),
-        np.zeros(mice),
-    )  # fmt: skip
+    return Reading(np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice))
 
 
 @_inner
@@ -249,8 +251,8 @@ def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MicePa
     `rate` is the gyro's (rad/s), NaN without one.
     """
     normal, right, before = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), vec.load(state.velocity)
-    for i in range(reading.use.shape[0]):
-        if reading.use[i]:
+    for i in range(state.used.shape[0]):
+        if state.used[i]:
             at = place.position[i]
             w = 1.0 / variance(place.metres_per_count[i] / step, before, at, p.scatter, p.noise_m_s**2)
             normal, right = add_mouse(normal, right, w, at, reading.moved[i, 0] / step, reading.moved[i, 1] / step)
@@ -398,7 +400,7 @@ def leave_out_for_now(
     sums[mice, 0], sums[mice, 1] = step, rate * step if math.isfinite(rate) else 0.0
     disagree, worst, beyond_doubt = find_fault(sums, step, (step * p.noise_m_s) ** 2, p, reading, place, state)
     if disagree and beyond_doubt:
-        reading.use[worst] = False
+        state.used[worst] = False
 
 
 @_inner
@@ -414,7 +416,7 @@ def exclude(reading: Reading, step: float, place: Placement, p: MiceParameters, 
         state.watch[i, 3] = state.watch[i, 3] + step if is_found and i == worst else 0.0
     if not (is_found and state.watch[worst, 3] >= _LATE_S):
         return False
-    state.distrusted[worst], reading.trusted[worst], reading.use[worst] = True, False, False
+    state.distrusted[worst], reading.trusted[worst], state.used[worst] = True, False, False
     state.watch[worst, 1] = state.watch[worst, 2] = state.watch[worst, 3] = state.watch[mice, 0] = 0.0
     return True
 
@@ -466,7 +468,7 @@ def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
 
 @_inner
 def hold(time_s: float, dt: float, state: MiceState) -> None:
-    """A sample without a velocity of its own: for a while the last one stands, then nobody knows."""
+    """A reading without a velocity of its own: for a while the last one stands, then nobody knows."""
     if time_s - state.time[2] <= _HOLD_S:
         state.std[0] += _ACCEL_M_S2 * dt
         state.std[1] += _ACCEL_M_S2 * dt
@@ -480,23 +482,24 @@ def hold(time_s: float, dt: float, state: MiceState) -> None:
 
 @_inner
 def advance(
-    time_s: float, flags: int, rate: float, reading: Reading, place: Placement, p: MiceParameters, state: MiceState
+    time_s: float, rate: float, reading: Reading, place: Placement, p: MiceParameters, state: MiceState
 ) -> None:
-    """One sample. After a gap its counts cover one usual interval only: what the lost samples counted is lost."""
+    """One reading. After a gap its counts cover one usual interval only: what the lost samples counted is lost."""
     dt = time_s - state.time[0]
     for i in range(reading.sound.shape[0]):
         was_away, state.away[i] = state.away[i], not reading.sound[i]
         reading.sound[i] = reading.sound[i] and not was_away  # who knows since when its first counts were gathered
         reading.trusted[i] = reading.sound[i] and not state.distrusted[i]
-        reading.use[i] = reading.trusted[i]
-    if not dt > 0.0:  # also the first sample, whose interval nobody knows
+        state.used[i] = reading.trusted[i]
+    if not dt > 0.0:  # also the first reading, whose interval nobody knows
         if math.isnan(state.time[0]):
             state.time[0] = time_s
         else:
             state.rejected[0] += 1
         return
     state.time[0] = time_s
-    is_gap = bool(flags & _GAP_BEFORE) or dt > LONGEST_STEP_S
+    is_gap = state.lost[0] or dt > LONGEST_STEP_S
+    state.lost[0] = False
     if not is_gap:
         state.time[1] = dt
     step = 0.0 if math.isnan(state.time[1]) else min(state.time[1], dt)
@@ -513,6 +516,39 @@ def advance(
         hold(time_s, dt - 0.5 * missed, state)
 
 
+@_inner
+def take(
+    time_s: float, counts: Floats, flags: int, rate: float,
+    reading: Reading, place: Placement, p: MiceParameters, state: MiceState,
+) -> bool:  # fmt: skip
+    """One sample; whether the mice were read for it. At high rates the board reads them at every n-th tick only."""
+    state.lost[0] = state.lost[0] or bool(flags & _GAP_BEFORE)
+    if flags & _STALE:
+        return False
+    read_mice(counts, flags, place, reading)
+    advance(time_s, rate, reading, place, p, state)
+    return True
+
+
+@_inner
+def show(time_s: float, state: MiceState, out: Floats) -> None:
+    """The estimate at a sample: from the last reading on its velocity stands."""
+    since = time_s - state.time[0]
+    if not since > 0.0:
+        since = 0.0
+    known = not math.isnan(state.time[2])
+    for j in range(3):
+        doubt = _ACCEL_M_S2 if j < 2 else _ANGULAR_RAD_S2
+        out[j] = state.velocity[j] if known else math.nan
+        out[3 + j] = math.hypot(state.std[j], doubt * since) if known else math.nan
+        out[6 + j] = state.pose[j]
+    advance_pose(out[6:9], state.velocity, since)
+    out[9] = 0.0
+    for j in range(state.used.shape[0]):
+        if not state.used[j]:
+            out[9] += 1 << j
+
+
 @compiled
 def _process(
     time_s: Floats,
@@ -525,19 +561,8 @@ def _process(
     state: MiceState,
     out: Floats,
 ) -> None:
-    mice = place.position.shape[0]
-    reading = room(mice)
+    reading = room(place.position.shape[0])
     for i in range(len(time_s)):
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        read_mice(counts[i], flags[i], place, reading)
-        advance(time_s[i], flags[i], rate[2] if has_rate else math.nan, reading, place, p, state)
-        known = not math.isnan(state.time[2])
-        excluded = 0
-        for j in range(mice):
-            if not reading.use[j]:
-                excluded |= 1 << j
-        for j in range(3):
-            out[i, j] = state.velocity[j] if known else np.nan
-            out[i, 3 + j] = state.std[j] if known else np.nan
-            out[i, 6 + j] = state.pose[j]
-        out[i, 9] = excluded
+        take(time_s[i], counts[i], flags[i], rate[2] if has_rate else math.nan, reading, place, p, state)
+        show(time_s[i], state, out[i])

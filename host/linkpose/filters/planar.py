@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from linkpose.filters import mice
 from linkpose.filters._imu import Floats, ImuCalibration, read_gyro
 from linkpose.filters._vector import compiled
-from linkpose.filters.mice import MiceParameters, MiceState, Placement, Reading
+from linkpose.filters.mice import Bools, MiceParameters, MiceState, Placement, Reading
 from linkpose.localization import models
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.grid import no_map
@@ -51,14 +51,16 @@ class PlanarState(NamedTuple):
 
     mean: Floats  # (7,) x, y (m), θ (rad), v_x, v_y (m/s), ω, b (rad/s)
     covariance: Floats  # (7, 7)
+    time: Floats  # (1,) s, of the last sample; NaN for none
     mice: MiceState  # of the filter that chooses the mice
-    rejected: NDArray[np.int64]  # (1,) samples that brought no measurement, or after which P was no covariance
+    rejected: NDArray[np.int64]  # (1,) readings that brought no measurement, samples after which P was no covariance
 
     @staticmethod
     def fresh(count: int) -> PlanarState:
         return PlanarState(
-            np.zeros(_STATES), np.diag(np.square(_START_STD)), MiceState.fresh(count), np.zeros(1, np.int64)
-        )
+            np.zeros(_STATES), np.diag(np.square(_START_STD)), np.full(1, np.nan), MiceState.fresh(count),
+            np.zeros(1, np.int64),
+        )  # fmt: skip
 
 
 class World(NamedTuple):
@@ -104,7 +106,7 @@ class _PlanarFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far that were passed by prediction alone."""
+        """Readings of the mice so far that brought nothing, and samples after which the doubt had to start anew."""
         return int(self.state.rejected[0])
 
     def process(self, block: Measurements) -> Floats:
@@ -133,16 +135,19 @@ class PlanarUkf(_PlanarFilter):
 
 @compiled
 def _measure(
-    reading: Reading, step: float, place: Placement, p: MiceParameters, mean: Floats
+    reading: Reading, used: Bools, step: float, place: Placement, p: MiceParameters, mean: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Velocities of the mice that count (2 m,), their R (2 m, 2 m), and their places (m, 2)."""
-    count = mice.number(reading.use)
+    """Velocities of the mice that count (2 m,), their R (2 m, 2 m), and their places (m, 2).
+
+    `step` (s) is what the reading covers. No mouse counts where it is NaN: not known, or a sample without a reading.
+    """
+    count = mice.number(used) if step > 0.0 else 0
     values, covariance, places = np.empty(2 * count), np.zeros((2 * count, 2 * count)), np.empty((count, 2))
     square = mean[3] * mean[3] + mean[4] * mean[4]
     common, apart = p.floor * p.floor * square, p.mismatch * p.mismatch * square * _LASTS_S / step
     k = 0
-    for i in range(reading.use.shape[0]):
-        if reading.use[i]:
+    for i in range(used.shape[0]):
+        if count and used[i]:
             at = place.position[i]
             own = mice.variance(
                 place.metres_per_count[i] / step, (mean[3], mean[4], mean[5]), at, p.scatter, p.noise_m_s**2
@@ -194,19 +199,19 @@ def _process(
     state: PlanarState,
     out: Floats,
 ) -> None:
-    count = place.position.shape[0]
-    reading = mice.room(count)
+    reading = mice.room(place.position.shape[0])
     rate, rate_noise, nothing = np.empty(1), np.full((1, 1), imu.gyro_variance), np.empty((0, 2))
     for i in range(len(time_s)):
-        dt = time_s[i] - state.mice.time[0]
+        dt, since = time_s[i] - state.time[0], time_s[i] - state.mice.time[0]
         has_rate, turned = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        mice.read_mice(counts[i], flags[i], place, reading)
-        mice.advance(time_s[i], flags[i], turned[2] if has_rate else math.nan, reading, place, p, state.mice)
+        is_reading = mice.take(
+            time_s[i], counts[i], flags[i], turned[2] if has_rate else math.nan, reading, place, p, state.mice
+        )
+        if not dt <= 0.0:
+            state.time[0] = time_s[i]
         if dt > 0.0:  # not the first sample, whose interval nobody knows
-            step = min(state.mice.time[1], dt)
-            for j in range(count):
-                reading.use[j] = reading.use[j] and step > 0.0  # NaN: no interval is known yet
-            values, covariance, places = _measure(reading, step, place, p, state.mean)
+            step = min(state.mice.time[1], since) if is_reading else math.nan
+            values, covariance, places = _measure(reading, state.mice.used, step, place, p, state.mean)
             sound = _step(
                 is_ukf, dt, world.mouse_velocity, values, covariance, places, world, state.mean, state.covariance
             )
@@ -219,7 +224,7 @@ def _process(
                 for j in range(_STATES):
                     for k in range(_STATES):
                         state.covariance[j, k] = _START_STD[j] ** 2 if j == k else 0.0
-            state.rejected[0] += not (sound and values.shape[0])
+            state.rejected[0] += not (sound and (values.shape[0] or not is_reading))
         for j in range(_SHOWN):
             out[i, j] = state.mean[j]
             out[i, _SHOWN + j] = math.sqrt(state.covariance[j, j])

@@ -27,7 +27,7 @@ class Measurements:
     pressure_Pa: Floats  # (N,) the last compensated pressure, repeated until the next
     baro_temp_degC: Floats  # (N,)
     baro_fresh: NDArray[np.bool_]  # (N,) True at the first sample that carries a new pressure
-    mice_counts: Floats  # (N, M, 2) movement dx, dy of each mouse since the sample before, in counts
+    mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where flags say MICE_STALE
     flags: NDArray[np.uint16]  # (N,) wire.messages.SampleFlags
 
     def __len__(self) -> int:

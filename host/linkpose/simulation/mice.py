@@ -32,6 +32,7 @@ PAPER_TWIST = (0.01, 0.01, 0.0)  # m/s, m/s, rad/s
 PAPER_NOISE_M_S = 0.0025
 MOST_MICE = 4  # the firmware's ports
 NOISE_S = 0.01  # for which a mouse's noise keeps its value
+_POLL_S = 0.0075  # that the firmware leaves the mice to answer, before it asks them again at a tick
 _TEMPERATURE_DEGC = 27.0
 _BLOCK = 1000  # samples, or draws of noise, made at once
 
@@ -140,6 +141,7 @@ class MiceRun:
         self.seed, self.duration_s, self.rate_hz, self.mice, self.errors = seed, duration_s, rate_hz, mice, errors
         self.accel_range_g, self.gyro_range_deg_s, self.faults = accel_range_g, gyro_range_deg_s, faults
         self._mouse_errors = mouse_errors or LEVELS[errors]
+        self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
         self._drive = _drive(path, seed, duration_s, length_m)
         self._track = Track(self._drive)
         self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
@@ -271,11 +273,13 @@ class MiceRun:
         """The SAMPLEs of ticks first … first + count − 1. The counts of the first tick of all are 0."""
         ticks = np.arange(first - 1, first + count)
         time_s = np.maximum(ticks, 0) / self.rate_hz
-        moved = np.diff(self.counts(time_s), axis=0)
+        since_read = ticks % self._ticks_per_reading
+        moved = np.diff(self.counts((ticks - since_read) / self.rate_hz), axis=0)
         there = self.plugged(time_s[1:])
         if np.abs(moved).max(initial=0) > 32767:
             raise LinkposeError("a mouse moves by more counts in a sample than the wire holds; lower counts_per_m")
         flags = int(SampleFlags.IMU_VALID) + there @ (int(SampleFlags.MOUSE1_VALID) << np.arange(len(self.mice)))
+        flags = flags + np.where(since_read[1:], int(SampleFlags.MICE_STALE), 0)
         counts = self.imu_counts(time_s[1:], first).tolist()
         stamps = np.rint(time_s[1:] * 1e6).astype(np.int64).tolist()
         own = [tuple(SampleMouse(*pair) for pair in row) for row in np.where(there[:, :, None], moved, 0).tolist()]

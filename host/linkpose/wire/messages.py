@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 VERSION = "0.1.0"
 PROTOCOL_MAJOR = 1
-PROTOCOL_MINOR = 0
-SCHEMA_CRC = 0x89879a12
+PROTOCOL_MINOR = 1
+SCHEMA_CRC = 0xb774c1ea
 BAUD = 250000
 MAX_FRAME = 132
 
@@ -44,6 +44,7 @@ class SampleFlags(IntFlag):
     MOUSE2_OVERFLOW = 0x200
     MOUSE3_OVERFLOW = 0x400
     MOUSE4_OVERFLOW = 0x800
+    MICE_STALE = 0x1000
     GAP_BEFORE = 0x8000
 
 
@@ -129,7 +130,7 @@ class Hello(NamedTuple):
 class SampleMouse(NamedTuple):
     """One for each port up to the last at which a mouse was ever found since boot."""
 
-    dx: int  # counts; movement since the last SAMPLE
+    dx: int  # counts; movement since the last SAMPLE that was not mice_stale
     dy: int  # counts
 
 

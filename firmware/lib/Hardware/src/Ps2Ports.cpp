@@ -120,20 +120,21 @@ bool waiting(uint8_t port) { return prepared(port) & clock_of(port); }
 const Ps2Bits& bits(uint8_t port) { return lines[port]; }
 
 // Data goes low first, which is the start bit, then the clocks go free: the mice begin to clock their byte in.
-void start_prepared() {
-  if (--ticks_left != 0) return;
+bool start_prepared() {
+  if (--ticks_left != 0) return false;
   ticks_left = divider;
   PORTD &= static_cast<uint8_t>(~start_bits_d);
   DDRD |= start_bits_d;
   DDRD &= static_cast<uint8_t>(~prepared_d);
   PORTD |= prepared_d;
   prepared_d = start_bits_d = 0;
-  if (!prepared_b) return;
+  if (!prepared_b) return true;
   PORTB &= static_cast<uint8_t>(~start_bits_b);
   DDRB |= start_bits_b;
   DDRB &= static_cast<uint8_t>(~prepared_b);
   PORTB |= prepared_b;
   prepared_b = start_bits_b = 0;
+  return true;
 }
 
 }  // namespace ps2

@@ -24,7 +24,7 @@ void hold(uint8_t port);
 bool waiting(uint8_t port);
 const Ps2Bits& bits(uint8_t port);
 
-// For the interrupt of Timer1.
-void start_prepared();
+// For the interrupt of Timer1. Whether this is a tick that serves the mice.
+bool start_prepared();
 
 }  // namespace ps2

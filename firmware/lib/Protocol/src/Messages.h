@@ -8,8 +8,8 @@
 namespace wire {
 
 constexpr uint8_t kProtocolMajor = 1;
-constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0x89879a12;
+constexpr uint8_t kProtocolMinor = 1;
+constexpr uint32_t kSchemaCrc = 0xb774c1ea;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -48,6 +48,7 @@ constexpr uint16_t kMouse1Overflow = 0x0100;
 constexpr uint16_t kMouse2Overflow = 0x0200;
 constexpr uint16_t kMouse3Overflow = 0x0400;
 constexpr uint16_t kMouse4Overflow = 0x0800;
+constexpr uint16_t kMiceStale = 0x1000;
 constexpr uint16_t kGapBefore = 0x8000;
 }  // namespace sample_flags
 
@@ -127,7 +128,7 @@ static_assert(sizeof(Hello) == Hello::kSize, "no padding");
 // All sensors at one tick.
 struct __attribute__((packed)) Sample {
   struct __attribute__((packed)) Mouse {
-    int16_t dx;  // counts; movement since the last SAMPLE
+    int16_t dx;  // counts; movement since the last SAMPLE that was not mice_stale
     int16_t dy;  // counts
   };
   static_assert(sizeof(Mouse) == 4, "no padding");
