@@ -35,9 +35,11 @@ from linkpose.filters.tilt import (
     TiltParameters,
     TiltState,
     acceleration,
+    actual_covariance,
     advance,
     correct_by_accel,
     describe,
+    hear,
     keep,
     recall,
 )
@@ -83,7 +85,7 @@ class JointFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
-        The standard deviation is that of the modelled noise; a bias that the calibration left is not in it.
+        The standard deviation is that of the modelled noise and of the error that the residuals show beyond it.
         """
         out = np.empty((len(block), 4))
         _process(
@@ -146,7 +148,8 @@ def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu
     change = vec.apply(now.covariance, vec.apply(inverse, innovation))
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
     covariance = vec.parallel(now.covariance, noise, inverse)
-    return Now(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt))
+    now = Now(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt), now.lasting)
+    return hear(now, acceleration(reference, tilt))
 
 
 @compiled
@@ -178,13 +181,15 @@ def _process(
         if derivable:
             c = weights(now.time - t1, t1 - t2)
             now = correct_by_joint(now, force, c, w1, w2, d, imu)
+        elif has_force:
+            now = hear(now, now.accel)
         if now.time != t1:  # a repeated stamp brings nothing new
             t2, w2 = t1, w1
             t1, w1 = (now.time if has_rate else math.nan), now.rate
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, d)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, actual_covariance(now), d)
     keep(state, now, rejected)
     history.time[0], history.time[1] = t1, t2
     for j in range(3):

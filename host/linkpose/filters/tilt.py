@@ -10,6 +10,16 @@ Frames: n is fixed, Z up; s is the sensor's. The state is the tilt Z = Zˢ, n's 
 with a⁺_k = s_A,k − g Z⁺_k. Two refinements over the paper's (5): the rate over a step is the mean of the rates at its
 ends, and the rotation is exact, where I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
 
+P is the covariance of the modelled noise, and that is the least of the error: it holds neither the gyro's residual bias
+nor an acceleration that lasts. What P leaves out shows in the residual s_A − gZ⁺. Averaged over some seconds in a frame
+that does not turn, its noise vanishes, and so do the accelerations, velocities being bounded: what lasts is the error of
+the tilt. Along Z, where a tilt cannot err, it is the accelerometer's own error, which the tilt takes over unseen. With
+the lasting residual r (in g) and the error m (in g) that a calibration leaves the accelerometer, each axis across Z has
+
+    σ² = ½ (‖r‖² + (r·Z)²) + m²   beyond P, and the height   std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)²
+
+where the last term is that of 1 − cos: what a leaning link loses in height. No estimate is changed by it.
+
 Sources: the link paper, equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and
 external acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas.
 61(8), 2012.
@@ -41,6 +51,16 @@ from linkpose.sensors.rig import Rig
 _START_ACCEL_PER_RATE = 5.0
 _GUESS_RAD2 = 0.005  # a tilt whose variances sum to more is a guess: 3° either way
 _SWING_SAMPLES = 30.0  # that an acceleration lasts
+_LASTING_S = 5.0  # over which the residual is averaged: some swings of a hand, and less than the filter's memory
+_ACCEL_ERROR_M_S2 = 0.03  # that a calibration leaves, on each axis
+
+
+class Lasting(NamedTuple):
+    """The mean residual of the last seconds, in registers."""
+
+    mean: Vec  # m/s², turned along with the sensor
+    span: float  # over how long it has been taken (s)
+    share: float  # of the present sample
 
 
 class Now(NamedTuple):
@@ -52,6 +72,7 @@ class Now(NamedTuple):
     tilt: Vec  # Z
     covariance: Sym  # of Z
     accel: Vec  # a⁺ (m/s²)
+    lasting: Lasting
 
 
 class TiltParameters(NamedTuple):
@@ -68,12 +89,13 @@ class TiltState(NamedTuple):
     tilt: Floats  # (3,) Z
     covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
     accel: Floats  # (3,) a⁺ (m/s²)
+    lasting: Floats  # (4,) mean residual (m/s²), over how long it has been taken (s)
     rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time could not be used
 
     @staticmethod
     def fresh() -> TiltState:
         time, upward = np.array([np.nan, 0.0]), np.array([0.0, 0.0, 1.0])
-        return TiltState(time, np.zeros(3), upward, np.zeros(6), np.zeros(3), np.zeros(1, np.int64))
+        return TiltState(time, np.zeros(3), upward, np.zeros(6), np.zeros(3), np.zeros(4), np.zeros(1, np.int64))
 
 
 class TiltFilter:
@@ -96,7 +118,7 @@ class TiltFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
-        The standard deviation is that of the modelled noise; a bias that the calibration left is not in it.
+        The standard deviation is that of the modelled noise and of the error that the residuals show beyond it.
         """
         out = np.empty((len(block), 4))
         _process(
@@ -122,15 +144,16 @@ def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
 
 
 @inlined
-def predict(
-    tilt: Vec, covariance: Sym, rate: Vec, before: Vec, step_s: float, held_s: float, imu: ImuCalibration
-) -> tuple[Vec, Sym]:
+def predict(now: Now, time_s: float, step_s: float, rate: Vec, held_s: float, imu: ImuCalibration) -> Now:
     """(5) over `step_s`, from the rates at its ends, the last of which has been held for `held_s`."""
-    half = 0.5 * step_s
+    half, before = 0.5 * step_s, now.rate
     rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
-    tilt = vec.turn_back(rotation, tilt)
-    covariance = vec.turn_back_sym(rotation, covariance)
-    return tilt, vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
+    tilt = vec.turn_back(rotation, now.tilt)
+    covariance = vec.turn_back_sym(rotation, now.covariance)
+    covariance = vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
+    span = min(now.lasting.span + step_s, _LASTING_S)
+    lasting = Lasting(vec.turn_back(rotation, now.lasting.mean), span, step_s / span)
+    return Now(time_s, rate, held_s, tilt, covariance, now.accel, lasting)
 
 
 @inlined
@@ -169,7 +192,31 @@ def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -
     )
     change = vec.apply(gain, innovation)
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
-    return Now(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), acceleration(force, tilt))
+    accel = acceleration(force, tilt)
+    return Now(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), accel, now.lasting)
+
+
+@inlined
+def hear(now: Now, residual: Vec) -> Now:
+    """Takes a sample's residual, measured − gZ⁺ (m/s²), into the lasting one."""
+    m, share = now.lasting.mean, now.lasting.share
+    mean = (
+        m[0] + share * (residual[0] - m[0]),
+        m[1] + share * (residual[1] - m[1]),
+        m[2] + share * (residual[2] - m[2]),
+    )
+    lasting = Lasting(mean, now.lasting.span, share)
+    return Now(now.time, now.rate, now.held, now.tilt, now.covariance, now.accel, lasting)
+
+
+@inlined
+def actual_covariance(now: Now) -> Sym:
+    """Covariance of Z's actual error: P, and what the lasting residual says beyond it."""
+    mean, z = now.lasting.mean, now.tilt
+    along = vec.dot(mean, z)
+    across = (0.5 * (vec.dot(mean, mean) + along * along) + _ACCEL_ERROR_M_S2**2) / GRAVITY**2
+    beyond = vec.add(vec.cross_square(z, across), 2.0 * across * across, vec.outer(z))
+    return vec.add(now.covariance, 1.0, beyond)
 
 
 @inlined
@@ -200,6 +247,7 @@ def recall(state: TiltState) -> Now:
         vec.load(state.tilt),
         vec.load_sym(state.covariance),
         vec.load(state.accel),
+        Lasting(vec.load(state.lasting), state.lasting[3], 0.0),
     )
 
 
@@ -211,8 +259,10 @@ def keep(state: TiltState, now: Now, rejected: int) -> None:
         state.rate[j] = now.rate[j]
         state.tilt[j] = now.tilt[j]
         state.accel[j] = now.accel[j]
+        state.lasting[j] = now.lasting.mean[j]
     for j in range(6):
         state.covariance[j] = now.covariance[j]
+    state.lasting[3] = now.lasting.span
     state.rejected[0] += rejected
 
 
@@ -227,15 +277,15 @@ def advance(
         if not (has_force and has_rate and math.isfinite(time_s)):
             return now, False, force, False
         tilt, covariance = start(force, rate, imu)
-        return Now(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt)), True, force, True
+        nothing = Lasting((0.0, 0.0, 0.0), 0.0, 1.0)
+        return Now(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt), nothing), True, force, True
     goes_on, step_s = step_between(time_s, now.time)
     if not goes_on:
         return now, False, force, False
     held = 0.0 if has_rate else now.held + step_s
     if not has_rate:
         rate = now.rate
-    tilt, covariance = predict(now.tilt, now.covariance, rate, now.rate, step_s, held, imu)
-    return Now(time_s, rate, held, tilt, covariance, now.accel), has_force, force, has_rate
+    return predict(now, time_s, step_s, rate, held, imu), has_force, force, has_rate
 
 
 @compiled
@@ -259,8 +309,9 @@ def _process(
         rejected += not (has_force and has_rate)
         if has_force:
             now = correct_by_accel(now, force, parameters.accel_memory, imu)
+            now = hear(now, now.accel)
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, actual_covariance(now), j2s)
     keep(state, now, rejected)
