@@ -79,6 +79,16 @@ def trace(s: Sym) -> float:
 
 
 @compiled
+def cholesky(s: Sym) -> Sym:
+    """L of s = L Lᵀ, s positive definite: (l00, l10, l20, l11, l21, l22)."""
+    l00 = math.sqrt(s[0])
+    l10, l20 = s[1] / l00, s[2] / l00
+    l11 = math.sqrt(s[3] - l10 * l10)
+    l21 = (s[4] - l20 * l10) / l11
+    return l00, l10, l20, l11, l21, math.sqrt(s[5] - l20 * l20 - l21 * l21)
+
+
+@compiled
 def inverse(s: Sym) -> Sym:
     """Inverse of a positive definite matrix, by cofactors."""
     c00 = s[3] * s[5] - s[4] * s[4]

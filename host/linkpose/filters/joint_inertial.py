@@ -3,26 +3,29 @@
 Method A needs the derivative of the gyro. Here the accelerometer is integrated instead, and the velocity that comes of
 it must be the one that the angular rate gives the sensor. The state, all in the sensor's frame s:
 
-    Z    tilt, n's Z axis                       Ż = −(s_G − b_g) × Z
-    v    velocity of the sensor (m/s)           v̇ = −(s_G − b_g) × v + s_A − b_a − g Z
-    b_g  bias of the gyro (rad/s)               random walk
-    b_a  bias of the accelerometer (m/s²)       first-order Gauss-Markov
-    d    J2S as the gyro tells it (m)           constant
+    Z    tilt, n's Z axis                       Ż = −ω × Z
+    v    velocity of the sensor (m/s)           v̇ = −ω × v + f − g Z
+    b_g  bias of the gyro (rad/s)               ω = (I − M_g) (s_G − b_g)
+    b_a  bias of the accelerometer (m/s²)       f = (I − M_a) s_A − b_a
+    d    J2S (m)
+    M_a, M_g   scale, cross-axis sensitivity and alignment of either sensor, nine numbers each
 
-and at every sample the measurement  0 = v − (s_G − b_g) × d + n_G × d + e.  Over a step the frame turns by the exact
-exponential of the mean rate, v is integrated by the trapezoid, and ‖Z‖ = 1 is kept. Nothing is differentiated, no rest
-is needed, and motion tells the biases and d apart; a rest, where there is one, tells b_g outright. The height is Zᵀd.
+with the measurement  0 = v − ω × d + n_G × d + e.  The errors are constants, but for a slow walk of b_g, and what is
+believed of them fades, so that an error of the model does not stay. Nothing is differentiated, no rest is needed, and
+motion tells the errors and d apart; a rest, where there is one, tells b_g outright. The height is Zᵀd.
 
-A motion in a plane does not tell b_a across it from a leaning Z. There b_a keeps to what it can be (Gauss-Markov), and
-Z is as good as that. A reading that repeats the last one to the last bit is an old one, read again by a logger that is
-faster than the sensor: the step waits for the next new force, with the angle summed over the rates that came.
+The mean is brought forward at each sample: over a step the frame turns by the exact exponential of the mean rate, v is
+integrated by the trapezoid, and ‖Z‖ = 1 is kept. Covariance and measurement follow 25 times in a second: a faster pace
+brings no more, since what the constraint leaves over (e) is no white noise. e is measured: the share of ω×d that was
+left over in the last seconds. A reading that repeats the last one to the last bit is an old one, read again by a logger
+that is faster than the sensor: the step waits for the next new force, with the angle summed over the rates that came.
 
-What the model leaves out is scale and alignment. Each sensor's is taken for noise in proportion to what it reads. A
-gyro that reads 1 % more sees a lever that is 1 % shorter: d is J2S with such an error, and the height is
-Zᵀ(d₀ + w(d − d₀)), with w the share of J2S's own doubt in that of d (0 for a J2S that was measured, 1 for one that is
-unknown). What fits neither way (e) is measured: the share of ω×d that was left over in the last seconds.
+Whether the sensors were calibrated is not known, and the two beliefs differ in what they make of a first second. So two
+filters run, one with the errors that a calibration leaves (`CALIBRATED`) and one with the data sheet's (`DATA_SHEET`).
+The evidence for each is the likelihood of its innovations, and the estimate is the mean of both, weighted by it.
 
-Source: the constraint is (9) of the link paper, once integrated.
+Sources: the constraint is (9) of the link paper, once integrated. The two filters are a multiple-model estimator: D. T.
+Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control 10(4), 1965.
 """
 
 from __future__ import annotations
@@ -42,44 +45,59 @@ from linkpose.filters._imu import (
     read_gyro,
     rotation_variance,
 )
+from linkpose.filters._inertial import add_noise, predict_mean, rotation_rows, spread, take
 from linkpose.filters._vector import Vec, compiled, inlined
 from linkpose.filters.tilt import start
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-_N = 15
-_Z, _V, _BG, _BA, _D = 0, 3, 6, 9, 12  # where each begins in the state
+_N = 33
+_Z, _V, _BG, _BA, _D, _MA, _MG = 0, 3, 6, 9, 12, 15, 24  # where each begins in the state
+_OTHERS = ((1, 2), (2, 0), (0, 1))
+_PACE_S = 0.035  # between two corrections, at least
 _CLEAR = 30.0  # ‖ω‖² over its noise's, from which on it tells d; noise that is read as a rotation would, too
 _GATE = 25.0  # χ² with 3 degrees of freedom: one sound sample in 65 000
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of a link, but a spike
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
 _NONE_RAD2 = 1e-6  # and has no more than this along it
 _GAP_ACCEL_M_S2 = 10.0  # where the accelerometer did not see
-_SNAP_M_S4 = 500.0  # of a hand's motion, the force's second derivative: between two readings h apart it bends by h²/12
+_BEND = 1.0 / 12.0  # of the second difference
+_START_RAD_S2, _SWING_PER_S = 3.0, 5.0  # angular acceleration that the first sample may hold, and to a rate of 1 rad/s
 _LONGEST_BLIND_S = 0.3  # without a rate, a moving link has turned by more than its tilt can be guessed to
 LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
 _REST_S = 0.5  # of stillness that tells the gyro's bias
 _REST_STD_RAD_S = 0.001  # of a link that is held still
 _REST_SIGMAS = 5.0  # within which the readings stay at rest
+_TURN_SIGMAS = 3.0  # beyond which a rate is a turn, and no bias
+_FADING_PACE_S = 0.5
 _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, where there is that much: the tilt is wrong
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
+
+
+class Sensors(NamedTuple):
+    """How far off the sensors may be: standard deviations of one axis."""
+
+    gyro_bias_rad_s: float
+    gyro_scale: float
+    gyro_cross: float
+    accel_bias_m_s2: float
+    accel_scale: float
+    accel_cross: float
+
+
+CALIBRATED = Sensors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005)
+DATA_SHEET = Sensors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012)
+_BELIEFS = (CALIBRATED, DATA_SHEET)
+_ODDS = 15.0  # logarithm of those of the first of them, before anything was measured
 
 
 class JointInertialParameters(NamedTuple):
     """What the filter assumes."""
 
-    gyro_bias_std_rad_s: float = 0.35  # at switch-on: the data sheet's ±20 °/s
     gyro_bias_walk_rad_s: float = 1e-4  # in a second
-    # The accelerometer's follows its temperature: the data sheet's ±35 mg over 70 °C (x, y; ±60 mg for z) are 6 mg in a
-    # dozen degrees. The time is no data sheet's: within what the simulated Tests allow, both were chosen on recordings
-    # of a pendulum.
-    accel_bias_std_m_s2: float = 0.06
-    accel_bias_time_s: float = 100.0  # after which e⁻¹ of it is left
+    fade_s: float = 200.0  # after which e⁻¹ of what was believed of the sensors' errors is left
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
-    accel_misfit: float = 0.002  # noise in proportion to the force: scale and alignment
-    gyro_misfit: float = 0.003  # noise of the rotation in proportion to it
-    lever_misfit: float = 0.005  # of the lever that the gyro tells, as a share of ‖d₀‖
-    least_misfit: float = 0.002  # of the constraint, as a share of ‖ω×d‖
+    least_misfit: float = 0.0013  # of the constraint, as a share of ‖ω×d‖
     first_misfit: float = 0.03  # before it has been measured
     misfit_time_s: float = 4.0  # over which it is measured
     velocity_floor_m_s: float = 0.001  # play of the joint, bend of the link
@@ -88,24 +106,23 @@ class JointInertialParameters(NamedTuple):
 class Lever(NamedTuple):
     """What is known of J2S beforehand."""
 
-    j2s: Vec  # d₀ (m)
-    variance: float  # of d about d₀, each axis (m²)
-    share: float  # w: how much of d − d₀ is J2S's
-    rest: float  # variance of J2S that d cannot take away (m²)
+    j2s: Vec  # m
+    variance: float  # each axis (m²)
 
 
 class State(NamedTuple):
-    """What the filter remembers from one block to the next; changed in place."""
+    """What one filter remembers from one block to the next; changed in place."""
 
     time: Floats  # (4,) of the last step, NaN before the first; of no rate (s); of the last turn; its variance (rad²)
-    mean: Floats  # (15,) Z, v, b_g, b_a, d
-    covariance: Floats  # (15, 15)
-    last: Floats  # (4, 3) force and rate at the last step (m/s², rad/s), newest rate, angle turned since (rad)
+    mean: Floats  # (33,)
+    covariance: Floats  # (33, 33)
+    last: Floats  # (5, 3) force and rate at the last step, newest rate, angle turned since (rad), change of the force
+    since: Floats  # (9,) the last correction: s, angle (rad), ∫ force (m/s), variances (rad², m²/s²)
+    belief: Floats  # (2,) time since it last faded (s); half the χ² of the sensors' errors by it
     rest: Floats  # (7,) for how long it has been still (s), first force, sum over time of the rate
     misfit: Floats  # (2,) mean squares of the excess innovation and of ‖ω‖‖d‖ (m/s)²
-    work: Floats  # (6, 15) F P, within a step
-    cross: Floats  # (15, 3) P Hᵀ, within a step
-    gain: Floats  # (15, 3) within a step
+    work: Floats  # (12, 33) F P; errors of ω and f, within a step
+    cross: Floats  # (3, 33) H P, within a step
     counts: NDArray[np.int64]  # (2,) rejected samples, restarts
 
     @staticmethod
@@ -114,12 +131,13 @@ class State(NamedTuple):
             np.array([np.nan, 0.0, np.nan, 0.0]),
             np.zeros(_N),
             np.zeros((_N, _N)),
-            np.zeros((4, 3)),
+            np.zeros((5, 3)),
+            np.zeros(9),
+            np.zeros(2),
             np.zeros(7),
             np.zeros(2),
-            np.zeros((6, _N)),
-            np.zeros((_N, 3)),
-            np.zeros((_N, 3)),
+            np.zeros((12, _N)),
+            np.zeros((3, _N)),
             np.zeros(2, np.int64),
         )
 
@@ -139,11 +157,15 @@ class JointInertialFilter:
         """The rig must know J2S, be it as roughly as `j2s_std_m` says."""
         assert rig.joint.j2s_m is not None
         self.parameters = parameters or JointInertialParameters()
-        self.state = State.fresh()
+        self.states = tuple(State.fresh() for _ in _BELIEFS)
         self._imu = ImuCalibration.of(rig.imu)
-        j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.j2s_std_m
-        own, gyros = self._j2s_std**2, self.parameters.lever_misfit**2 * sum(c * c for c in j2s)
-        self._lever = Lever(j2s, own + gyros, own / (own + gyros), gyros * own / (own + gyros))
+        self._lever = Lever(rig.joint.j2s_m, rig.joint.j2s_std_m**2)
+
+    @property
+    def state(self) -> State:
+        """That of the filter that is believed more."""
+        first, second = self.states
+        return first if _odds(first.belief[1], second.belief[1]) >= 0.0 else second
 
     @property
     def rejected(self) -> int:
@@ -158,11 +180,9 @@ class JointInertialFilter:
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
         """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m². Before the first sample, the rig's."""
-        nominal, _, share, rest = self._lever
         if math.isnan(self.state.time[0]):
-            return np.array(nominal), self._j2s_std**2 * np.eye(3)
-        mean = np.array(nominal) + share * (self.state.mean[_D:] - nominal)
-        return mean, share**2 * self.state.covariance[_D:, _D:] + rest * np.eye(3)
+            return np.array(self._lever.j2s), self._lever.variance * np.eye(3)
+        return self.state.mean[_D:_MA].copy(), self.state.covariance[_D:_MA, _D:_MA].copy()
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
@@ -176,17 +196,69 @@ class JointInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
-        out = np.empty((len(block), 4))
-        _process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._lever, self.state, out,
-        )  # fmt: skip
+        n = len(block)
+        estimates = [np.empty((n, 6)) for _ in _BELIEFS]
+        for belief, state, estimate in zip(_BELIEFS, self.states, estimates, strict=True):
+            _process(
+                block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
+                self._imu, belief, self.parameters, self._lever, state, estimate,
+            )  # fmt: skip
+        out = np.empty((n, 4))
+        _mix(estimates[0], estimates[1], out)
         return out
+
+
+@compiled
+def _odds(first: float, second: float) -> float:
+    """Logarithm of the odds of the first belief, from how far off each says the sensors are."""
+    return _ODDS + second - first
+
+
+@compiled
+def _mix(first: Floats, second: Floats, out: Floats) -> None:
+    """The mean of two filters' estimates by how much each is believed, and its deviation: theirs, and how they differ."""
+    for i in range(len(out)):
+        odds = min(max(_odds(first[i, 5], second[i, 5]), -50.0), 50.0)
+        share = 1.0 / (1.0 + math.exp(-odds))
+        rest = 1.0 - share
+        apart = first[i, 0] - second[i, 0]
+        out[i, 0] = share * first[i, 0] + rest * second[i, 0]
+        out[i, 1] = math.sqrt(share * first[i, 1] ** 2 + rest * second[i, 1] ** 2 + share * rest * apart * apart)
+        x, y = share * first[i, 2] + rest * second[i, 2], share * first[i, 3] + rest * second[i, 3]
+        z = share * first[i, 4] + rest * second[i, 4]
+        out[i, 2], out[i, 3] = math.degrees(math.atan2(y, z)), math.degrees(math.atan2(-x, math.sqrt(y * y + z * z)))
 
 
 @compiled
 def _minus(a: Vec, b: Vec) -> Vec:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@inlined
+def _corrected(x: Floats, first: int, reading: Vec) -> Vec:
+    """The reading less its share by the matrix in the state from `first` on."""
+    m = (vec.at(x, first), vec.at(x, first + 3), vec.at(x, first + 6))
+    return (
+        reading[0] - vec.dot(m[0], reading),
+        reading[1] - vec.dot(m[1], reading),
+        reading[2] - vec.dot(m[2], reading),
+    )
+
+
+@inlined
+def _error(p: Floats, bias: int, matrix: int, reading: Vec, j: int) -> Vec:
+    """Column j's error of ω or f: that of the bias and of the matrix's share of a reading, both taken off."""
+    return (
+        -p[bias, j] - p[matrix, j] * reading[0] - p[matrix + 1, j] * reading[1] - p[matrix + 2, j] * reading[2],
+        -p[bias + 1, j] - p[matrix + 3, j] * reading[0] - p[matrix + 4, j] * reading[1] - p[matrix + 5, j] * reading[2],
+        -p[bias + 2, j] - p[matrix + 6, j] * reading[0] - p[matrix + 7, j] * reading[1] - p[matrix + 8, j] * reading[2],
+    )
+
+
+@inlined
+def _others(a: Vec, c: int) -> tuple[float, float]:
+    """The components of a vector that a cross product's component c takes."""
+    return (a[1], a[2]) if c == 0 else (a[2], a[0]) if c == 1 else (a[0], a[1])
 
 
 @compiled
@@ -196,188 +268,158 @@ def _along(variance: float) -> float:
 
 
 @compiled
+def _prior(belief: Sensors, i: int) -> float:
+    """Variance of state i, one of the sensors' errors, before anything was measured."""
+    if i < _BA:
+        return belief.gyro_bias_rad_s**2
+    if i < _D:
+        return belief.accel_bias_m_s2**2
+    if i < _MG:
+        return (belief.accel_scale if (i - _MA) % 4 == 0 else belief.accel_cross) ** 2
+    return (belief.gyro_scale if (i - _MG) % 4 == 0 else belief.gyro_cross) ** 2
+
+
+@compiled
+def _distance(x: Floats, belief: Sensors) -> float:
+    """Half the χ² of the errors that were found, by what is believed of the sensors; the gyro's bias may be any."""
+    square = 0.0
+    for i in range(_BA, _N):
+        if not _D <= i < _MA:
+            square += x[i] * x[i] / _prior(belief, i)
+    return 0.5 * square
+
+
+@compiled
 def _begin(
-    x: Floats,
-    p: Floats,
-    misfit: Floats,
+    state: State,
     force: Vec,
     rate: Vec,
     imu: ImuCalibration,
+    belief: Sensors,
     q: JointInertialParameters,
     lever: Lever,
 ) -> None:
     """Mean and covariance from one sample and the priors."""
-    x[:] = 0.0
-    p[:] = 0.0
-    for i in range(3):
-        p[_BG + i, _BG + i] = q.gyro_bias_std_rad_s**2
-        p[_BA + i, _BA + i] = q.accel_bias_std_m_s2**2
-        p[_D + i, _D + i] = lever.variance
-    vec.put(x, _D, lever.j2s)
-    _set_upright(x, p, force, rate, imu)
-    misfit[0], misfit[1] = 0.5 * q.first_misfit**2, 0.5
+    state.mean[:] = 0.0
+    state.covariance[:] = 0.0
+    for i in range(_BG, _N):
+        state.covariance[i, i] = lever.variance if _D <= i < _MA else _prior(belief, i)
+    vec.put(state.mean, _D, lever.j2s)
+    _set_upright(state, force, rate, imu)
+    state.misfit[0], state.misfit[1] = 0.5 * q.first_misfit**2, 0.5
 
 
 @compiled
-def _set_upright(x: Floats, p: Floats, force: Vec, rate: Vec, imu: ImuCalibration) -> None:
+def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration) -> None:
     """Tilt from the force, velocity from the constraint, as if nothing had been known of them."""
-    variance_a = p[_BA, _BA]
-    tilt, s = start(force, rate, imu)
+    x, p = state.mean, state.covariance
+    reading = force
+    force = _minus(_corrected(x, _MA, force), vec.at(x, _BA))
+    w, d = _corrected(x, _MG, _minus(rate, vec.at(x, _BG))), vec.at(x, _D)
+    tilt = vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0)
     vec.put(x, _Z, tilt)
-    bias, d = vec.at(x, _BG), vec.at(x, _D)
-    vec.put(x, _V, vec.cross(_minus(rate, bias), d))
+    vec.put(x, _V, vec.cross(w, d))
+    tangent = vec.cross_square(tilt, -1.0 / GRAVITY)
     for i in range(6):
-        for j in range(_N):
-            p[i, j] = p[j, i] = 0.0
-    tangent = vec.cross_square(tilt, 1.0)
-    s = vec.add(s, variance_a / GRAVITY**2, tangent)
-    s = vec.add(s, _along(0.5 * vec.trace(s)), vec.outer(tilt))
+        p[i, :] = 0.0
+        p[:, i] = 0.0
+    # An error of the accelerometer leans the tilt that is read off it: δZ = −(I − ZZᵀ) δf / g
+    for j in range(_BG, _N):
+        z = vec.apply(tangent, _error(p, _BA, _MA, reading, j))
+        z = (-z[0], -z[1], -z[2])
+        for i in range(3):
+            p[i, j] = p[j, i] = z[i]
+    for j in range(3):
+        z = vec.apply(tangent, _error(p, _BA, _MA, reading, j))
+        for i in range(3):
+            p[i, j] = -z[i]
+    # The acceleration that there may be: of a link that starts to turn, that swings, that whirls.
     reach = vec.dot(d, d) + p[_D, _D] + p[_D + 1, _D + 1] + p[_D + 2, _D + 2]
-    speed = (vec.dot(rate, rate) + p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2]) * reach
-    k = 0
+    speed = vec.dot(w, w) + p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2]
+    accel = reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
+    variance = min((imu.accel_variance + accel) / GRAVITY**2, 1.0)
+    s, k = vec.add(vec.cross_square(tilt, variance), _along(variance), vec.outer(tilt)), 0
     for i in range(3):
-        p[_V + i, _V + i] = speed + 1e-4
+        p[_V + i, _V + i] = speed * reach + 1e-4
         for j in range(i, 3):
-            p[i, j] = p[j, i] = s[k]
-            # A bias of the accelerometer leans the tilt that is read off it: δZ = −(I − ZZᵀ) δb_a / g
-            p[i, _BA + j] = p[_BA + j, i] = -tangent[k] * variance_a / GRAVITY
-            p[j, _BA + i] = p[_BA + i, j] = p[i, _BA + j]
+            p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i]) + s[k]
             k += 1
 
 
 @inlined
-def _spread(
-    z: Vec, v: Vec, b: Vec, a: Vec, rows: tuple[Vec, Vec, Vec], tilt: Vec, velocity: Vec, h: float
-) -> tuple[Vec, Vec]:
-    """Errors of tilt and velocity after a step, from small ones of tilt, velocity and the biases before it."""
-    z = (vec.dot(rows[0], z), vec.dot(rows[1], z), vec.dot(rows[2], z))
-    g, by_tilt, by_velocity = GRAVITY * h, vec.cross(tilt, b), vec.cross(velocity, b)
-    v = (
-        vec.dot(rows[0], v) - g * z[0] - h * (by_velocity[0] + a[0]),
-        vec.dot(rows[1], v) - g * z[1] - h * (by_velocity[1] + a[1]),
-        vec.dot(rows[2], v) - g * z[2] - h * (by_velocity[2] + a[2]),
-    )
-    return (z[0] - h * by_tilt[0], z[1] - h * by_tilt[1], z[2] - h * by_tilt[2]), v
+def _put_errors(p: Floats, bias: int, matrix: int, reading: Vec, out: Floats, k: int) -> None:
+    """`_error` of all columns into three rows of `out` from k on. One row after the other, for the vector unit."""
+    for c in range(3):
+        for j in range(_N):
+            by_matrix = p[matrix + 3 * c, j] * reading[0] + p[matrix + 3 * c + 1, j] * reading[1]
+            out[k + c, j] = -p[bias + c, j] - by_matrix - p[matrix + 3 * c + 2, j] * reading[2]
 
 
-@inlined
-def _predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, h: float) -> tuple[Vec, Vec]:
-    """Tilt and velocity after a step `h` that turns the frame by `turn` (rad), with the forces at its ends."""
-    tilt, velocity, bias = vec.at(x, _Z), vec.at(x, _V), vec.at(x, _BA)
-    half = 0.5 * h
-    velocity = (
-        velocity[0] + half * (before[0] - bias[0] - GRAVITY * tilt[0]),
-        velocity[1] + half * (before[1] - bias[1] - GRAVITY * tilt[1]),
-        velocity[2] + half * (before[2] - bias[2] - GRAVITY * tilt[2]),
-    )
-    tilt, velocity = vec.unit(vec.turn_back(turn, tilt)), vec.turn_back(turn, velocity)
-    velocity = (
-        velocity[0] + half * (force[0] - bias[0] - GRAVITY * tilt[0]),
-        velocity[1] + half * (force[1] - bias[1] - GRAVITY * tilt[1]),
-        velocity[2] + half * (force[2] - bias[2] - GRAVITY * tilt[2]),
-    )
-    return tilt, velocity
-
-
-@inlined
-def _predict_covariance(p: Floats, work: Floats, turn: Vec, tilt: Vec, velocity: Vec, h: float) -> None:
-    """F P Fᵀ; only the rows and columns of tilt and velocity change."""
-    back = (-turn[0], -turn[1], -turn[2])
-    rows = (
-        vec.turn_back(back, (1.0, 0.0, 0.0)),
-        vec.turn_back(back, (0.0, 1.0, 0.0)),
-        vec.turn_back(back, (0.0, 0.0, 1.0)),
-    )
-    for j in range(_N):
-        z, v = _spread(
-            (p[0, j], p[1, j], p[2, j]), (p[3, j], p[4, j], p[5, j]), (p[6, j], p[7, j], p[8, j]),
-            (p[9, j], p[10, j], p[11, j]), rows, tilt, velocity, h,
-        )  # fmt: skip
-        work[0, j], work[1, j], work[2, j] = z
-        work[3, j], work[4, j], work[5, j] = v
+@compiled
+def _predict_covariance(
+    p: Floats, work: Floats, turn: Vec, tilt: Vec, velocity: Vec, rate: Vec, force: Vec, h: float
+) -> None:
+    """F P Fᵀ over a step of mean rate and force; only the rows and columns of tilt and velocity change."""
+    rows, g = rotation_rows(turn), GRAVITY * h
+    _put_errors(p, _BG, _MG, rate, work, 6)
+    _put_errors(p, _BA, _MA, force, work, 9)
+    for c in range(3):
+        r, (a, b), (at, bt), (av, bv) = rows[c], _OTHERS[c], _others(tilt, c), _others(velocity, c)
+        for j in range(_N):
+            turned = r[0] * p[0, j] + r[1] * p[1, j] + r[2] * p[2, j]
+            work[c, j] = turned + h * (at * work[6 + b, j] - bt * work[6 + a, j])
+            work[3 + c, j] = -g * turned + h * (av * work[6 + b, j] - bv * work[6 + a, j] + work[9 + c, j])
+        for j in range(_N):
+            work[3 + c, j] += r[0] * p[3, j] + r[1] * p[4, j] + r[2] * p[5, j]
+    turned_ = work.T
     for i in range(6):
-        z, v = _spread(
+        z, v = spread(
             (work[i, 0], work[i, 1], work[i, 2]), (work[i, 3], work[i, 4], work[i, 5]),
-            (work[i, 6], work[i, 7], work[i, 8]), (work[i, 9], work[i, 10], work[i, 11]), rows, tilt, velocity, h,
+            _error(turned_, _BG, _MG, rate, i), _error(turned_, _BA, _MA, force, i), rows, tilt, velocity, h,
         )  # fmt: skip
         p[i, 0], p[i, 1], p[i, 2] = z
         p[i, 3], p[i, 4], p[i, 5] = v
         for j in range(6, _N):
-            p[i, j] = p[j, i] = work[i, j]
+            p[i, j] = work[i, j]
+        for j in range(6, _N):
+            p[j, i] = work[i, j]
 
 
 @compiled
-def _add_noise(
-    p: Floats,
-    tilt: Vec,
-    velocity: Vec,
-    rotation: float,
-    accel: float,
-    j2s: float,
-    h: float,
-    q: JointInertialParameters,
-) -> None:
-    """Noise of a step: variances of its rotation (rad²), of the velocity gained (m²/s²), of J2S (m²); random walks."""
-    # The same wrong rotation turns tilt and velocity: [Z×][Z×]ᵀ, [v×][v×]ᵀ, and [Z×][v×]ᵀ = (Z·v) I − v Zᵀ.
-    zz, vv, zv = vec.cross_square(tilt, rotation), vec.cross_square(velocity, rotation), vec.dot(tilt, velocity)
-    zz = vec.add(zz, _along(rotation), vec.outer(tilt))
-    k = 0
-    for i in range(3):
-        for j in range(i, 3):
-            p[_Z + i, _Z + j] += zz[k]
-            p[_V + i, _V + j] += vv[k]
-            p[_Z + j, _Z + i], p[_V + j, _V + i] = p[_Z + i, _Z + j], p[_V + i, _V + j]
-            k += 1
-        p[_V + i, _V + i] += accel
-        p[_BG + i, _BG + i] += q.gyro_bias_walk_rad_s**2 * h
-        p[_D + i, _D + i] += j2s
-        for j in range(3):
-            share = rotation * ((zv if i == j else 0.0) - velocity[i] * tilt[j])
-            p[_Z + i, _V + j] += share
-            p[_V + j, _Z + i] = p[_Z + i, _V + j]
+def _fade(x: Floats, p: Floats, passed_s: float, belief: Sensors, q: JointInertialParameters) -> None:
+    """First-order Gauss-Markov: what is believed of the sensors' errors, but for the gyro's bias, returns to nothing."""
+    kept = math.exp(-passed_s / q.fade_s)
+    for i in range(_BA, _N):
+        if not _D <= i < _MA:
+            x[i] *= kept
+            for j in range(_N):
+                p[i, j] *= kept
+            for j in range(_N):
+                p[j, i] *= kept
+            p[i, i] += (1.0 - kept * kept) * _prior(belief, i)
 
 
 @compiled
-def _forget_bias(x: Floats, p: Floats, h: float, q: JointInertialParameters) -> None:
-    """The accelerometer's bias after a step: first-order Gauss-Markov, so that what no motion tells stays bounded."""
-    kept = math.exp(-h / q.accel_bias_time_s)
-    for i in range(_BA, _D):
-        x[i] *= kept
-        for j in range(_N):
-            p[i, j] *= kept
-            p[j, i] *= kept
-        p[i, i] += (1.0 - kept * kept) * q.accel_bias_std_m_s2**2
-
-
-@inlined
 def _correct(
-    x: Floats,
-    p: Floats,
-    ph: Floats,
-    gain: Floats,
-    misfit: Floats,
-    jumped: bool,
-    before: Vec,
-    rate: Vec,
-    h: float,
-    imu: ImuCalibration,
-    q: JointInertialParameters,
+    state: State, jumped: bool, before: Vec, rate: Vec, h: float, imu: ImuCalibration, q: JointInertialParameters
 ) -> bool:
     """The constraint 0 = v − ω×d as a measurement. False where the gate refused it, for a reading that jumped.
 
-    d is corrected in the part that the rotation stands out of the gyro's noise: K's rows of d are scaled by it, and P
-    follows as P − KHP − PHᵀKᵀ + KSKᵀ.
+    d is corrected in the part that the rotation stands out of the gyro's
+    noise: K's rows of d are scaled by it, and P follows as P − KHP − PHᵀKᵀ + KSKᵀ.
     """
+    x, p, work, cross, misfit = state.mean, state.covariance, state.work, state.cross, state.misfit
     d, velocity = vec.at(x, _D), vec.at(x, _V)
-    w = _minus(rate, vec.at(x, _BG))
-    lever = vec.cross(w, d)
-    y = _minus(lever, velocity)
-    for i in range(_N):
-        by_bias = vec.cross(d, (p[i, 6], p[i, 7], p[i, 8]))
-        by_lever = vec.cross(w, (p[i, 12], p[i, 13], p[i, 14]))
-        for c in range(3):
-            ph[i, c] = p[i, 3 + c] - by_bias[c] - by_lever[c]
-    s = _innovation_covariance(ph, d, w)
+    reading = _minus(rate, vec.at(x, _BG))
+    w = _corrected(x, _MG, reading)
+    y = _minus(vec.cross(w, d), velocity)
+    _put_errors(p, _BG, _MG, reading, work, 6)
+    for c in range(3):
+        (a, b), (ad, bd), (aw, bw) = _OTHERS[c], _others(d, c), _others(w, c)
+        for j in range(_N):
+            by_lever = aw * p[_D + b, j] - bw * p[_D + a, j]
+            cross[c, j] = p[_V + c, j] + ad * work[6 + b, j] - bd * work[6 + a, j] - by_lever
+    s = _innovation_covariance(cross, d, w, reading)
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
     product = 0.5 * (p[6, 6] + p[7, 7] + p[8, 8]) * (p[12, 12] + p[13, 13] + p[14, 14])
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
@@ -385,7 +427,8 @@ def _correct(
     reach = vec.dot(moved, moved) * vec.dot(d, d)
     share = min(max(misfit[0] / misfit[1], q.least_misfit**2), 1.0)
     keep = min(h / q.misfit_time_s, 1.0)
-    inverse = vec.inverse(vec.plus_diagonal(s, share * reach))
+    whole = vec.plus_diagonal(s, share * reach)
+    inverse = vec.inverse(whole)
     distance = vec.quadratic(inverse, y)
     excess = (min(vec.dot(y, y), _GATE * (vec.trace(s) + 3.0 * share * reach)) - vec.trace(s)) / 3.0
     misfit[0] += keep * (excess - misfit[0])
@@ -395,21 +438,36 @@ def _correct(
             return False
         inverse = vec.scaled(_GATE / distance, inverse)  # it is the state that is doubted, but with care
     told = min(max(vec.dot(w, w) / (_CLEAR * 3.0 * imu.gyro_variance) - 1.0, 0.0), 1.0)
+    _take_constraint(x, p, cross, y, inverse, told)
+    return True
+
+
+@compiled
+def _take_constraint(x: Floats, p: Floats, cross: Floats, y: Vec, inverse: vec.Sym, told: float) -> None:
+    """The Kalman correction by an innovation y, with H P, the inverse of S, and the share of it that d takes."""
+    # With S⁻¹ = L Lᵀ and C = Lᵀ H P, K y = Cᵀ Lᵀ y and K S Kᵀ = Cᵀ C, which is symmetric to the last bit.
+    l00, l10, l20, l11, l21, l22 = vec.cholesky(inverse)
+    z = (l00 * y[0] + l10 * y[1] + l20 * y[2], l11 * y[1] + l21 * y[2], l22 * y[2])
+    for j in range(_N):
+        cross[0, j] = l00 * cross[0, j] + l10 * cross[1, j] + l20 * cross[2, j]
+        cross[1, j] = l11 * cross[1, j] + l21 * cross[2, j]
+        cross[2, j] = l22 * cross[2, j]
+    for j in range(_N):
+        share = told if _D <= j < _MA else 1.0
+        x[j] += share * (z[0] * cross[0, j] + z[1] * cross[1, j] + z[2] * cross[2, j])
+    kept = (1.0 - told) * (1.0 - told)
     for i in range(_N):
-        k = vec.apply(inverse, (ph[i, 0], ph[i, 1], ph[i, 2]))
-        gain[i, 0], gain[i, 1], gain[i, 2] = k
-        x[i] += vec.dot(k, y) if i < _D else told * vec.dot(k, y)
-    for i in range(_N):
-        for j in range(i, _N):
-            part = 1.0 if i < _D else told * (2.0 - told)
-            p[i, j] -= part * (gain[i, 0] * ph[j, 0] + gain[i, 1] * ph[j, 1] + gain[i, 2] * ph[j, 2])
-            p[j, i] = p[i, j]
+        c0, c1, c2 = cross[0, i], cross[1, i], cross[2, i]
+        for j in range(_N):
+            p[i, j] -= c0 * cross[0, j] + c1 * cross[1, j] + c2 * cross[2, j]
+    for i in range(_D, _MA):
+        for j in range(_D, _MA):
+            p[i, j] += kept * (cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j])
     tilt = vec.unit(vec.at(x, _Z))
     vec.put(x, _Z, tilt)
     block = (p[0, 0], p[0, 1], p[0, 2], p[1, 1], p[1, 2], p[2, 2])
     if vec.quadratic(block, tilt) > _NONE_RAD2 and vec.trace(block) < _SMALL_RAD2:
         _flatten(p, tilt)
-    return True
 
 
 @compiled
@@ -426,28 +484,29 @@ def _flatten(p: Floats, tilt: Vec) -> None:
 
 
 @inlined
-def _innovation_covariance(ph: Floats, d: Vec, w: Vec) -> vec.Sym:
-    """H P Hᵀ from P Hᵀ."""
-    c0 = _column(ph, 0, d, w)
-    c1 = _column(ph, 1, d, w)
-    c2 = _column(ph, 2, d, w)
+def _innovation_covariance(cross: Floats, d: Vec, w: Vec, reading: Vec) -> vec.Sym:
+    """H P Hᵀ from H P."""
+    turned = cross.T
+    c0 = _column(turned, 0, d, w, reading)
+    c1 = _column(turned, 1, d, w, reading)
+    c2 = _column(turned, 2, d, w, reading)
     return (c0[0], 0.5 * (c0[1] + c1[0]), 0.5 * (c0[2] + c2[0]), c1[1], 0.5 * (c1[2] + c2[1]), c2[2])
 
 
 @inlined
-def _column(ph: Floats, c: int, d: Vec, w: Vec) -> Vec:
-    by_bias = vec.cross(d, (ph[6, c], ph[7, c], ph[8, c]))
-    by_lever = vec.cross(w, (ph[12, c], ph[13, c], ph[14, c]))
+def _column(ph: Floats, c: int, d: Vec, w: Vec, reading: Vec) -> Vec:
+    by_rate = vec.cross(d, _error(ph, _BG, _MG, reading, c))
+    by_lever = vec.cross(w, (ph[_D, c], ph[_D + 1, c], ph[_D + 2, c]))
     return (
-        ph[3, c] - by_bias[0] - by_lever[0],
-        ph[4, c] - by_bias[1] - by_lever[1],
-        ph[5, c] - by_bias[2] - by_lever[2],
+        ph[3, c] + by_rate[0] - by_lever[0],
+        ph[4, c] + by_rate[1] - by_lever[1],
+        ph[5, c] + by_rate[2] - by_lever[2],
     )
 
 
 @inlined
-def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> bool:
-    """Follows how long neither force nor rate has left the noise; True when that is long enough to be a rest."""
+def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> None:
+    """Follows how long neither force nor rate has left the noise."""
     still = rest[0]
     change = _minus(force, vec.at(rest, 1))
     drift = (rate[0] * still - rest[4], rate[1] * still - rest[5], rate[2] * still - rest[6])
@@ -456,28 +515,27 @@ def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibrati
     steady = steady and vec.dot(drift, drift) < width * (imu.gyro_variance + _REST_STD_RAD_S**2) * still * still
     if still > 0.0 and not steady:
         rest[0] = 0.0
-        return False
+        return
     if still == 0.0:
         vec.put(rest, 1, force)
         vec.put(rest, 4, (0.0, 0.0, 0.0))
     rest[0] = still + h
     for j in range(3):
         rest[4 + j] += rate[j] * h
-    return bool(rest[0] > _REST_S)
 
 
 @compiled
 def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
-    """The gyro's bias is its mean since the rest began, where that says more than is known."""
+    """The gyro's bias is its mean since the rest began, where that says more than is known and can be."""
     variance = _REST_STD_RAD_S**2
-    if p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2] <= 6.0 * variance:
+    if rest[0] <= _REST_S or p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2] <= 6.0 * variance:
         return
-    for i in range(3):
-        x[_BG + i] = rest[4 + i] / rest[0]
-        for j in range(_N):
-            p[_BG + i, j] = p[j, _BG + i] = 0.0
-        p[_BG + i, _BG + i] = variance
-        x[_V + i] = 0.0
+    for c in range(_BG, _BA):
+        innovation = rest[4 + c - _BG] / rest[0] - x[c]
+        if innovation * innovation > _TURN_SIGMAS**2 * (p[c, c] + variance):
+            return  # no rest, but a turn at a constant rate
+    for c in range(_BG, _BA):
+        take(x, p, c, rest[4 + c - _BG] / rest[0] - x[c], variance)
 
 
 @inlined
@@ -491,22 +549,16 @@ def _runs_away(x: Floats) -> bool:
 
 
 @inlined
-def _describe(tilt: Vec, x: Floats, p: Floats, lever: Lever) -> tuple[float, float, float, float]:
-    """Height Zᵀ(d₀ + w(d − d₀)) and its standard deviation (m), roll and pitch (°)."""
-    w = lever.share
-    change = _minus(vec.at(x, _D), lever.j2s)
-    d = (lever.j2s[0] + w * change[0], lever.j2s[1] + w * change[1], lever.j2s[2] + w * change[2])
-    variance = lever.rest
+def _height(tilt: Vec, x: Floats, p: Floats, turned: Vec) -> tuple[float, float]:
+    """Height Zᵀd and its standard deviation (m), the frame having turned since the covariance was brought forward."""
+    d = vec.at(x, _D)
+    back = (-turned[0], -turned[1], -turned[2])
+    by_tilt, variance = vec.turn_back(back, d), 0.0
     for i in range(3):
         for j in range(3):
-            variance += d[i] * d[j] * p[_Z + i, _Z + j] + w * w * tilt[i] * tilt[j] * p[_D + i, _D + j]
-            variance += 2.0 * w * d[i] * tilt[j] * p[_Z + i, _D + j]
-    return (
-        vec.dot(tilt, d),
-        math.sqrt(max(variance, 0.0)),
-        math.degrees(math.atan2(tilt[1], tilt[2])),
-        math.degrees(math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))),
-    )
+            variance += by_tilt[i] * by_tilt[j] * p[_Z + i, _Z + j] + tilt[i] * tilt[j] * p[_D + i, _D + j]
+            variance += 2.0 * by_tilt[i] * tilt[j] * p[_Z + i, _D + j]
+    return vec.dot(tilt, d), math.sqrt(max(variance, 0.0))
 
 
 @inlined
@@ -515,27 +567,42 @@ def _same(a: Vec, b: Vec) -> bool:
 
 
 @inlined
-def _add_turn(angle: Vec, before: Vec, rate: Vec, step: float) -> Vec:
-    """The angle turned (rad), the gyro's bias in it, after one more step between two rates."""
-    half = 0.5 * step
-    return (
-        angle[0] + half * (before[0] + rate[0]),
-        angle[1] + half * (before[1] + rate[1]),
-        angle[2] + half * (before[2] + rate[2]),
-    )
+def _plus(a: Vec, scale: float, b: Vec) -> Vec:
+    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
 
 
 @inlined
-def _less(angle: Vec, h: float, bias: Vec) -> Vec:
-    return (angle[0] - h * bias[0], angle[1] - h * bias[1], angle[2] - h * bias[2])
+def _velocity_variance(bend: Vec, has_force: bool, h: float, imu: ImuCalibration) -> float:
+    """Variance (m²/s²) of the velocity gained over a step: noise, and what a trapezoid leaves of the force."""
+    bent = _BEND * math.sqrt(vec.dot(bend, bend)) if has_force else _GAP_ACCEL_M_S2
+    return (imu.accel_variance + min(bent, _GAP_ACCEL_M_S2) ** 2) * h * h
 
 
-@inlined
-def _velocity_variance(force: Vec, has_force: bool, h: float, imu: ImuCalibration, q: JointInertialParameters) -> float:
-    """Variance (m²/s²) of the velocity gained over a step: noise, misfit, what a trapezoid leaves of the force."""
-    bent = _SNAP_M_S4 / 12.0 * h * h if has_force else _GAP_ACCEL_M_S2
-    variance = imu.accel_variance + q.accel_misfit**2 * vec.dot(force, force) + min(bent, _GAP_ACCEL_M_S2) ** 2
-    return variance * h * h
+@compiled
+def _close(
+    state: State, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, belief: Sensors,
+    q: JointInertialParameters, lever: Lever,
+) -> bool:  # fmt: skip
+    """Brings the covariance up to the mean, and corrects both. False where the correction was refused."""
+    x, p, since, rest = state.mean, state.covariance, state.since, state.rest
+    h, turned = since[0], vec.at(since, 1)
+    tilt, velocity = vec.at(x, _Z), vec.at(x, _V)
+    mean_rate, mean_force = _plus((0.0, 0.0, 0.0), 1.0 / h, turned), _plus((0.0, 0.0, 0.0), 1.0 / h, vec.at(since, 4))
+    _predict_covariance(p, state.work, turned, tilt, velocity, mean_rate, mean_force, h)
+    add_noise(p, tilt, velocity, since[7], since[8])
+    for i in range(3):
+        p[_BG + i, _BG + i] += q.gyro_bias_walk_rad_s**2 * h
+        p[_D + i, _D + i] += q.j2s_walk**2 * lever.variance * h
+    state.belief[0] += h
+    if state.belief[0] > _FADING_PACE_S:
+        _fade(x, p, state.belief[0], belief, q)
+        state.belief[0] = 0.0
+    state.belief[1] = _distance(x, belief)
+    since[:] = 0.0
+    _take_bias_from_rest(x, p, rest)
+    if not has_rate:
+        return True
+    return _correct(state, jumped, before, rate, h, imu, q)
 
 
 @compiled
@@ -545,17 +612,18 @@ def _process(
     gyro: Floats,
     flags: NDArray[np.uint16],
     imu: ImuCalibration,
+    belief: Sensors,
     q: JointInertialParameters,
     lever: Lever,
     state: State,
     out: Floats,
 ) -> None:
-    x, p, work, ph, gain, misfit = state.mean, state.covariance, state.work, state.cross, state.gain, state.misfit
-    rest = state.rest
-    last, held, turned_at, spread = state.time[0], state.time[1], state.time[2], state.time[3]
+    x, p, since, rest, misfit = state.mean, state.covariance, state.since, state.rest, state.misfit
+    last, held, turned_at, doubt = state.time[0], state.time[1], state.time[2], state.time[3]
     before_a, before_w = vec.load(state.last[0]), vec.load(state.last[1])
-    newest_w, angle = vec.load(state.last[2]), vec.load(state.last[3])
+    newest_w, angle, change = vec.load(state.last[2]), vec.load(state.last[3]), vec.load(state.last[4])
     rejected, restarts = state.counts[0], state.counts[1]
+    zero = (0.0, 0.0, 0.0)
     for i in range(len(time_s)):
         has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
@@ -564,11 +632,12 @@ def _process(
         begins = math.isnan(last) or (good and max(h, held) > _LONGEST_BLIND_S)
         if begins and good and math.isfinite(time_s[i]):
             if math.isnan(last):
-                _begin(x, p, misfit, force, rate, imu, q, lever)
+                _begin(state, force, rate, imu, belief, q, lever)
             else:
-                _set_upright(x, p, force, rate, imu)
-            last, turned_at, held, spread = time_s[i], time_s[i], 0.0, 0.0
-            before_a, before_w, newest_w, angle = force, rate, rate, (0.0, 0.0, 0.0)
+                _set_upright(state, force, rate, imu)
+            since[:] = 0.0
+            last, turned_at, held, doubt = time_s[i], time_s[i], 0.0, 0.0
+            before_a, before_w, newest_w, angle, change = force, rate, rate, zero, zero
         elif h > 0.0:
             force = force if has_force else before_a
             rate = rate if has_rate else newest_w
@@ -578,52 +647,59 @@ def _process(
             jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
             if step > 0.0 and not (waits and (jumped or _same(rate, newest_w))):
                 held = 0.0 if has_rate else held + step
-                angle = _add_turn(angle, newest_w, newest_w if jumped else rate, step)
-                spread += rotation_variance(step, held, imu)
+                angle = _plus(_plus(angle, 0.5 * step, newest_w), 0.5 * step, newest_w if jumped else rate)
+                doubt += rotation_variance(step, held, imu)
                 if jumped:
-                    spread += 0.25 * step * step * vec.dot(jerk, jerk)
+                    doubt += 0.25 * step * step * vec.dot(jerk, jerk)
                 turned_at, newest_w = time_s[i], rate
             if not waits:
-                turn = _less(angle, h, vec.at(x, _BG))
-                tilt, velocity = _predict_mean(x, turn, before_a, force, h)
-                _predict_covariance(p, work, turn, tilt, velocity, h)
-                vec.put(x, _Z, tilt)
-                vec.put(x, _V, velocity)
-                noise = _velocity_variance(force, has_force, h, imu, q)
-                _forget_bias(x, p, h, q)
-                spread += q.gyro_misfit**2 * vec.dot(turn, turn)
-                _add_noise(p, tilt, velocity, spread, noise, q.j2s_walk**2 * lever.variance * h, h, q)
-                if good and _watch_rest(rest, force, rate, h, imu):
-                    _take_bias_from_rest(x, p, rest)
-                if has_rate:
-                    jump = _minus(force, before_a)
-                    jumped = jumped or vec.dot(jump, jump) > _JUMP_M_S2**2
-                    if not _correct(x, p, ph, gain, misfit, jumped, before_w, rate, h, imu, q):
+                jump = _minus(force, before_a)
+                jumped = jumped or vec.dot(jump, jump) > _JUMP_M_S2**2
+                if jumped and since[0] > 0.0:  # that this reading be judged alone
+                    _close(state, True, False, before_w, before_w, imu, belief, q, lever)
+                turn = _corrected(x, _MG, _plus(angle, -h, vec.at(x, _BG)))
+                begin = _minus(_corrected(x, _MA, before_a), vec.at(x, _BA))
+                end = _minus(_corrected(x, _MA, force), vec.at(x, _BA))
+                predict_mean(x, turn, begin, end, h)
+                since[0] += h
+                vec.put(since, 1, _plus(vec.at(since, 1), 1.0, turn))
+                vec.put(since, 4, _plus(_plus(vec.at(since, 4), 0.5 * h, before_a), 0.5 * h, force))
+                since[7] += doubt
+                since[8] += _velocity_variance(_minus(jump, change), has_force, h, imu)
+                if good:
+                    _watch_rest(rest, force, rate, h, imu)
+                change = jump
+                if jumped or since[0] > _PACE_S:
+                    if not _close(state, has_rate, jumped, before_w, rate, imu, belief, q, lever):
                         # A spike: what it did to this step is in doubt, and the next step goes without it.
                         good = False
-                        _add_noise(p, tilt, velocity, 0.0, 0.25 * h * h * vec.dot(jump, jump), 0.0, 0.0, q)
-                        rate, force = before_w, before_a
+                        add_noise(p, vec.at(x, _Z), vec.at(x, _V), 0.0, 0.25 * h * h * vec.dot(jump, jump))
+                        rate, force, change = before_w, before_a, zero
                 last, before_a, before_w, newest_w = time_s[i], force, rate, rate
-                angle, spread = (0.0, 0.0, 0.0), 0.0
+                angle, doubt = zero, 0.0
                 if _runs_away(x) or misfit[0] > _LOST * max(misfit[1], _LOST_M2_S2):
-                    _begin(x, p, misfit, force, rate, imu, q, lever)
+                    _begin(state, force, rate, imu, belief, q, lever)
+                    since[:] = 0.0
                     restarts += 1
         else:
             good = False
         rejected += not good
         if math.isnan(last):
-            out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
+            out[i, :] = np.nan
         else:
-            tilt = vec.at(x, _Z)
+            tilt, turned, bias = vec.at(x, _Z), vec.at(since, 1), vec.at(x, _BG)
+            ahead_turn = zero
             if time_s[i] > last:  # while the step waits
-                since = _add_turn(angle, newest_w, newest_w, time_s[i] - turned_at)
-                tilt = vec.turn_back(_less(since, time_s[i] - last, vec.at(x, _BG)), tilt)
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = _describe(tilt, x, p, lever)
-    state.time[0], state.time[1], state.time[2], state.time[3] = last, held, turned_at, spread
+                ahead_turn = _plus(_plus(angle, time_s[i] - turned_at, newest_w), last - time_s[i], bias)
+            ahead_turn = _plus(ahead_turn, imu.delay, _minus(newest_w, bias))
+            tilt = vec.turn_back(_corrected(x, _MG, ahead_turn), tilt)
+            out[i, 0], out[i, 1] = _height(tilt, x, p, _plus(turned, 1.0, ahead_turn))
+            out[i, 2], out[i, 3], out[i, 4] = tilt
+        out[i, 5] = state.belief[1]
+    state.time[0], state.time[1], state.time[2], state.time[3] = last, held, turned_at, doubt
     vec.put(state.last[0], 0, before_a)
     vec.put(state.last[1], 0, before_w)
     vec.put(state.last[2], 0, newest_w)
     vec.put(state.last[3], 0, angle)
+    vec.put(state.last[4], 0, change)
     state.counts[0], state.counts[1] = rejected, restarts
-
-
