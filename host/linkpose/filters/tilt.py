@@ -10,11 +10,11 @@ Frames: n is fixed, Z up; s is the sensor's. The state is the tilt Z = Zˢ, n's 
 with a⁺_k = s_A,k − g Z⁺_k. Two refinements over the paper's (5): the rate over a step is the mean of the rates at its
 ends, and the rotation is exact, where I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
 
-P is the covariance of the modelled noise, which is the least of the error: it holds neither the gyro's residual bias nor
-an acceleration that lasts. What it leaves out shows in the residual s_A/g − Z⁺. Averaged over some seconds in a frame
-that does not turn, the noise vanishes, and so do the accelerations, since velocities are bounded: what lasts is the
-error of the tilt. Along Z, where a tilt does not err, it is the accelerometer's own error, which the tilt takes over
-unseen. With the lasting residual r, and m for what a calibration leaves of the accelerometer's error (both in g),
+P is the covariance of the modelled noise, the least of the error: it holds neither the gyro's residual bias nor an
+acceleration that lasts. What it leaves out shows in the residual s_A/g − Z⁺. Averaged over some seconds in a frame that
+does not turn, the noise vanishes, and so do the accelerations, since velocities are bounded: what lasts is the error of
+the tilt. Along Z, where a tilt does not err, it is the accelerometer's own, which the tilt takes over unseen across Z.
+With the lasting residual r, and m for what a calibration leaves of the accelerometer's error (both in g),
 
     σ² = ½ (‖r‖² + (r·Z)²) + m²                          beyond P, on each axis across Z
     std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)²                  of the height Zᵀd
