@@ -144,12 +144,9 @@ def _weights(time_s: Floats) -> tuple[NDArray[np.int64], Floats, Floats, float]:
 
 
 def _attitudes(time_s: Floats, rate: Floats) -> Floats:
-    """C (N, 3, 3) from the sensor's axes to those at the first sample, by the rates (N, 3), rad/s.
-
-    Over a step the frame turns by the mean rate, and by what two rates about different axes add to it.
-    """
+    """C (N, 3, 3) from the sensor's axes to those at the first sample, by the mean rate (rad/s) over each step."""
     step = np.diff(time_s)[:, None]
-    turn = 0.5 * step * (rate[1:] + rate[:-1]) + step**2 / 12 * np.cross(rate[:-1], rate[1:])
+    turn = 0.5 * step * (rate[1:] + rate[:-1])
     half = 0.5 * np.linalg.norm(turn, axis=1, keepdims=True)
     steps = np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * turn], axis=1)
     q = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps])
