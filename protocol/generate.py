@@ -260,10 +260,14 @@ def python_module(schema: dict) -> str:
         name = camel(message["name"])
         tail = None
         if repeat := message.get("repeat"):
-            lines += python_class(
-                f"{name}Mouse", f"{repeat['doc'][0].upper()}{repeat['doc'][1:]}.", repeat["fields"], None
-            )
-            tail = f"    mice: tuple[{name}Mouse, ...] = ()"
+            if repeat.get("flat"):
+                group = ", ".join(field["name"] for field in repeat["fields"])
+                tail = f"    mice: tuple[int, ...] = ()  # {group} of each in turn: {repeat['doc']}"
+            else:
+                lines += python_class(
+                    f"{name}Mouse", f"{repeat['doc'][0].upper()}{repeat['doc'][1:]}.", repeat["fields"], None
+                )
+                tail = f"    mice: tuple[{name}Mouse, ...] = ()"
         lines += python_class(name, message["doc"], message["fields"], tail)
     names = [camel(m["name"]) for m in schema["message"]]
     lines += ["", "", f"Message = {' | '.join(names)}", "", "", "class Layout(NamedTuple):"]
@@ -274,7 +278,7 @@ def python_module(schema: dict) -> str:
         "    cls: type[Message]",
         "    fields: str",
         "    group: str",
-        "    group_cls: type[tuple[int, ...]] | None",
+        "    group_cls: type[tuple[int, ...]] | None  # None: the values of all groups stand in one tuple",
         "    group_max: int",
         "",
         "",
@@ -284,7 +288,7 @@ def python_module(schema: dict) -> str:
         code = "".join(STRUCT_CODE[f["type"]] for f in message["fields"])
         repeat = message.get("repeat")
         group = "".join(STRUCT_CODE[f["type"]] for f in repeat["fields"]) if repeat else ""
-        group_cls = f"{camel(message['name'])}Mouse" if repeat else "None"
+        group_cls = f"{camel(message['name'])}Mouse" if repeat and not repeat.get("flat") else "None"
         most = repeat["max"] if repeat else 0
         name = camel(message["name"])
         lines.append(f'    Layout({message["id"]:#04x}, {name}, "{code}", "{group}", {group_cls}, {most}),')

@@ -17,7 +17,6 @@ from pymavlink.dialects.v20 import common
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.capture import decode_capture
 from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import SampleMouse
 
 PIECE = 64
 FRAMES = 20_000
@@ -25,7 +24,7 @@ CAPTURE_FRAMES = 60_000
 
 
 def our_stream(count: int, mice: int) -> bytes:
-    moved = tuple(SampleMouse(3 * port, -port) for port in range(mice))
+    moved = tuple(value for port in range(mice) for value in (3 * port, -port))
     return b"".join(encode(sample._replace(mice=moved)) for sample in LinkRun(duration_s=count / 100).samples())
 
 

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from linkpose.calibration.imu import calibrate_imu, with_calibration
-from linkpose.calibration.joint import calibrate_joint
+from linkpose.calibration.joint import JointCalibration, calibrate_joint
 from linkpose.cli import calibrate_imu as imu_command
 from linkpose.cli import calibrate_joint as joint_command
 from linkpose.cli import simulate_link
@@ -21,6 +21,7 @@ from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Rig
 from linkpose.simulation.link import LinkRun
+from linkpose.wire.messages import SampleFlags
 
 BIAS = np.radians([3.0, -7.0, 12.0])
 OFFSET, SCALE = np.array([0.4, -0.3, 0.2]), np.array([1.02, 0.985, 0.97])
@@ -84,33 +85,104 @@ def test_no_rest_is_refused():
         calibrate_imu([recording(block)])
 
 
+def normalised(run: LinkRun, found: JointCalibration):
+    return (found.j2s_m - run.j2s_m) / found.std_m
+
+
 @pytest.mark.parametrize("test", [1, 2, 3])
 def test_joint_to_millimetres_from_a_minute(test):
     for seed in range(3):
         run = LinkRun(test, seed, 60.0)
         found = calibrate_joint([recording(run.measurements())], Rig())
-        error = np.abs(found.j2s_m - run.j2s_m)
-        assert error.max() <= 0.008
-        assert (error <= 3 * found.std_m).all()
-        assert found.residual_m_s2 < 0.1
+        assert np.abs(found.j2s_m - run.j2s_m).max() <= 0.003
+        assert np.abs(normalised(run, found)).max() <= 3
+        assert found.std_m.max() <= 0.003
+        assert found.residual_m_s2 < 0.03
+
+
+def test_joint_from_a_sensor_that_was_never_calibrated():
+    """Along the lever the scales are found; across it the axes' tilt within the chip cannot be, and is in the std."""
+    scores = []
+    for seed in range(4):
+        run = LinkRun(1, seed, 60.0, errors="datasheet")
+        found = calibrate_joint([recording(run.measurements())], Rig())
+        assert abs(found.j2s_m[2] - run.j2s_m[2]) <= 0.004
+        scores.append(normalised(run, found))
+    assert 0.3 <= np.sqrt(np.mean(np.square(scores))) <= 2.0
 
 
 def test_joint_of_a_short_link_from_two_recordings():
     runs = [LinkRun(2, seed, 30.0, j2s_m=(0.05, -0.2, 0.3)) for seed in (0, 1)]
     found = calibrate_joint([recording(run.measurements()) for run in runs], Rig())
-    assert found.j2s_m == pytest.approx([0.05, -0.2, 0.3], abs=0.004)
+    assert found.j2s_m == pytest.approx([0.05, -0.2, 0.3], abs=0.001)
 
 
-def test_rotation_about_one_axis_names_the_axis_it_does_not_tell():
+def test_joint_in_spite_of_lost_held_and_wild_samples():
+    run = LinkRun(2, 1, 60.0)
+    block, rng = run.measurements(), np.random.default_rng(3)
+    rate, force = block.gyro_rad_s.copy(), block.accel_m_s2.copy()
+    wild = rng.choice(len(block), 12, replace=False)
+    rate[wild[:6], 1] += 17.0
+    force[wild[6:], 0] -= 70.0
+    kept = np.flatnonzero(rng.random(len(block)) > 0.05)
+    found = calibrate_joint([recording(replace(block, gyro_rad_s=rate, accel_m_s2=force)[kept])], Rig())
+    assert np.abs(found.j2s_m - run.j2s_m).max() <= 0.003
+    held = np.arange(len(block)) // 4 * 4
+    held_block = replace(block, gyro_rad_s=block.gyro_rad_s[held], accel_m_s2=block.accel_m_s2[held])
+    found = calibrate_joint([recording(held_block)], Rig())
+    assert np.abs(found.j2s_m - run.j2s_m).max() <= 0.004
+
+
+def test_saturated_samples_are_left_out():
+    run = LinkRun(3, 0, 60.0)
+    block = run.measurements()
+    most = 3.0  # rad/s
+    flags = block.flags | np.where((np.abs(block.gyro_rad_s) > most).any(axis=1), SampleFlags.GYRO_SATURATED, 0)
+    clipped = replace(block, gyro_rad_s=np.clip(block.gyro_rad_s, -most, most), flags=flags.astype(np.uint16))
+    assert (clipped.gyro_rad_s != block.gyro_rad_s).any(axis=1).sum() >= 20
+    found = calibrate_joint([recording(clipped)], Rig())
+    assert np.abs(found.j2s_m - run.j2s_m).max() <= 0.003
+
+
+def test_play_in_the_joint_shows_in_the_std():
+    run = LinkRun(2, 1, 60.0)
+    block = run.measurements()
+    shake = 0.03 * 25.0 * np.sin(5.0 * block.time_s)  # 3 cm to and fro
+    found = calibrate_joint([recording(block)], Rig())
+    loose = calibrate_joint(
+        [recording(replace(block, accel_m_s2=block.accel_m_s2 + np.outer(shake, [1, 0, 0])))], Rig()
+    )
+    assert loose.residual_m_s2 > 5 * found.residual_m_s2
+    assert loose.std_m.max() > 3 * found.std_m.max()
+    assert np.abs(normalised(run, loose)).max() <= 3
+
+
+def test_a_sensor_on_no_joint_is_refused():
+    """A hand that carries it about while it turns."""
+    run = LinkRun(2, 0, 40.0, j2s_m=(0.0, 0.0, 0.02))
+    block = run.measurements()
+    t = block.time_s[:, None]
+    carried = 3.0 * np.sin(np.array([5.1, 6.3, 7.7]) * t + np.array([0.0, 1.0, 2.0]))
+    with pytest.raises(LinkposeError, match="no joint that stays in its place"):
+        calibrate_joint([recording(replace(block, accel_m_s2=block.accel_m_s2 + carried))], Rig())
+
+
+@pytest.mark.parametrize(("axis", "others"), [("x", "y and z"), ("y", "x and z"), ("z", "x and y")])
+def test_rotation_about_one_axis_names_the_axis_it_does_not_tell(axis, others):
     t = np.arange(4000) / 100
-    angle, rate = 0.5 * np.sin(3 * t), 1.5 * np.cos(3 * t)
-    tilt = np.column_stack([np.zeros(4000), np.sin(angle), np.cos(angle)])
-    omega = np.column_stack([rate, np.zeros(4000), np.zeros(4000)])
-    slope = np.column_stack([-4.5 * np.sin(3 * t), np.zeros(4000), np.zeros(4000)])
+    angle, rate, slope = 0.5 * np.sin(3 * t), 1.5 * np.cos(3 * t), -4.5 * np.sin(3 * t)
+    order = {"x": [0, 1, 2], "y": [2, 0, 1], "z": [1, 2, 0]}[axis]  # where the x, y, z of a turn about x go
+    zero = np.zeros(4000)
+    tilt = np.column_stack([zero, np.sin(angle), np.cos(angle)])[:, order]
+    omega, alpha = np.column_stack([rate, zero, zero])[:, order], np.column_stack([slope, zero, zero])[:, order]
     d = np.array([0.3, 0.2, 1.0])
-    force = STANDARD_GRAVITY * tilt + np.cross(slope, d) + np.cross(omega, np.cross(omega, d))
-    block = replace(LinkRun(1, 0, 40.0).measurements(), time_s=t, accel_m_s2=force, gyro_rad_s=omega)
-    with pytest.raises(LinkposeError, match="sensor's x axis"):
+    force = STANDARD_GRAVITY * tilt + np.cross(alpha, d) + np.cross(omega, np.cross(omega, d))
+    noise = np.random.default_rng(0).normal(size=(2, 4000, 3))
+    block = replace(
+        LinkRun(1, 0, 40.0).measurements(), time_s=t,
+        accel_m_s2=force + 0.04 * noise[0], gyro_rad_s=omega + 0.0009 * noise[1],
+    )  # fmt: skip
+    with pytest.raises(LinkposeError, match=f"sensor's {axis} axis.*turn the link about its {others} axes"):
         calibrate_joint([recording(block)], Rig())
 
 
@@ -130,7 +202,7 @@ def test_commands_complete_the_rig_file(tmp_path):
         assert result.exit_code == 0
         shown = json.loads(result.stdout.splitlines()[0])
     rig = Rig.load(rig_file)
-    assert rig.joint.j2s_m == pytest.approx((-0.09, -0.04, 1.65), abs=0.008)
+    assert rig.joint.j2s_m == pytest.approx((-0.09, -0.04, 1.65), abs=0.003)
     assert shown["j2s_m"] == pytest.approx(rig.joint.j2s_m, abs=1e-4)
     assert 0.0001 < rig.joint.j2s_std_m < 0.01
     assert (rig.mouse[0].x_m, rig.mouse[0].y_m) == (0.1, 0.2)

@@ -15,6 +15,8 @@ from linkpose.cli import COMMANDS
 from linkpose.device import ports
 from linkpose.device.ports import PortInfo
 from linkpose.recording.table import read_table
+from linkpose.sensors.rig import Joint, Rig
+from linkpose.simulation.link import LinkRun
 
 HOST = Path(__file__).parents[2] / "host"
 SIM = "sim://link?speed=0"  # as fast as it goes
@@ -215,6 +217,33 @@ def test_the_boards_settings_are_put_in_force_and_recorded(linkpose, refused, tm
     assert done.status == 0 and len(read_table(tmp_path / "e.csv")) == 50
     assert "refused CONFIGURE: sample rate out of range" in refused("record", "--port", SIM, "--rate", 77)
     assert "--live" in refused("estimate", out, "--rate", 50)
+
+
+def test_how_late_the_readings_are_follows_from_the_boards_setting(linkpose, monkeypatch, tmp_path):
+    """Register map, 4.3: 13.8 ms at DLPF_CFG 5. Live, over the recording and over the raw bytes it is the same."""
+    monkeypatch.setattr(LinkRun, "rig", property(lambda run: Rig(Joint(run.j2s_m))))  # as a real board: it names none
+    live, recording, raw = tmp_path / "live.csv", tmp_path / "rec.csv", tmp_path / "rec.bin"
+    typed = ["--live", "--port", SIM, "--duration", 5, "--dlpf", 5, "--filter", "tilt-inertial"]
+    assert linkpose("estimate", *typed, "-o", live, "--record", recording, "--raw", raw).status == 0
+    assert "delay_s" not in read_table(recording, "recording").metadata["rig"]["imu"]
+    rig = tmp_path / "rig.toml"
+    rig.write_text("[imu]\ndelay_s = 0.002\n")
+    late = {}
+    for name, source in (("csv", [recording]), ("raw", [raw]), ("named", [recording, "--rig", rig])):
+        out = tmp_path / f"{name}.csv"
+        assert linkpose("estimate", *source, "--filter", "tilt-inertial", "-o", out).status == 0
+        late[name] = read_table(out, "estimate").metadata["rig"]["imu"]["delay_s"]
+    assert read_table(live, "estimate").metadata["rig"]["imu"]["delay_s"] == 0.0138
+    assert late == {"csv": 0.0138, "raw": 0.0138, "named": 0.002}
+    assert rows(live) == rows(tmp_path / "csv.csv") != rows(tmp_path / "named.csv")
+
+
+def test_simulated_readings_are_not_late_whatever_the_rig_file(linkpose, tmp_path):
+    recording, truth, rig, out = (tmp_path / name for name in ("r.csv", "t.csv", "rig.toml", "e.csv"))
+    linkpose("simulate", "link", "--duration", 5, "-o", recording, "--truth", truth)
+    rig.write_text("[joint]\nj2s_m = [-0.09, -0.04, 1.65]\n")
+    assert linkpose("estimate", recording, "--rig", rig, "-o", out).status == 0
+    assert read_table(out, "estimate").metadata["rig"]["imu"]["delay_s"] == 0.0
 
 
 def test_info_json(linkpose):

@@ -122,6 +122,72 @@ def test_test_1_reaches_the_papers_figure():
     assert np.mean([height_rmse_cm("joint", 1, seed) for seed in range(5)]) <= 0.58
 
 
+# ---- the standard deviation is that of the error ----
+
+
+def height_nees(name: str, rig: Rig, block: Measurements, height_m: np.ndarray) -> float:
+    """Mean square of the height's error in standard deviations."""
+    estimate = filters.create(name, rig).process(block)
+    return float(np.nanmean(((estimate[:, 0] - height_m) / estimate[:, 1]) ** 2))
+
+
+@pytest.mark.parametrize("test", [1, 2, 3])
+@pytest.mark.parametrize("name", PAPER)
+def test_the_error_is_as_large_as_the_standard_deviation_says(name, test):
+    found = []
+    for seed in range(5):
+        run, block = recorded(test, seed)
+        found.append(height_nees(name, run.rig, block, run.truth().height_m))
+    assert 0.5 < np.mean(found) < 2
+
+
+@pytest.mark.parametrize(
+    ("otherwise", "start"),
+    [
+        pytest.param({"errors": "datasheet"}, 0, id="uncalibrated"),
+        pytest.param({"rate_hz": 50.0}, 0, id="50 Hz"),
+        pytest.param({"rate_hz": 500.0}, 0, id="500 Hz"),
+        pytest.param({"j2s_m": (0.0, -0.005, 0.05)}, 0, id="5 cm"),
+        pytest.param({"j2s_m": (0.1, 0.0, 2.0)}, 0, id="2 m"),
+        pytest.param({"j2s_m": (0.6, 0.3, 0.1)}, 0, id="level"),
+        pytest.param({}, 1500, id="start in motion"),
+    ],
+)
+def test_it_is_so_for_other_sensors_rates_links_and_starts(otherwise, start):
+    found = []
+    for test, seed in [(1, 0), (2, 1), (3, 2)]:
+        run = LinkRun(test, seed, 40.0, **otherwise)
+        block, height = run.measurements()[start:], run.truth().height_m[start:]
+        found.append([height_nees(name, run.rig, block, height) for name in PAPER])
+    mean = dict(zip(PAPER, np.mean(found, axis=0), strict=True))
+    assert all(0.3 < value < 3 for value in mean.values()), mean
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_standard_deviation_grows_in_motion_and_shrinks_at_rest(name):
+    """The last second, which is one of rest, is repeated for half a minute."""
+    run, block = recorded(1, 0)
+    rows = np.concatenate([np.arange(6500), 6400 + np.arange(3000) % 100])
+    longer = Measurements(*(np.ascontiguousarray(getattr(block, f)[rows]) for f in block.__slots__))
+    longer = replace(longer, time_s=np.arange(9500) / 100)
+    std = np.sqrt(np.convolve(filters.create(name, run.rig).process(longer)[:, 1] ** 2, np.ones(100) / 100, "valid"))
+    # The air's pressure goes on changing at rest.
+    share = {"joint": 0.8, "tilt": 0.3}.get(name, 0.97)
+    assert std[0] < share * std[400:6000].max()
+    assert std[-1] < share * std[400:6000].max()
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+def test_a_bias_of_the_gyro_is_in_the_standard_deviation(name):
+    """At rest with the rate 0.2 °/s off about y: the tilt leans towards x, and the residual is what it leans by."""
+    n = 6000
+    force = np.tile([0, 0, STANDARD_GRAVITY], (n, 1))
+    block = measurements(np.arange(n) / 100, force, np.tile([0, np.radians(0.2), 0], (n, 1)))
+    height, std = filters.create(name, Rig().with_j2s((1.0, 0.0, 0.0))).process(block)[-1, :2]
+    assert abs(height) > 0.01
+    assert std == pytest.approx(abs(height) / np.sqrt(2), rel=0.1)  # of both axes across Z alike
+
+
 # ---- tilt-inertial: the gyro's bias, accelerations that last, delayed readings ----
 
 

@@ -31,7 +31,7 @@ from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.capture import decode_capture
 from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Configure, Hello, HelloMouse, Sample, SampleMouse
+from linkpose.wire.messages import Configure, Hello, HelloMouse, Sample
 
 CLI = [sys.executable, "-m", "linkpose"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
@@ -73,10 +73,8 @@ raw_samples = st.lists(
         baro_ut=st.integers(0, 65535),
         baro_up=st.integers(0, 2**19 - 1),
         baro_count=st.integers(0, 3),
-        flags=st.integers(0, 0x0FFF),
-        mice=st.lists(st.builds(SampleMouse, st.integers(-32768, 32767), st.integers(-32768, 32767)), max_size=3).map(
-            tuple
-        ),
+        flags=st.integers(0, 0x1FFF),
+        mice=st.integers(0, 3).flatmap(lambda mice: st.tuples(*[st.integers(-32768, 32767)] * 2 * mice)),
     ),
     min_size=1,
     max_size=30,

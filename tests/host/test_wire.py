@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from linkpose.wire import messages
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
-from linkpose.wire.messages import Hello, Ping, Pong, Sample, SampleMouse
+from linkpose.wire.messages import Hello, Ping, Pong, Sample
 
 VECTORS = json.loads((Path(__file__).parents[2] / "protocol" / "vectors.json").read_text())
 BY_NAME = {layout.cls.__name__.upper(): layout.cls for layout in messages.LAYOUTS}
@@ -22,7 +22,9 @@ def golden_message(row):
     cls = BY_NAME[row["message"].replace("_", "")]
     layout = next(layout for layout in messages.LAYOUTS if layout.cls is cls)
     message = cls(**row["fields"])
-    return message._replace(mice=tuple(layout.group_cls(**m) for m in row["mice"])) if row["mice"] else message
+    if layout.group_cls:
+        return message._replace(mice=tuple(layout.group_cls(**mouse) for mouse in row["mice"]))
+    return message._replace(mice=tuple(n for mouse in row["mice"] for n in mouse.values())) if row["mice"] else message
 
 
 @pytest.mark.parametrize("row", VECTORS["frames"], ids=lambda row: row["name"])
@@ -59,6 +61,16 @@ def test_hello_of_an_older_protocol_is_recognised_whatever_its_length():
     assert decoder.feed(frame_of(body)) == [OtherProtocol(0, 7, 123)]
 
 
+@pytest.mark.parametrize("mice", range(5))
+def test_what_is_as_long_as_a_sample_and_is_none_is_counted_by_cause(mice):
+    body = bytes(29 + 4 * mice)
+    decoder = StreamDecoder()
+    assert decoder.feed(frame_of(b"\x7d" + body) + frame_of(b"\x04" + body) + frame_of(b"\x02" + body + b"\0")) == []
+    crossed = encode(sample(7, mice))[:-3] + b"\x11\x22\0"
+    assert decoder.feed(crossed) == []
+    assert decoder.corrupt.as_dict() == {"cobs": 0, "length": 2, "crc": 1, "type": 1}
+
+
 def frame_of(payload: bytes) -> bytes:
     from binascii import crc_hqx
 
@@ -70,7 +82,7 @@ def frame_of(payload: bytes) -> bytes:
 def sample(seq: int, mice: int = 3) -> Sample:
     return Sample(
         seq % 65536, seq * 10000 % 2**32, -seq % 1000, 0, 4096, 1, 0, -1, seq % 7, 27898, 23843, seq % 256, 0x1FF,
-        tuple(SampleMouse(seq % 100 - 50, -(seq % 30)) for _ in range(mice)),
+        (seq % 100 - 50, -(seq % 30)) * mice,
     )  # fmt: skip
 
 

@@ -53,10 +53,15 @@ def lost(samples: list[Sample]) -> int:
     return int(((np.diff([sample.seq for sample in samples]) - 1) & 0xFFFF).sum())
 
 
+def movements(samples: list[Sample]) -> NDArray[np.int64]:
+    """Counts of each mouse in each of the samples, (samples, mice, 2)."""
+    counts: NDArray[np.int64] = np.array([sample.mice for sample in samples], dtype=np.int64)
+    return counts.reshape(len(samples), -1, 2)
+
+
 def totals(samples: list[Sample]) -> NDArray[np.int64]:
     """Sums of the counts, (mice, 2)."""
-    counts: NDArray[np.int64] = np.array([sample.mice for sample in samples], dtype=np.int64)
-    return np.asarray(counts.sum(axis=0))
+    return np.asarray(movements(samples).sum(axis=0))
 
 
 def reported(link: WireLink) -> NDArray[np.int64]:

@@ -1,46 +1,91 @@
 """J2S from a recording of the link in motion, with no other reference.
 
-The tilt has length 1, so whatever it is, ‖s_A − ([ω̇×] + [ω×][ω×]) d‖ = g at every sample: three unknowns in as many
-equations as there are samples. Gauss-Newton from d = 0, on samples smoothed without a lag, with Huber's weights. That
-tells which axes the motion excites. The joint-inertial filter, which knows the sensors' errors, then refines it.
+The joint's constraint is asked of the readings themselves (`joint_constraint`), and J2S is found by least squares
+together with how the sensors err: biases, scales, alignment. A calibration leaves 0.2 % of scale, which would stretch
+J2S by as much; but gravity, whose length is known, turns in the sensor's axes by the angles that the gyro tells, and so
+shows the scales. By how much scale and alignment may err is asked of the recording as well: each group's variance is
+that of its members as they are found (empirical Bayes), within what the data sheet allows.
 
-Source: T. Seel, J. Raisch, T. Schauer, "IMU-based joint angle measurement for gait analysis", Sensors 14(4), 2014, who
-compare two sensors where here gravity's length is known.
+Gauss-Newton, with Huber's weights. Gravity's direction γ is each piece's own, and is eliminated: over some seconds
+neither the gyro's noise nor its wandering bias turns it by much. The first passes take short pieces, over which a gyro
+bias of 20 °/s leaves γ nearly in its place.
+
+What the residuals have in common from one to the next (a joint with play, a sensor that lags) makes them worth less
+than their number. That is measured on the gradients of blocks of a second, and the variance is widened by it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from linkpose.calibration.joint_constraint import (
+    ACCEL_BIAS,
+    ACCEL_MATRIX,
+    GYRO_BIAS,
+    GYRO_MATRIX,
+    J2S,
+    UNKNOWNS,
+    Equations,
+    Stretch,
+    equations,
+    pieces,
+    stretches,
+)
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
-from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.measurements import Floats
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Rig
+from linkpose.sensors.rig import Joint, Rig
 
-_HALF_WINDOW_S = 0.05  # of the parabola that smooths and differentiates
-_LONGEST_STEPS = 1.5  # a longer step than so many usual ones splits the recording
-_HUBER_M_S2 = 0.3
-_WORST_STD_M = 0.03  # of an axis that the motion does not tell
-_FEWEST_SAMPLES = 500
-_CORRELATED = 20.0  # neighbouring samples that say the same, by the smoothing and by what the model leaves out
-_REFINE_FROM_STD_M = 0.05
-_REFINE_PASSES = 2
+LARGE_RESIDUAL_M_S2 = 0.2  # what a joint that moves by centimetres leaves; one with a little play leaves 0.03
+_MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
+_WORST_STD_M, _WORST_SHARE = 0.03, 0.05  # of an axis that the motion does not tell: metres, share of ‖d‖
 _FARTHEST_M = 5.0
-_SCALE_DOUBT = 0.002  # of the sensors' scale, which stretches the lever and shows in no residual
+_SHORT_PIECES_S, _PIECE_S = (1.0, 1.0, 3.0, 3.0), 8.0
+_MOST_PASSES, _SETTLED_M = 20, 1e-5
+_HUBER_SIGMAS = 3.0
+_BLOCK_S = 1.0
+_GRAVITY_STD_M_S2 = 0.003  # of ‖γ‖ from piece to piece
+_LOCAL_GRAVITY = 0.0005  # share by which g differs from the standard's between 38° and 52° of latitude
+
+# Data sheet: zero-rate output ±20 °/s, zero-g output ±50 mg.
+_GYRO_BIAS_STD_RAD_S, _ACCEL_BIAS_STD_M_S2 = 0.35, 0.3
+# Scale and alignment: who errs alike, and the largest standard deviation (data sheet: ±3 %, ±2 %). What both sensors'
+# axes are turned by together shows nowhere: J2S is then in the axes halfway between the two sensors'.
+_DIAGONAL = np.arange(0, 9, 4)
+_OFF_DIAGONAL = np.setdiff1d(np.arange(9), _DIAGONAL)
+_GROUPS = (
+    (ACCEL_MATRIX + _DIAGONAL, 0.03),
+    (GYRO_MATRIX + _DIAGONAL, 0.03),
+    (np.concatenate([ACCEL_MATRIX + _OFF_DIAGONAL, GYRO_MATRIX + _OFF_DIAGONAL]), 0.02),
+)
+_ACCEL_SCALES = _GROUPS[0][0]
+_FREE_PASSES = 2  # before the residuals tell anything of themselves
+_FIRST_STD = 0.01
+_USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, worth so many members
 
 
 @dataclass(frozen=True, slots=True)
 class JointCalibration:
-    """What was found. The residual of a calibrated sensor on a good joint is 0.1 m/s² or less."""
+    """What was found. The residual of a good joint is 0.03 m/s² or less."""
 
     j2s_m: Floats  # (3,)
     std_m: Floats  # (3,)
-    residual_m_s2: float  # rms of ‖s_A − K d‖ − g
-    samples: int
+    residual_m_s2: float  # rms, by axis, of the smoothed specific force that is not explained
+    samples: int  # in motion
+
+
+class _Sums(NamedTuple):
+    """Normal equations at some unknowns, gravity's directions eliminated, in blocks."""
+
+    normals: Floats  # (B, UNKNOWNS, UNKNOWNS)
+    gradients: Floats  # (B, UNKNOWNS), downhill
+    residual: Floats  # (M, 3) m/s²
+    equations: float  # how many, less what the robust weights take
 
 
 def with_calibration(rig: Rig, found: JointCalibration) -> Rig:
@@ -51,111 +96,138 @@ def with_calibration(rig: Rig, found: JointCalibration) -> Rig:
 
 def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibration:
     """J2S from all recordings together. Raises LinkposeError, naming the axis, for a motion that does not tell it."""
-    force, k = (np.concatenate(part) for part in zip(*(_equations(r, rig.imu) for r in recordings), strict=True))
-    if len(force) < _FEWEST_SAMPLES:
-        raise LinkposeError(
-            f"only {len(force)} samples show motion; swing the link for half a minute or more, in all directions"
-        )
-    d, covariance, residual = _gauss_newton(force, k)
-    _refuse_weak_axes(covariance)
-    d, std = _refine([r.measurements for r in recordings], rig, d)
+    parts = [stretch for r in recordings for stretch in stretches(r.measurements, rig.imu)]
+    if not any(True for part in parts for _ in pieces(part, _PIECE_S)):
+        names = ", ".join(str(r.path) for r in recordings)
+        raise LinkposeError(f"{names} has no unbroken stretch of samples; record again")
+    unknowns, covariance, residual = _fit(parts)
+    samples = _samples_in_motion(parts, unknowns[GYRO_BIAS:ACCEL_BIAS])
+    d, covariance = unknowns[J2S:GYRO_BIAS], covariance[J2S:GYRO_BIAS, J2S:GYRO_BIAS]
+    covariance = covariance + _LOCAL_GRAVITY**2 * np.outer(d, d)
+    _refuse_weak_axes(d, covariance, residual)
     if not np.linalg.norm(d) < _FARTHEST_M:
         raise LinkposeError(f"the fit gives a J2S of {np.round(d, 2)} m: is the link on a joint that is fixed?")
-    return JointCalibration(d, std, residual, len(force))
+    return JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples)
 
 
-def _equations(recording: Recording, imu: Imu) -> tuple[Floats, Floats]:
-    """Smoothed forces (N, 3), m/s², and K = [ω̇×] + [ω×][ω×] (N, 3, 3), 1/s², of all unbroken stretches."""
-    block = recording.measurements
-    force = (block.accel_m_s2 - np.array(imu.accel_offset_m_s2)) / np.array(imu.accel_scale)
-    rate = block.gyro_rad_s - np.array(imu.gyro_bias_rad_s)
-    usable = np.isfinite(force).all(axis=1) & np.isfinite(rate).all(axis=1)
-    time_s, force, rate = block.time_s[usable], force[usable], rate[usable]
-    steps = np.diff(time_s)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    breaks = np.flatnonzero((steps > _LONGEST_STEPS * usual) | (steps <= 0)) + 1
-    parts = []
-    half = max(2, round(_HALF_WINDOW_S / usual)) if usual else 2
-    for rows in np.split(np.arange(len(time_s)), breaks):
-        if len(rows) > 4 * half:
-            parts.append((_smooth(force[rows], half), _smooth(rate[rows], half), _slope(rate[rows], half) / usual))
-    if not parts:
-        raise LinkposeError(f"{recording.path} has no unbroken stretch of samples; record again")
-    force, rate, derivative = (np.concatenate(part) for part in zip(*parts, strict=True))
-    moving = np.linalg.norm(rate, axis=1) > 0.2
-    w, wd = rate[moving], derivative[moving]
-    inward = w[:, :, None] * w[:, None, :] - (w**2).sum(axis=1)[:, None, None] * np.eye(3)
-    return force[moving], _cross_matrix(wd) + inward
-
-
-def _smooth(values: Floats, half: int) -> Floats:
-    """Value at the middle of the parabola fitted to 2·half + 1 neighbours: Savitzky and Golay."""
-    i = np.arange(-half, half + 1)
-    n, s2, s4 = len(i), (i**2).sum(), (i.astype(float) ** 4).sum()
-    weight = (s4 - s2 * i**2) / (n * s4 - s2**2)
-    return np.column_stack([np.convolve(axis, weight, "valid") for axis in values.T])
-
-
-def _slope(values: Floats, half: int) -> Floats:
-    """Slope, per sample, at the middle of the same parabola."""
-    i = np.arange(-half, half + 1)
-    weight = i[::-1] / (i**2).sum()
-    return np.column_stack([np.convolve(axis, weight, "valid") for axis in values.T])
-
-
-def _cross_matrix(v: Floats) -> Floats:
-    zero = np.zeros(len(v))
-    x, y, z = v.T
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-
-
-def _gauss_newton(force: Floats, k: Floats) -> tuple[Floats, Floats, float]:
-    """d, its covariance, and the rms residual."""
-    d = np.zeros(3)
-    for _ in range(50):
-        gravity = force - k @ d
-        length = np.linalg.norm(gravity, axis=1)
-        residual = length - STANDARD_GRAVITY
-        jacobian = -np.einsum("ni,nij->nj", gravity / length[:, None], k)
-        weight = np.minimum(1.0, _HUBER_M_S2 / np.maximum(np.abs(residual), 1e-12))
-        normal = jacobian.T @ (weight[:, None] * jacobian)
-        if np.linalg.cond(normal) > 1e12:
-            break  # told apart from a good fit by its covariance
-        change = -np.linalg.solve(normal, jacobian.T @ (weight * residual))
-        d = d + change
-        if np.abs(change).max() < 1e-9:
-            break
-    variance = float(np.average(residual**2, weights=weight)) * _CORRELATED
-    values, vectors = np.linalg.eigh(normal)
-    covariance = (vectors * (variance / np.maximum(values, 1e-12))) @ vectors.T
-    return d, np.asarray(covariance), float(np.sqrt(np.mean(residual**2)))
-
-
-def _refuse_weak_axes(covariance: Floats) -> None:
-    values, vectors = np.linalg.eigh(covariance)
-    if np.sqrt(values[-1]) > _WORST_STD_M:
-        axis = int(np.argmax(np.abs(vectors[:, -1])))
-        others = " and ".join(name for i, name in enumerate("xyz") if i != axis)
+def _samples_in_motion(parts: Iterable[Stretch], gyro_bias: Floats) -> int:
+    """How many; raises LinkposeError where they are too few."""
+    samples, seconds = 0, 0.0
+    for part in parts:
+        moving = np.linalg.norm(part.rate - gyro_bias, axis=1) > _MOVING_RAD_S
+        samples += int(moving.sum())
+        seconds += float(np.diff(part.time_s)[moving[1:]].sum())
+    if seconds < _LEAST_MOTION_S:
         raise LinkposeError(
-            f"the motion does not tell J2S along the sensor's {'xyz'[axis]} axis (to {np.sqrt(values[-1]):.2f} m "
-            f"only): turn the link about its {others} axes too, and faster"
+            f"only {seconds:.1f} s show motion; swing the link for half a minute or more, in all directions"
         )
+    return samples
 
 
-def _refine(blocks: Sequence[Measurements], rig: Rig, d: Floats) -> tuple[Floats, Floats]:
-    """J2S and standard deviations (3,) by the joint-inertial filter, each pass from what the last one found."""
-    from linkpose.filters.joint_inertial import JointInertialFilter, JointInertialParameters
+def _refuse_weak_axes(d: Floats, covariance: Floats, residual: float) -> None:
+    values, vectors = np.linalg.eigh(covariance)
+    std, length = float(np.sqrt(values[-1])), float(np.linalg.norm(d))
+    if std <= min(_WORST_STD_M, _WORST_SHARE * length):
+        return
+    if residual > LARGE_RESIDUAL_M_S2:
+        raise LinkposeError(
+            f"the readings fit no joint that stays in its place ({residual:.1f} m/s² rms are left over): fix the "
+            "joint, and the sensor firmly on the link"
+        )
+    axis = int(np.argmax(np.abs(vectors[:, -1])))
+    others = " and ".join(name for i, name in enumerate("xyz") if i != axis)
+    raise LinkposeError(
+        f"the motion does not tell J2S along the sensor's {'xyz'[axis]} axis (to {std:.3f} m only, of a J2S of "
+        f"{length:.2f} m): turn the link about its {others} axes too, and faster"
+    )
 
-    parameters = JointInertialParameters(lever_misfit=0.0)
-    for _ in range(_REFINE_PASSES):
-        total, weighted = np.zeros((3, 3)), np.zeros(3)
-        for block in blocks:
-            start = Joint((float(d[0]), float(d[1]), float(d[2])), _REFINE_FROM_STD_M)
-            f = JointInertialFilter(Rig(joint=start, imu=rig.imu), parameters)
-            f.process(block)
-            mean, covariance = f.j2s_m
-            information = np.linalg.inv(covariance)
-            total, weighted = total + information, weighted + information @ mean
-        d = np.asarray(np.linalg.solve(total, weighted), dtype=np.float64)
-    variance = np.diag(np.linalg.inv(total)) + _SCALE_DOUBT**2 * (d @ d)
-    return d, np.sqrt(variance)
+
+def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
+    """The unknowns (UNKNOWNS,), their covariance, and the residual's rms (m/s²)."""
+    unknowns, spread, worth, scale = np.zeros(UNKNOWNS), np.full(len(_GROUPS), _FIRST_STD**2), 1.0, 1.0
+    for number, longest_s in enumerate((*_SHORT_PIECES_S, *[_PIECE_S] * _MOST_PASSES)):
+        sums = _normal_equations([equations(p, unknowns) for part in parts for p in pieces(part, longest_s)], scale)
+        normal, prior = sums.normals.sum(axis=0), _prior(spread)
+        first = number < _FREE_PASSES
+        worth = 1.0 if first else _correlation(sums, normal + worth * np.diag(prior))
+        # The readings' density: a fit that shrinks them would shrink its residuals, and be none the better for it.
+        volume = np.zeros(UNKNOWNS)
+        volume[_ACCEL_SCALES] = sums.equations / (1 - unknowns[_ACCEL_SCALES])
+        curvature = volume**2 / max(sums.equations, 1.0)
+        covariance: Floats = np.linalg.inv((normal + np.diag(curvature)) / worth + np.diag(prior))
+        change = covariance @ ((sums.gradients.sum(axis=0) - volume) / worth - prior * unknowns)
+        unknowns = unknowns + change
+        scale = max(1.4826 * float(np.median(np.abs(sums.residual))), 1e-4)
+        spread = spread if first else _spreads(unknowns, covariance, spread)
+        if number > len(_SHORT_PIECES_S) and np.abs(change[J2S:GYRO_BIAS]).max() < _SETTLED_M:
+            break
+    return unknowns, covariance, float(np.sqrt(np.mean(sums.residual**2)))
+
+
+def _normal_equations(parts: Sequence[Equations], scale: float) -> _Sums:
+    """Sums over the pieces, `scale` (m/s²) being the usual residual.
+
+    To let γ be what fits a piece best is to take its means off, and leaves one equation on the length of the mean.
+    """
+    block_normals, gradients, residuals, number = [], [], [], 0.0
+    for gravity, jacobian, apart_s in parts:
+        mean, residual, weight = _mean_gravity(gravity, scale)
+        residuals.append(residual)
+        number += float(weight.sum())
+        weight = weight / scale**2
+        mean_jacobian = np.tensordot(weight / weight.sum(), jacobian, 1)
+        centred = jacobian - mean_jacobian
+        blocks = max(1, round(len(gravity) * apart_s / _BLOCK_S))
+        for rows in np.array_split(np.arange(len(gravity)), blocks):
+            j, w = centred[rows], weight[rows]
+            block_normals.append(np.einsum("n,nip,niq->pq", w, j, j))
+            gradients.append(-np.einsum("n,nip,ni->p", w, j, residual[rows]))
+        length = max(float(np.linalg.norm(mean)), 1e-9)
+        row, known = mean / length @ mean_jacobian, 1 / (_GRAVITY_STD_M_S2**2 + 1 / weight.sum())
+        block_normals.append(known * np.outer(row, row))
+        gradients.append(known * (STANDARD_GRAVITY - length) * row)
+    return _Sums(np.array(block_normals), np.array(gradients), np.concatenate(residuals), number)
+
+
+def _mean_gravity(gravity: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
+    """Of a piece: the robust mean (3,) of γ (M, 3), the residuals (M, 3), and their weights (M,), up to 1."""
+    mean = np.median(gravity, axis=0)
+    for _ in range(5):
+        residual = gravity - mean
+        away = np.linalg.norm(residual, axis=1)
+        weight = np.minimum(1.0, _HUBER_SIGMAS * scale / np.maximum(away, 1e-12))
+        mean = weight @ gravity / weight.sum()
+    return mean, gravity - mean, weight
+
+
+def _prior(spread: Floats) -> Floats:
+    """(UNKNOWNS,) Inverse variances about zero."""
+    prior = np.full(UNKNOWNS, 1 / _FARTHEST_M**2)
+    prior[GYRO_BIAS:ACCEL_BIAS] = 1 / _GYRO_BIAS_STD_RAD_S**2
+    prior[ACCEL_BIAS:ACCEL_MATRIX] = 1 / _ACCEL_BIAS_STD_M_S2**2
+    for (members, _), variance in zip(_GROUPS, spread, strict=True):
+        prior[members] = 1 / variance
+    return prior
+
+
+def _spreads(unknowns: Floats, covariance: Floats, spread: Floats) -> Floats:
+    """Variance of each group's members, as they are found; those that are not told do not count (MacKay's update)."""
+    found = []
+    for (members, largest), variance in zip(_GROUPS, spread, strict=True):
+        told = len(members) - float(np.diag(covariance)[members].sum()) / variance
+        squares = float((unknowns[members] ** 2).sum())
+        found.append(min((_USUAL_WEIGHT * _USUAL_STD**2 + squares) / (_USUAL_WEIGHT + told), largest**2))
+    return np.array(found)
+
+
+def _correlation(sums: _Sums, information: Floats) -> float:
+    """By how much the gradients of blocks vary more than those of independent residuals would; 1 or more.
+
+    Σ sᵀ N⁻¹ s over the blocks' gradients s, over what it is expected to be: a block's own normal matrix, less its part
+    in what was fitted.
+    """
+    inverse = np.linalg.inv(information)
+    measured = np.einsum("bp,pq,bq->", sums.gradients, inverse, sums.gradients)
+    told = inverse @ sums.normals
+    expected = np.einsum("bpp->", told) - np.einsum("bpq,bqp->", told, told)
+    return max(1.0, float(measured / expected))

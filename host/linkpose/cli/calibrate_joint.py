@@ -9,8 +9,6 @@ import click
 
 from linkpose.cli import options
 
-_LARGE_RESIDUAL_M_S2 = 0.3
-
 
 @click.command("joint")
 @click.argument("recordings", type=options.FILE, nargs=-1, required=True)
@@ -20,9 +18,9 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> N
     """Find J2S, the vector from the joint's centre to the sensor in its axes, and write it into the rig file.
 
     Record the link on its fixed joint, swung for half a minute or more in all directions. The rig file's calibration of
-    the inertial sensor is applied; make it first with `linkpose calibrate imu`.
+    the inertial sensor is applied, and what is left of its errors is estimated with J2S.
     """
-    from linkpose.calibration.joint import calibrate_joint, with_calibration
+    from linkpose.calibration.joint import LARGE_RESIDUAL_M_S2, calibrate_joint, with_calibration
     from linkpose.recording.reader import load_recording
 
     loaded = [load_recording(path) for path in recordings]
@@ -36,6 +34,6 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> N
     else:
         click.echo(f"J2S {x:.4f} ± {sx:.4f}, {y:.4f} ± {sy:.4f}, {z:.4f} ± {sz:.4f} m")
         click.echo(f"residual {found.residual_m_s2:.3f} m/s² over {found.samples} samples in motion")
-    if found.residual_m_s2 > _LARGE_RESIDUAL_M_S2:
-        click.echo("a large residual: type `linkpose calibrate imu` first, and see that the joint is fixed", err=True)
+    if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
+        click.echo("a large residual: see that the joint is fixed, and the sensor firmly on the link", err=True)
     click.echo(f"written to {rig_file}", err=True)

@@ -104,7 +104,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig)
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with _patience(console):
         measurements = recording.measurements
         estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
@@ -157,12 +157,13 @@ def _live(
         with _patience(console):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            mice = Settings.of(session.hello).mouse_ports
-            estimator = Estimator(request.filter_names, rig, Sensors(session.hello.sensors), mice)
+            settings, sensors = Settings.of(session.hello), Sensors(session.hello.sensors)
+            used = rig.with_delay_of(settings.dlpf)
+            estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
             _check(estimator, request, console)
             estimator.warm_up()
         recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
-        head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": rig.as_dict()}
+        head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": used.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress))
 

@@ -109,8 +109,13 @@ def verbosity(function: Function) -> Function:
 
 
 def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:
-    """The rig file where one is named, or else the one that came along; `--j2s` goes before either's."""
+    """The rig file where one is named, or else the one that came along; `--j2s` goes before either's.
+
+    How late the readings are is theirs rather than the rig's: what came along tells it where the rig file does not.
+    """
     rig = Rig.load(rig_file) if rig_file else brought or Rig()
+    if brought is not None and rig.imu.delay_s is None:
+        rig = replace(rig, imu=replace(rig.imu, delay_s=brought.imu.delay_s))
     return replace(rig, joint=joint) if joint else rig
 
 

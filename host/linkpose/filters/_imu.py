@@ -45,7 +45,7 @@ class ImuCalibration(NamedTuple):
             (1 / x, 1 / y, 1 / z),
             imu.gyro_noise_rad_s**2,
             imu.accel_noise_m_s2**2,
-            imu.delay_s,
+            imu.known_delay_s,
         )
 
 

@@ -5,6 +5,10 @@
 over the mean pressure p₀ of the first second, when the link is expected to be at rest. With J2S the height is over the
 joint's centre like that of the other filters: the tilt of that first second, from the mean accelerometer, says how high
 the sensor stood. Without J2S the height is relative to the start.
+
+The sensor's noise is not all of the error. The air's pressure changes with doors, wind and weather, a sensor that moves
+through the air feels a part of ½ρv², and a link that was not at rest in the first second started from a height that is
+as uncertain as the accelerometer was unsteady. All of it is in the standard deviation.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import Floats, ImuCalibration, read_accel
+from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, read_accel, read_gyro
 from linkpose.filters._vector import Vec, compiled, inlined
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -24,6 +28,11 @@ from linkpose.sensors.rig import Rig
 HEIGHT_SCALE_M = 44330.77
 HEIGHT_EXPONENT = 0.190263
 START_S = 1.0  # over which the start's pressure and tilt are averaged
+# What a pressure says besides height and noise: standard deviations.
+_SLOW_PA, _SLOW_S = 3.5, 12.0  # draughts, and what the sensor's compensation leaves of the temperature; how soon
+_WEATHER_PA_S = 0.01  # 1 hPa in three hours
+_SUCTION = 0.3  # of the dynamic pressure ½ρv²
+_AIR_KG_M3 = 1.2
 
 
 class StartState(NamedTuple):
@@ -31,13 +40,16 @@ class StartState(NamedTuple):
 
     time: Floats  # (1,) of the first sample (s), NaN before it
     force: Floats  # (3,) sum of the usable forces (m/s²)
+    unsteady: Floats  # (2,) sum of their squares (m²/s⁴), and how many
     pressure: Floats  # (2,) sum of the usable pressures (Pa), and how many
     height: Floats  # (1,) last height (m), NaN before the first pressure
+    air: Floats  # (1,) variance of the last pressure that height and noise do not explain (Pa²)
     rejected: NDArray[np.int64]  # (1,) fresh pressures that could not be used
 
     @staticmethod
     def fresh() -> StartState:
-        return StartState(np.full(1, np.nan), np.zeros(3), np.zeros(2), np.full(1, np.nan), np.zeros(1, np.int64))
+        unknown, zero = np.full(1, np.nan), np.zeros(1)
+        return StartState(unknown, np.zeros(3), np.zeros(2), np.zeros(2), unknown.copy(), zero, np.zeros(1, np.int64))
 
 
 class BaroFilter:
@@ -60,11 +72,11 @@ class BaroFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m) at each of the N samples: (N, 2), NaN before the first pressure.
 
-        The standard deviation is that of the sensor's noise; the weather's drift is not in it.
+        The standard deviation is that of the sensor's noise, of the air and of a start in motion.
         """
         out = np.empty((len(block), 2))
         _process(
-            block.time_s, block.accel_m_s2, block.flags, block.pressure_Pa, block.baro_fresh,
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, block.pressure_Pa, block.baro_fresh,
             self._imu, self._j2s, self._noise_Pa, self.state, out,
         )  # fmt: skip
         return out
@@ -85,6 +97,8 @@ def listen(
         if has_force:
             for j in range(3):
                 state.force[j] += force[j]
+            state.unsteady[0] += vec.dot(force, force)
+            state.unsteady[1] += 1.0
     elif state.pressure[1] > 0.0:
         return good
     if good:
@@ -99,6 +113,32 @@ def start_height(state: StartState, j2s: Vec) -> float:
     force = vec.load(state.force)
     length = math.sqrt(vec.dot(force, force))
     return float(vec.dot(force, j2s) / length) if length > 0.0 else 0.0
+
+
+@inlined
+def start_variance(state: StartState, j2s: Vec) -> float:
+    """Variance (m²) of `start_height`: what a force varied by was not gravity, and half of it may not average out."""
+    number = state.unsteady[1]
+    if number == 0.0:
+        return 0.0
+    force = vec.load(state.force)
+    varied = state.unsteady[0] / number - vec.dot(force, force) / (number * number)
+    across = vec.dot(j2s, j2s) - start_height(state, j2s) ** 2
+    return float(0.25 * max(varied, 0.0) / GRAVITY**2 * max(across, 0.0))
+
+
+@inlined
+def air_variance(time_s: float, raw_gyro: Vec, flags: int, imu: ImuCalibration, j2s: Vec, state: StartState) -> float:
+    """Variance (Pa²) of what else than height a fresh pressure may differ from the start's by."""
+    since_s = time_s - state.time[0]
+    if not since_s > 0.0:
+        return 0.0
+    has_rate, rate = read_gyro(raw_gyro, flags, imu)
+    velocity = vec.cross(rate, j2s)
+    suction = _SUCTION * 0.5 * _AIR_KG_M3 * vec.dot(velocity, velocity) if has_rate else 0.0
+    weather = _WEATHER_PA_S * since_s
+    slow = _SLOW_PA**2 * (1.0 - math.exp(-since_s / _SLOW_S))
+    return float(slow + weather * weather + suction * suction)
 
 
 @inlined
@@ -118,6 +158,7 @@ def metres_per_pascal(state: StartState) -> float:
 def _process(
     time_s: Floats,
     accel: Floats,
+    gyro: Floats,
     flags: NDArray[np.uint16],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
@@ -131,8 +172,11 @@ def _process(
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
         if listen(time_s[i], a, flags[i], pressure_Pa[i], fresh[i], imu, state):
             state.height[0] = start_height(state, j2s) + barometric_height(pressure_Pa[i], state)
+            w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
+            state.air[0] = air_variance(time_s[i], w, flags[i], imu, j2s, state)
         out[i, 0] = state.height[0]
         if math.isnan(state.height[0]):
             out[i, 1] = np.nan
         else:
-            out[i, 1] = noise_Pa * metres_per_pascal(state) * math.sqrt(1.0 + 1.0 / state.pressure[1])
+            pressure = noise_Pa * noise_Pa * (1.0 + 1.0 / state.pressure[1]) + state.air[0]
+            out[i, 1] = math.sqrt(metres_per_pascal(state) ** 2 * pressure + start_variance(state, j2s))

@@ -7,6 +7,10 @@ height, the vertical velocity and the bias of the vertical acceleration,
 
 propagates it at the sampling rate and corrects it with each fresh pressure only, by the barometric formula of `baro`.
 Height over the joint's centre with J2S, relative to the start without.
+
+The covariance is that of the modelled noise. A wrong tilt makes an acceleration that lasts, and that shows in the
+innovation: its mean over half a second is the error of the height against the barometer's. Its square is added to the
+variance, and so is what the barometer itself is wrong by: the air and a start in motion, as in `baro`.
 """
 
 from __future__ import annotations
@@ -20,10 +24,21 @@ from numpy.typing import NDArray
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec, compiled, inlined
-from linkpose.filters.baro import START_S, StartState, barometric_height, listen, metres_per_pascal, start_height
+from linkpose.filters.baro import (
+    START_S,
+    StartState,
+    air_variance,
+    barometric_height,
+    listen,
+    metres_per_pascal,
+    start_height,
+    start_variance,
+)
 from linkpose.filters.tilt import TiltParameters, TiltState, advance, correct_by_accel, describe, keep, recall
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
+
+_LASTING_S = 0.5  # over which the innovation is averaged
 
 
 class VerticalParameters(NamedTuple):
@@ -40,11 +55,12 @@ class VerticalState(NamedTuple):
 
     mean: Floats  # (3,) h (m), v (m/s), b (m/s²)
     covariance: Floats  # (6,) hh hv hb vv vb bb
+    lasting: Floats  # (3,) mean innovation (m), over how long it has been taken (s), time of the last (s)
     started: NDArray[np.bool_]  # (1,) whether the start has passed
 
     @staticmethod
     def fresh() -> VerticalState:
-        return VerticalState(np.zeros(3), np.zeros(6), np.zeros(1, np.bool_))
+        return VerticalState(np.zeros(3), np.zeros(6), np.zeros(3), np.zeros(1, np.bool_))
 
 
 class ImuBaroFilter:
@@ -73,7 +89,7 @@ class ImuBaroFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
-        The height is NaN before the first pressure. The weather's drift is not in the standard deviation.
+        The height is NaN before the first pressure.
         """
         out = np.empty((len(block), 4))
         _process(
@@ -130,6 +146,23 @@ def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym
     return mean, p
 
 
+@inlined
+def hear(innovation: float, time_s: float, vertical: VerticalState) -> None:
+    """Takes the innovation (m) of a fresh pressure into the lasting one."""
+    step_s = time_s - vertical.lasting[2]
+    if step_s > 0.0:
+        span_s = min(vertical.lasting[1] + step_s, _LASTING_S)
+        vertical.lasting[0] += min(step_s / span_s, 1.0) * (innovation - vertical.lasting[0])
+        vertical.lasting[1], vertical.lasting[2] = span_s, time_s
+
+
+@inlined
+def height_std(covariance: Sym, start: StartState, vertical: VerticalState, j2s: Vec) -> float:
+    """Standard deviation of the height (m): of the model, of what innovations show beyond it, of air and start."""
+    air = metres_per_pascal(start) ** 2 * start.air[0]
+    return math.sqrt(covariance[0] + vertical.lasting[0] ** 2 + air + start_variance(start, j2s))
+
+
 @compiled
 def _process(
     time_s: Floats,
@@ -166,6 +199,7 @@ def _process(
             variance = (noise_Pa * metres_per_pascal(start)) ** 2
             mean = (start_height(start, j2s), 0.0, 0.0)
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
+            vertical.lasting[2] = time_s[i]
             vertical.started[0] = time_s[i] - start.time[0] > START_S
         elif known:
             if now.time > before:
@@ -174,11 +208,13 @@ def _process(
                 seen = has_force and step_s <= LONGEST_STEP_S
                 mean, covariance = propagate(mean, covariance, lifted, seen, step_s, q)
             if measured:
+                start.air[0] = air_variance(time_s[i], w, flags[i], imu, j2s, start)
                 height = start_height(start, j2s) + barometric_height(pressure_Pa[i], start)
                 variance = (noise_Pa * metres_per_pascal(start)) ** 2
+                hear(height - mean[0], time_s[i], vertical)
                 mean, covariance = correct(mean, covariance, height, variance)
         out[i, 0] = mean[0] if known else np.nan
-        out[i, 1] = math.sqrt(covariance[0]) if known else np.nan
+        out[i, 1] = height_std(covariance, start, vertical, j2s) if known else np.nan
         if math.isnan(now.time):
             out[i, 2] = out[i, 3] = np.nan
         else:

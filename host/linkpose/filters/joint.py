@@ -14,7 +14,7 @@ first order belongs to the middle of the step and lags by half a sample. The noi
     B = (c₀D + G) Σ_G (c₀D + G)ᵀ + (c₁² + c₂²) D Σ_G Dᵀ + Σ_A,   D = [d×]
 
 where the paper takes ṅ_G as white of its own. The displacement is Zᵀd (15), the height of the sensor over the joint's
-centre.
+centre, and its standard deviation that of `tilt`, with the innovation z_c/g − Z for the residual.
 
 Source: the link paper, equations (9)-(15).
 """
@@ -35,11 +35,12 @@ from linkpose.filters.tilt import (
     TiltParameters,
     TiltState,
     acceleration,
-    actual_covariance,
     advance,
     correct_by_accel,
     describe,
     hear,
+    hear_accel,
+    height_std,
     keep,
     recall,
 )
@@ -149,7 +150,7 @@ def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
     covariance = vec.parallel(now.covariance, noise, inverse)
     now = Now(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt), now.lasting)
-    return hear(now, acceleration(reference, tilt))
+    return hear(now, innovation)
 
 
 @compiled
@@ -182,14 +183,15 @@ def _process(
             c = weights(now.time - t1, t1 - t2)
             now = correct_by_joint(now, force, c, w1, w2, d, imu)
         elif has_force:
-            now = hear(now, now.accel)
+            now = hear_accel(now)
         if now.time != t1:  # a repeated stamp brings nothing new
             t2, w2 = t1, w1
             t1, w1 = (now.time if has_rate else math.nan), now.rate
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, actual_covariance(now), d)
+            out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, d)
+            out[i, 1] = height_std(now, d)
     keep(state, now, rejected)
     history.time[0], history.time[1] = t1, t2
     for j in range(3):

@@ -10,15 +10,16 @@ Frames: n is fixed, Z up; s is the sensor's. The state is the tilt Z = Zˢ, n's 
 with a⁺_k = s_A,k − g Z⁺_k. Two refinements over the paper's (5): the rate over a step is the mean of the rates at its
 ends, and the rotation is exact, where I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
 
-P is the covariance of the modelled noise, and that is the least of the error: it holds neither the gyro's residual bias
-nor an acceleration that lasts. What P leaves out shows in the residual s_A − gZ⁺. Averaged over some seconds in a frame
-that does not turn, its noise vanishes, and so do the accelerations, velocities being bounded: what lasts is the error of
-the tilt. Along Z, where a tilt cannot err, it is the accelerometer's own error, which the tilt takes over unseen. With
-the lasting residual r (in g) and the error m (in g) that a calibration leaves the accelerometer, each axis across Z has
+P is the covariance of the modelled noise, the least of the error: it holds neither the gyro's residual bias nor an
+acceleration that lasts. What it leaves out shows in the residual s_A/g − Z⁺. Averaged over some seconds in a frame that
+does not turn, the noise vanishes, and so do the accelerations, since velocities are bounded: what lasts is the error of
+the tilt. Along Z, where a tilt does not err, it is the accelerometer's own, which the tilt takes over unseen across Z.
+With the lasting residual r, and m for what a calibration leaves of the accelerometer's error (both in g),
 
-    σ² = ½ (‖r‖² + (r·Z)²) + m²   beyond P, and the height   std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)²
+    σ² = ½ (‖r‖² + (r·Z)²) + m²                          beyond P, on each axis across Z
+    std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)²                  of the height Zᵀd
 
-where the last term is that of 1 − cos: what a leaning link loses in height. No estimate is changed by it.
+where the last term is what a link that leans loses in height, 1 − cos. No estimate is changed by it.
 
 Sources: the link paper, equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and
 external acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas.
@@ -58,7 +59,7 @@ _ACCEL_ERROR_M_S2 = 0.03  # that a calibration leaves, on each axis
 class Lasting(NamedTuple):
     """The mean residual of the last seconds, in registers."""
 
-    mean: Vec  # m/s², turned along with the sensor
+    mean: Vec  # in g, turned along with the sensor
     span: float  # over how long it has been taken (s)
     share: float  # of the present sample
 
@@ -89,7 +90,7 @@ class TiltState(NamedTuple):
     tilt: Floats  # (3,) Z
     covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
     accel: Floats  # (3,) a⁺ (m/s²)
-    lasting: Floats  # (4,) mean residual (m/s²), over how long it has been taken (s)
+    lasting: Floats  # (4,) mean residual (in g), over how long it has been taken (s)
     rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time could not be used
 
     @staticmethod
@@ -198,7 +199,7 @@ def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -
 
 @inlined
 def hear(now: Now, residual: Vec) -> Now:
-    """Takes a sample's residual, measured − gZ⁺ (m/s²), into the lasting one."""
+    """Takes a sample's residual (in g) into the lasting one."""
     m, share = now.lasting.mean, now.lasting.share
     mean = (
         m[0] + share * (residual[0] - m[0]),
@@ -210,13 +211,19 @@ def hear(now: Now, residual: Vec) -> Now:
 
 
 @inlined
-def actual_covariance(now: Now) -> Sym:
-    """Covariance of Z's actual error: P, and what the lasting residual says beyond it."""
+def hear_accel(now: Now) -> Now:
+    """Takes a⁺ as the sample's residual."""
+    return hear(now, (now.accel[0] / GRAVITY, now.accel[1] / GRAVITY, now.accel[2] / GRAVITY))
+
+
+@inlined
+def height_std(now: Now, j2s: Vec) -> float:
+    """Standard deviation of the height (m): of the modelled noise, and what the lasting residual says beyond it."""
     mean, z = now.lasting.mean, now.tilt
-    along = vec.dot(mean, z)
-    across = (0.5 * (vec.dot(mean, mean) + along * along) + _ACCEL_ERROR_M_S2**2) / GRAVITY**2
-    beyond = vec.add(vec.cross_square(z, across), 2.0 * across * across, vec.outer(z))
-    return vec.add(now.covariance, 1.0, beyond)
+    along, height = vec.dot(mean, z), vec.dot(z, j2s)
+    variance = 0.5 * (vec.dot(mean, mean) + along * along) + (_ACCEL_ERROR_M_S2 / GRAVITY) ** 2
+    beyond = variance * (vec.dot(j2s, j2s) + (2.0 * variance - 1.0) * height * height)
+    return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0))
 
 
 @inlined
@@ -309,9 +316,10 @@ def _process(
         rejected += not (has_force and has_rate)
         if has_force:
             now = correct_by_accel(now, force, parameters.accel_memory, imu)
-            now = hear(now, now.accel)
+            now = hear_accel(now)
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], out[i, 1], out[i, 2], out[i, 3] = describe(now.tilt, actual_covariance(now), j2s)
+            out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+            out[i, 1] = height_std(now, j2s)
     keep(state, now, rejected)

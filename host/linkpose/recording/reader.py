@@ -35,6 +35,13 @@ class Recording:
     metadata: dict[str, Any]
     remarks: list[str]  # what the reader should know: a cut file, corrupt frames
 
+    @property
+    def dlpf(self) -> int | None:
+        """The MPU-6050's low-pass setting (DLPF_CFG, 0 to 6) in force; None where the file does not say."""
+        settings = self.metadata.get("settings")
+        value = settings.get("dlpf") if isinstance(settings, dict) else None
+        return value if isinstance(value, int) and 0 <= value < len(mpu6050.DLPF_DELAY_S) else None
+
 
 def load_recording(path: Path) -> Recording:
     """Reads a recording. Raises LinkposeError naming the file, the line and the cure for anything that is none."""
@@ -153,7 +160,8 @@ def _from_capture(path: Path) -> Recording:
         remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
     if gaps:
         remarks.append(f"{path}: {sum(gap.lost for gap in gaps)} samples lost in {len(gaps)} gaps")
-    return Recording(path, measurements, None, settings.sample_rate_hz, {"device": str(path)}, remarks)
+    metadata = {"device": str(path), "settings": {"dlpf": settings.dlpf}}
+    return Recording(path, measurements, None, settings.sample_rate_hz, metadata, remarks)
 
 
 def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[Floats, NDArray[np.int64], list[Gap]]:

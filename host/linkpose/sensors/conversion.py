@@ -27,6 +27,7 @@ _GYRO_STEPS = 10.0**mpu6050.GYRO_DECIMALS
 _TEMPERATURE_STEPS = 10.0**mpu6050.TEMPERATURE_DECIMALS
 
 _NO_IMU = (math.nan,) * 7
+_NO_MOVEMENT = (math.nan,) * 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +123,6 @@ class Converter:
     def _mice(self, sample: Sample, flags: int) -> tuple[float, ...]:
         values: list[float] = []
         for port in range(self._mouse_ports):
-            if port < len(sample.mice) and flags & MOUSE_VALID[port]:
-                values += sample.mice[port]
-            else:
-                values += (math.nan, math.nan)
+            moved = sample.mice[2 * port : 2 * port + 2]
+            values += moved if moved and flags & MOUSE_VALID[port] else _NO_MOVEMENT
         return tuple(values)

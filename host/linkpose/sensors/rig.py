@@ -42,7 +42,14 @@ class Imu:
     accel_scale: Vector = (1.0, 1.0, 1.0)
     gyro_noise_rad_s: float = math.radians(0.05)
     accel_noise_m_s2: float = 0.04
-    delay_s: float = 0.0049  # of the low-pass filter that the readings went through: DLPF_CFG 3
+    delay_s: float | None = None  # of the low-pass filter that the readings went through; None: by the board's setting
+
+    @property
+    def known_delay_s(self) -> float:
+        """The delay, that of the board's default setting where nothing is said of it."""
+        from linkpose.sensors.mpu6050 import DEFAULT_DLPF, DLPF_DELAY_S
+
+        return DLPF_DELAY_S[DEFAULT_DLPF] if self.delay_s is None else self.delay_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +81,22 @@ class Rig:
     def with_j2s(self, j2s_m: Vector) -> Rig:
         return replace(self, joint=Joint(j2s_m))
 
+    def with_delay_of(self, dlpf: int | None) -> Rig:
+        """The rig for readings through this low-pass setting (DLPF_CFG, 0 to 6); a delay that the rig names stays."""
+        from linkpose.sensors.mpu6050 import DLPF_DELAY_S
+
+        if dlpf is None or self.imu.delay_s is not None:
+            return self
+        return replace(self, imu=replace(self.imu, delay_s=DLPF_DELAY_S[dlpf]))
+
     def as_dict(self) -> dict[str, Any]:
         """The rig as plain tables, for JSON and TOML."""
         tables = asdict(self)
         tables["mouse"] = list(tables["mouse"])
         if self.joint.j2s_m is None:
             del tables["joint"]
+        if self.imu.delay_s is None:
+            del tables["imu"]["delay_s"]
         return tables
 
     @staticmethod

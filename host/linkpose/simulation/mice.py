@@ -22,7 +22,7 @@ from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation import imu
 from linkpose.simulation.drive import STILL_S, Drive, Manoeuvres, Move, Steady, Track
-from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, SampleMouse, Sensors
+from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -282,7 +282,7 @@ class MiceRun:
         flags = flags + np.where(since_read[1:], int(SampleFlags.MICE_STALE), 0)
         counts = self.imu_counts(time_s[1:], first).tolist()
         stamps = np.rint(time_s[1:] * 1e6).astype(np.int64).tolist()
-        own = [tuple(SampleMouse(*pair) for pair in row) for row in np.where(there[:, :, None], moved, 0).tolist()]
+        own = map(tuple, np.where(there[:, :, None], moved, 0).reshape(count, -1).tolist())
         return [
             Sample(tick & 0xFFFF, t_us & 0xFFFFFFFF, ax, ay, az, temp, gx, gy, gz, 0, 0, 0, bits, mice)
             for tick, t_us, (ax, ay, az, temp, gx, gy, gz), bits, mice in zip(

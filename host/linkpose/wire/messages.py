@@ -127,13 +127,6 @@ class Hello(NamedTuple):
     mice: tuple[HelloMouse, ...] = ()
 
 
-class SampleMouse(NamedTuple):
-    """One for each port up to the last at which a mouse was ever found since boot."""
-
-    dx: int  # counts; movement since the last SAMPLE that was not mice_stale
-    dy: int  # counts
-
-
 class Sample(NamedTuple):
     """All sensors at one tick."""
 
@@ -150,7 +143,7 @@ class Sample(NamedTuple):
     baro_up: int  # the BMP180's uncompensated pressure, 16 to 19 bits
     baro_count: int  # goes up by one with each new baro_up and wraps
     flags: int
-    mice: tuple[SampleMouse, ...] = ()
+    mice: tuple[int, ...] = ()  # dx, dy of each in turn: one for each port up to the last at which a mouse was ever found since boot
 
 
 class StatusMouse(NamedTuple):
@@ -271,13 +264,13 @@ class Layout(NamedTuple):
     cls: type[Message]
     fields: str
     group: str
-    group_cls: type[tuple[int, ...]] | None
+    group_cls: type[tuple[int, ...]] | None  # None: the values of all groups stand in one tuple
     group_max: int
 
 
 LAYOUTS: tuple[Layout, ...] = (
     Layout(0x01, Hello, "BBIBBBIBBHBBBHBBhhhHHHhhhhh", "BBB", HelloMouse, 4),
-    Layout(0x02, Sample, "HIhhhhhhhHIBH", "hh", SampleMouse, 4),
+    Layout(0x02, Sample, "HIhhhhhhhHIBH", "hh", None, 4),
     Layout(0x03, Status, "IIIIHHIHHHHHH", "HHH", StatusMouse, 4),
     Layout(0x04, Pong, "II", "", None, 0),
     Layout(0x05, Ack, "B", "", None, 0),

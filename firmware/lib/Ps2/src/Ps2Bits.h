@@ -67,7 +67,7 @@ class Ps2Bits {
   static constexpr uint8_t kGapSteps = 2000 / kStepUs;
 
   __attribute__((always_inline)) static bool odd_parity(uint8_t byte) {
-    byte ^= byte >> 4;
+    byte ^= static_cast<uint8_t>(byte << 4 | byte >> 4);  // one instruction
     byte ^= byte >> 2;
     byte ^= byte >> 1;
     return !(byte & 1);
@@ -99,8 +99,9 @@ class Ps2Bits {
     const uint8_t received = received_;
     if (received == kMaxAnswers) return end(Outcome::kBadFraming);  // more than anyone asked for
     bytes_[received] = byte;
-    received_ = received + 1;
-    return received + 1 == expected_ ? end(Outcome::kDone) : Act::kNone;
+    const uint8_t count = received + 1;
+    received_ = count;
+    return count == expected_ ? end(Outcome::kDone) : Act::kNone;
   }
 
   __attribute__((always_inline)) Act end(Outcome outcome) {

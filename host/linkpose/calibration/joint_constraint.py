@@ -1,0 +1,196 @@
+"""What a fixed joint says of the sensors' readings, as residuals that are linear in them, with their Jacobian.
+
+Within a piece of a recording let C turn the sensor's axes into those at the piece's first sample: the gyro, integrated.
+There gravity stands still, and the joint's constraint on the velocity, C(ω×d), reads
+
+    d/dt C(ω×d) = C f − γ,        γ = C g Z, constant, ‖γ‖ = g
+
+f being the specific force. Multiplied by a smooth weight w that is zero at both ends of a fraction of a second, and
+integrated by parts, nothing is left to differentiate:
+
+    γ = ∫ w C f dt + ∫ ẇ C(ω×d) dt,        ∫ w dt = 1
+
+Three equations every fraction of a second, in d and in how the sensors err: ω = (I − M_g)(s_G − b_g),
+f = (I − M_a)(s_A − b_a). How ω errs turns C more and more: its column holds the angle that was gathered since the
+piece's start.
+
+Source: the constraint is (9) of the link paper; the weights are M. Shinbrot's "method functions", NACA TN 3288, 1954.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Imu
+from linkpose.wire.messages import SampleFlags
+
+# Where each unknown begins: d, biases of gyro and accelerometer, and by rows M_a and M_g.
+J2S, GYRO_BIAS, ACCEL_BIAS, ACCEL_MATRIX, GYRO_MATRIX, UNKNOWNS = 0, 3, 6, 9, 18, 27
+
+_WEIGHT_S = 0.3  # over which a weight w reaches; half of it weighs little
+_FEWEST_READINGS = 8  # within a weight
+_LONGEST_STEP_S = 0.05  # over lost samples that a trapezoid still bridges
+_SPIKE_RAD_S, _SPIKE_M_S2 = 1.0, 10.0  # away from the neighbours on both sides: no motion of a link
+_OF_GYRO = [*range(GYRO_BIAS, ACCEL_BIAS), *range(GYRO_MATRIX, UNKNOWNS)]
+_SATURATED = int(SampleFlags.ACCEL_SATURATED | SampleFlags.GYRO_SATURATED)
+
+
+class Stretch(NamedTuple):
+    """N samples without a break."""
+
+    time_s: Floats  # (N,)
+    force: Floats  # (N, 3) m/s²
+    rate: Floats  # (N, 3) rad/s
+
+
+class Equations(NamedTuple):
+    """What a piece of a recording says, M times over."""
+
+    gravity: Floats  # (M, 3) γ, m/s²
+    jacobian: Floats  # (M, 3, UNKNOWNS) of γ
+    apart_s: float  # from one to the next
+
+
+def stretches(block: Measurements, imu: Imu) -> list[Stretch]:
+    """The unbroken stretches of a recording's usable samples, with the rig's calibration applied."""
+    force = (block.accel_m_s2 - np.array(imu.accel_offset_m_s2)) / np.array(imu.accel_scale)
+    rate = block.gyro_rad_s - np.array(imu.gyro_bias_rad_s)
+    usable = np.isfinite(force).all(axis=1) & np.isfinite(rate).all(axis=1) & (block.flags & _SATURATED == 0)
+    usable[usable] = ~(_spikes(force[usable], _SPIKE_M_S2) | _spikes(rate[usable], _SPIKE_RAD_S))
+    time_s, force, rate = block.time_s[usable], force[usable], rate[usable]
+    steps = np.diff(time_s)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    breaks = np.flatnonzero((steps > max(_LONGEST_STEP_S, 1.5 * usual)) | (steps <= 0)) + 1
+    return [Stretch(time_s[r], force[r], rate[r]) for r in np.split(np.arange(len(time_s)), breaks)]
+
+
+def pieces(stretch: Stretch, longest_s: float) -> Iterator[Stretch]:
+    """The stretch in pieces of equal length, none where it is too short for an equation."""
+    time_s = stretch.time_s
+    if len(time_s) < 2 * _FEWEST_READINGS:
+        return
+    count = max(1, int((time_s[-1] - time_s[0]) / longest_s))
+    edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1], count + 1))
+    for first, last in itertools.pairwise(edges):
+        rows = slice(int(first), int(last) + 1)
+        if time_s[last] - time_s[first] >= 2 * _weight_length(time_s[rows]):
+            yield Stretch(time_s[rows], stretch.force[rows], stretch.rate[rows])
+
+
+def equations(piece: Stretch, unknowns: Floats) -> Equations:
+    """γ at the unknowns (UNKNOWNS,), and its derivative by them."""
+    d = unknowns[J2S:GYRO_BIAS]
+    gyro, accel = piece.rate - unknowns[GYRO_BIAS:ACCEL_BIAS], piece.force - unknowns[ACCEL_BIAS:ACCEL_MATRIX]
+    of_gyro = np.eye(3) - unknowns[GYRO_MATRIX:].reshape(3, 3)
+    of_accel = np.eye(3) - unknowns[ACCEL_MATRIX:GYRO_MATRIX].reshape(3, 3)
+    rate = gyro @ of_gyro.T
+    turned = _attitudes(piece.time_s, rate)
+    force = np.einsum("nij,nj->ni", turned, accel @ of_accel.T)
+    velocity = np.einsum("nij,nj->ni", turned, np.cross(rate, d))
+    by_gyro = np.concatenate([np.broadcast_to(-of_gyro, (len(rate), 3, 3)), _by_matrix(gyro)], axis=2)
+    by_accel = np.concatenate([np.broadcast_to(-of_accel, (len(rate), 3, 3)), _by_matrix(accel)], axis=2)
+    angle = _integral(piece.time_s, turned @ by_gyro)
+    of_force, of_velocity = (np.zeros((len(rate), 3, UNKNOWNS)) for _ in range(2))
+    of_force[:, :, ACCEL_BIAS:GYRO_MATRIX] = turned @ by_accel
+    of_force[:, :, _OF_GYRO] = _cross_columns(angle, force)
+    of_velocity[:, :, J2S:GYRO_BIAS] = turned @ _cross_matrix(rate)
+    of_velocity[:, :, _OF_GYRO] = _cross_columns(angle, velocity) - turned @ _cross_matrix(d[None]) @ by_gyro
+    rows, weight, slope, apart_s = _weights(piece.time_s)
+    return Equations(
+        np.einsum("mk,mki->mi", weight, force[rows]) + np.einsum("mk,mki->mi", slope, velocity[rows]),
+        np.einsum("mk,mkip->mip", weight, of_force[rows]) + np.einsum("mk,mkip->mip", slope, of_velocity[rows]),
+        apart_s,
+    )
+
+
+def _spikes(values: Floats, jump: float) -> NDArray[np.bool_]:
+    """(N,) Where a reading is off from both its neighbours, to the same side on some axis."""
+    steps = np.diff(values, axis=0)
+    away = np.zeros(len(values), dtype=bool)
+    away[1:-1] = (np.minimum(np.abs(steps[:-1]), np.abs(steps[1:])) * (steps[:-1] * steps[1:] < 0) > jump).any(axis=1)
+    return away
+
+
+def _weight_length(time_s: Floats) -> float:
+    return max(_WEIGHT_S, _FEWEST_READINGS * float(np.median(np.diff(time_s))))
+
+
+def _weights(time_s: Floats) -> tuple[NDArray[np.int64], Floats, Floats, float]:
+    """Of M weights: the K samples under each, w and ẇ there times a sample's share of the time, all (M, K).
+
+    And how far they are apart (s). w is sin⁴: smooth enough at its ends for a sum over samples to be the integral. The
+    sums of w, of ẇ and of ẇ t are made exactly 1, 0 and −1.
+    """
+    length = _weight_length(time_s)
+    apart = 0.5 * length
+    starts = np.arange(time_s[0], time_s[-1] - length + 1e-6, apart)[:, None]
+    first, after = np.searchsorted(time_s, starts), np.searchsorted(time_s, starts + length)
+    rows = first + np.arange(int((after - first).max()))
+    phase = (time_s[np.minimum(rows, len(time_s) - 1)] - starts) / length
+    inside = (rows < after) & (phase < 1)
+    rows, sine = np.where(inside, rows, first), np.where(inside, np.sin(np.pi * phase), 0.0)
+    share, since = np.gradient(time_s)[rows], time_s[rows] - starts
+    weight, slope = sine**4 * share, sine**3 * np.cos(np.pi * phase) * share
+    weight /= weight.sum(axis=1, keepdims=True)
+    slope -= weight * slope.sum(axis=1, keepdims=True)
+    slope /= -(slope * since).sum(axis=1, keepdims=True)
+    return rows, weight, slope, apart
+
+
+def _attitudes(time_s: Floats, rate: Floats) -> Floats:
+    """C (N, 3, 3) from the sensor's axes to those at the first sample, by the mean rate (rad/s) over each step."""
+    step = np.diff(time_s)[:, None]
+    turn = 0.5 * step * (rate[1:] + rate[:-1])
+    half = 0.5 * np.linalg.norm(turn, axis=1, keepdims=True)
+    steps = np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * turn], axis=1)
+    q = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps])
+    reach = 1
+    while reach < len(q):  # products of all quaternions up to each, doubling how many are in
+        q = np.concatenate([q[:reach], _product(q[:-reach], q[reach:])])
+        reach *= 2
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=1).reshape(-1, 3, 3)
+
+
+def _product(p: Floats, q: Floats) -> Floats:
+    """Quaternion products (N, 4), the scalar first."""
+    scalar = p[:, 0] * q[:, 0] - (p[:, 1:] * q[:, 1:]).sum(axis=1)
+    vector = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
+    return np.column_stack([scalar, vector])
+
+
+def _integral(time_s: Floats, values: Floats) -> Floats:
+    """The integral (N, ...) up to each sample, by trapezoids."""
+    step = np.diff(time_s)[:, None, None]
+    sums = np.cumsum(0.5 * step * (values[1:] + values[:-1]), axis=0)
+    return np.concatenate([np.zeros_like(values[:1]), sums])
+
+
+def _by_matrix(reading: Floats) -> Floats:
+    """(N, 3, 9): derivative of (I − M) s by the rows of M."""
+    columns = np.zeros((len(reading), 3, 9))
+    for axis in range(3):
+        columns[:, axis, 3 * axis : 3 * axis + 3] = -reading
+    return columns
+
+
+def _cross_columns(left: Floats, right: Floats) -> Floats:
+    """(N, 3, K): each column of `left` (N, 3, K) × `right` (N, 3)."""
+    return -_cross_matrix(right) @ left
+
+
+def _cross_matrix(v: Floats) -> Floats:
+    """[v×], (N, 3, 3)."""
+    zero = np.zeros(len(v))
+    x, y, z = v.T
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
