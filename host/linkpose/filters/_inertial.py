@@ -62,7 +62,7 @@ def spread(z: Vec, v: Vec, w: Vec, f: Vec, rows: Rows, tilt: Vec, velocity: Vec,
 
 @compiled
 def add_noise(p: Floats, tilt: Vec, velocity: Vec, rotation: float, gained: float) -> None:
-    """Noise of a step: variances about and along each axis of its rotation (rad²) and of the velocity gained (m²/s²)."""
+    """Noise of a step: variances, on each axis, of its rotation (rad²) and of the velocity gained (m²/s²)."""
     # The same wrong rotation turns tilt and velocity: [Z×][Z×]ᵀ, [v×][v×]ᵀ, and [Z×][v×]ᵀ = (Z·v) I − v Zᵀ.
     zz, vv, zv = vec.cross_square(tilt, rotation), vec.cross_square(velocity, rotation), vec.dot(tilt, velocity)
     k = 0

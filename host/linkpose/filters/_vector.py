@@ -33,6 +33,17 @@ def dot(a: Vec, b: Vec) -> float:
 
 
 @compiled
+def minus(a: Vec, b: Vec) -> Vec:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@compiled
+def plus(a: Vec, scale: float, b: Vec) -> Vec:
+    """a + scale · b"""
+    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
+
+
+@compiled
 def unit(a: Vec) -> Vec:
     inverse = 1.0 / math.sqrt(dot(a, a))
     return (a[0] * inverse, a[1] * inverse, a[2] * inverse)

@@ -22,7 +22,8 @@ that is faster than the sensor: the step waits for the next new force, with the 
 
 Whether the sensors were calibrated is not known, and the two beliefs differ in what they make of a first second. So two
 filters run, one with the errors that a calibration leaves (`CALIBRATED`) and one with the data sheet's (`DATA_SHEET`).
-The evidence for each is the likelihood of its innovations, and the estimate is the mean of both, weighted by it.
+A filter whose errors turn out far beyond what it allows for is believed less, and the estimate is the mean of both,
+weighted by that belief: e^−χ²/2 of the errors found.
 
 Sources: the constraint is (9) of the link paper, once integrated. The two filters are a multiple-model estimator: D. T.
 Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control 10(4), 1965.
@@ -47,20 +48,20 @@ from linkpose.filters._imu import (
 )
 from linkpose.filters._inertial import add_noise, predict_mean, rotation_rows, spread, take
 from linkpose.filters._vector import Vec, compiled, inlined
-from linkpose.filters.tilt import start
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
 _N = 33
 _Z, _V, _BG, _BA, _D, _MA, _MG = 0, 3, 6, 9, 12, 15, 24  # where each begins in the state
-_OTHERS = ((1, 2), (2, 0), (0, 1))
+_ZERO = (0.0, 0.0, 0.0)
+_OTHERS = ((1, 2), (2, 0), (0, 1))  # components that a cross product's takes
 _PACE_S = 0.035  # between two corrections, at least
 _CLEAR = 30.0  # ‖ω‖² over its noise's, from which on it tells d; noise that is read as a rotation would, too
 _GATE = 25.0  # χ² with 3 degrees of freedom: one sound sample in 65 000
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of a link, but a spike
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
 _NONE_RAD2 = 1e-6  # and has no more than this along it
-_GAP_ACCEL_M_S2 = 10.0  # where the accelerometer did not see
+_GAP_ACCEL_M_S2 = 200.0  # where the accelerometer did not see, or beyond its range: a blow
 _BEND = 1.0 / 12.0  # of the second difference
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0  # angular acceleration that the first sample may hold, and to a rate of 1 rad/s
 _LONGEST_BLIND_S = 0.3  # without a rate, a moving link has turned by more than its tilt can be guessed to
@@ -74,7 +75,7 @@ _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, wher
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
 
 
-class Sensors(NamedTuple):
+class SensorErrors(NamedTuple):
     """How far off the sensors may be: standard deviations of one axis."""
 
     gyro_bias_rad_s: float
@@ -85,10 +86,11 @@ class Sensors(NamedTuple):
     accel_cross: float
 
 
-CALIBRATED = Sensors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005)
-DATA_SHEET = Sensors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012)
+CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005)
+DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012)
 _BELIEFS = (CALIBRATED, DATA_SHEET)
 _ODDS = 15.0  # logarithm of those of the first of them, before anything was measured
+_OCCAM = 8.0  # the wider belief can explain what is no error of a sensor: what it finds must lie well within it
 
 
 class JointInertialParameters(NamedTuple):
@@ -110,14 +112,40 @@ class Lever(NamedTuple):
     variance: float  # each axis (m²)
 
 
+class Since(NamedTuple):
+    """What has come since the covariance was brought up to the mean."""
+
+    span: float  # s
+    turned: Vec  # angle (rad)
+    impulse: Vec  # ∫ force (m/s)
+    rotation: float  # variance of the angle, each axis (rad²)
+    velocity: float  # variance of the velocity gained, each axis (m²/s²)
+
+
+_AT_ONCE = Since(0.0, _ZERO, _ZERO, 0.0, 0.0)
+
+
+class Now(NamedTuple):
+    """The registers, while a block is worked through."""
+
+    time: float  # of the last step (s), NaN before the first
+    held: float  # for how long the rate has had to do (s)
+    turned_at: float  # of the newest rate (s)
+    doubt: float  # variance of the angle turned since the last step (rad²)
+    force: Vec  # at the last step (m/s²)
+    rate: Vec  # at the last step (rad/s)
+    newest: Vec  # rate
+    angle: Vec  # turned since the last step, the gyro's bias in it (rad)
+    change: Vec  # of the force in the last step (m/s²)
+    since: Since
+
+
 class State(NamedTuple):
     """What one filter remembers from one block to the next; changed in place."""
 
-    time: Floats  # (4,) of the last step, NaN before the first; of no rate (s); of the last turn; its variance (rad²)
+    now: Floats  # (28,) the fields of Now, one after the other
     mean: Floats  # (33,)
     covariance: Floats  # (33, 33)
-    last: Floats  # (5, 3) force and rate at the last step, newest rate, angle turned since (rad), change of the force
-    since: Floats  # (9,) the last correction: s, angle (rad), ∫ force (m/s), variances (rad², m²/s²)
     belief: Floats  # (2,) time since it last faded (s); half the χ² of the sensors' errors by it
     rest: Floats  # (7,) for how long it has been still (s), first force, sum over time of the rate
     misfit: Floats  # (2,) mean squares of the excess innovation and of ‖ω‖‖d‖ (m/s)²
@@ -128,11 +156,9 @@ class State(NamedTuple):
     @staticmethod
     def fresh() -> State:
         return State(
-            np.array([np.nan, 0.0, np.nan, 0.0]),
+            np.concatenate([[np.nan], np.zeros(27)]),
             np.zeros(_N),
             np.zeros((_N, _N)),
-            np.zeros((5, 3)),
-            np.zeros(9),
             np.zeros(2),
             np.zeros(7),
             np.zeros(2),
@@ -180,7 +206,7 @@ class JointInertialFilter:
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
         """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m². Before the first sample, the rig's."""
-        if math.isnan(self.state.time[0]):
+        if math.isnan(self.state.now[0]):
             return np.array(self._lever.j2s), self._lever.variance * np.eye(3)
         return self.state.mean[_D:_MA].copy(), self.state.covariance[_D:_MA, _D:_MA].copy()
 
@@ -210,13 +236,13 @@ class JointInertialFilter:
 
 @compiled
 def _odds(first: float, second: float) -> float:
-    """Logarithm of the odds of the first belief, from how far off each says the sensors are."""
-    return _ODDS + second - first
+    """Logarithm of the odds of the first belief, from half the χ² of the sensors' errors that either has found."""
+    return _ODDS + _OCCAM * second - first
 
 
 @compiled
 def _mix(first: Floats, second: Floats, out: Floats) -> None:
-    """The mean of two filters' estimates by how much each is believed, and its deviation: theirs, and how they differ."""
+    """The mean of two filters' estimates, by how much each is believed; its deviation holds how far they differ."""
     for i in range(len(out)):
         odds = min(max(_odds(first[i, 5], second[i, 5]), -50.0), 50.0)
         share = 1.0 / (1.0 + math.exp(-odds))
@@ -227,11 +253,6 @@ def _mix(first: Floats, second: Floats, out: Floats) -> None:
         x, y = share * first[i, 2] + rest * second[i, 2], share * first[i, 3] + rest * second[i, 3]
         z = share * first[i, 4] + rest * second[i, 4]
         out[i, 2], out[i, 3] = math.degrees(math.atan2(y, z)), math.degrees(math.atan2(-x, math.sqrt(y * y + z * z)))
-
-
-@compiled
-def _minus(a: Vec, b: Vec) -> Vec:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 @inlined
@@ -268,7 +289,7 @@ def _along(variance: float) -> float:
 
 
 @compiled
-def _prior(belief: Sensors, i: int) -> float:
+def _prior(belief: SensorErrors, i: int) -> float:
     """Variance of state i, one of the sensors' errors, before anything was measured."""
     if i < _BA:
         return belief.gyro_bias_rad_s**2
@@ -280,7 +301,7 @@ def _prior(belief: Sensors, i: int) -> float:
 
 
 @compiled
-def _distance(x: Floats, belief: Sensors) -> float:
+def _distance(x: Floats, belief: SensorErrors) -> float:
     """Half the χ² of the errors that were found, by what is believed of the sensors; the gyro's bias may be any."""
     square = 0.0
     for i in range(_BA, _N):
@@ -295,7 +316,7 @@ def _begin(
     force: Vec,
     rate: Vec,
     imu: ImuCalibration,
-    belief: Sensors,
+    belief: SensorErrors,
     q: JointInertialParameters,
     lever: Lever,
 ) -> None:
@@ -314,8 +335,8 @@ def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration) -> No
     """Tilt from the force, velocity from the constraint, as if nothing had been known of them."""
     x, p = state.mean, state.covariance
     reading = force
-    force = _minus(_corrected(x, _MA, force), vec.at(x, _BA))
-    w, d = _corrected(x, _MG, _minus(rate, vec.at(x, _BG))), vec.at(x, _D)
+    force = vec.minus(_corrected(x, _MA, force), vec.at(x, _BA))
+    w, d = _corrected(x, _MG, vec.minus(rate, vec.at(x, _BG))), vec.at(x, _D)
     tilt = vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0)
     vec.put(x, _Z, tilt)
     vec.put(x, _V, vec.cross(w, d))
@@ -386,8 +407,8 @@ def _predict_covariance(
 
 
 @compiled
-def _fade(x: Floats, p: Floats, passed_s: float, belief: Sensors, q: JointInertialParameters) -> None:
-    """First-order Gauss-Markov: what is believed of the sensors' errors, but for the gyro's bias, returns to nothing."""
+def _fade(x: Floats, p: Floats, passed_s: float, belief: SensorErrors, q: JointInertialParameters) -> None:
+    """First-order Gauss-Markov: what was found of the sensors' errors, but for the gyro's bias, returns to nothing."""
     kept = math.exp(-passed_s / q.fade_s)
     for i in range(_BA, _N):
         if not _D <= i < _MA:
@@ -405,14 +426,14 @@ def _correct(
 ) -> bool:
     """The constraint 0 = v − ω×d as a measurement. False where the gate refused it, for a reading that jumped.
 
-    d is corrected in the part that the rotation stands out of the gyro's
-    noise: K's rows of d are scaled by it, and P follows as P − KHP − PHᵀKᵀ + KSKᵀ.
+    d is corrected in the part that the rotation stands out of the gyro's noise: K's rows of d are scaled by it, and P
+    follows as P − KHP − PHᵀKᵀ + KSKᵀ.
     """
     x, p, work, cross, misfit = state.mean, state.covariance, state.work, state.cross, state.misfit
     d, velocity = vec.at(x, _D), vec.at(x, _V)
-    reading = _minus(rate, vec.at(x, _BG))
+    reading = vec.minus(rate, vec.at(x, _BG))
     w = _corrected(x, _MG, reading)
-    y = _minus(vec.cross(w, d), velocity)
+    y = vec.minus(vec.cross(w, d), velocity)
     _put_errors(p, _BG, _MG, reading, work, 6)
     for c in range(3):
         (a, b), (ad, bd), (aw, bw) = _OTHERS[c], _others(d, c), _others(w, c)
@@ -423,7 +444,7 @@ def _correct(
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
     product = 0.5 * (p[6, 6] + p[7, 7] + p[8, 8]) * (p[12, 12] + p[13, 13] + p[14, 14])
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
-    moved = _minus(before, vec.at(x, _BG)) if jumped else w  # a spike must not excuse itself
+    moved = vec.minus(before, vec.at(x, _BG)) if jumped else w  # a spike must not excuse itself
     reach = vec.dot(moved, moved) * vec.dot(d, d)
     share = min(max(misfit[0] / misfit[1], q.least_misfit**2), 1.0)
     keep = min(h / q.misfit_time_s, 1.0)
@@ -508,7 +529,7 @@ def _column(ph: Floats, c: int, d: Vec, w: Vec, reading: Vec) -> Vec:
 def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> None:
     """Follows how long neither force nor rate has left the noise."""
     still = rest[0]
-    change = _minus(force, vec.at(rest, 1))
+    change = vec.minus(force, vec.at(rest, 1))
     drift = (rate[0] * still - rest[4], rate[1] * still - rest[5], rate[2] * still - rest[6])
     width = 3.0 * _REST_SIGMAS**2
     steady = vec.dot(change, change) < width * imu.accel_variance
@@ -567,11 +588,6 @@ def _same(a: Vec, b: Vec) -> bool:
 
 
 @inlined
-def _plus(a: Vec, scale: float, b: Vec) -> Vec:
-    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
-
-
-@inlined
 def _velocity_variance(bend: Vec, has_force: bool, h: float, imu: ImuCalibration) -> float:
     """Variance (m²/s²) of the velocity gained over a step: noise, and what a trapezoid leaves of the force."""
     bent = _BEND * math.sqrt(vec.dot(bend, bend)) if has_force else _GAP_ACCEL_M_S2
@@ -580,16 +596,15 @@ def _velocity_variance(bend: Vec, has_force: bool, h: float, imu: ImuCalibration
 
 @compiled
 def _close(
-    state: State, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, belief: Sensors,
-    q: JointInertialParameters, lever: Lever,
+    state: State, since: Since, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration,
+    belief: SensorErrors, q: JointInertialParameters, lever: Lever,
 ) -> bool:  # fmt: skip
     """Brings the covariance up to the mean, and corrects both. False where the correction was refused."""
-    x, p, since, rest = state.mean, state.covariance, state.since, state.rest
-    h, turned = since[0], vec.at(since, 1)
+    x, p, h = state.mean, state.covariance, since.span
     tilt, velocity = vec.at(x, _Z), vec.at(x, _V)
-    mean_rate, mean_force = _plus((0.0, 0.0, 0.0), 1.0 / h, turned), _plus((0.0, 0.0, 0.0), 1.0 / h, vec.at(since, 4))
-    _predict_covariance(p, state.work, turned, tilt, velocity, mean_rate, mean_force, h)
-    add_noise(p, tilt, velocity, since[7], since[8])
+    mean_rate, mean_force = vec.plus(_ZERO, 1.0 / h, since.turned), vec.plus(_ZERO, 1.0 / h, since.impulse)
+    _predict_covariance(p, state.work, since.turned, tilt, velocity, mean_rate, mean_force, h)
+    add_noise(p, tilt, velocity, since.rotation, since.velocity)
     for i in range(3):
         p[_BG + i, _BG + i] += q.gyro_bias_walk_rad_s**2 * h
         p[_D + i, _D + i] += q.j2s_walk**2 * lever.variance * h
@@ -597,12 +612,134 @@ def _close(
     if state.belief[0] > _FADING_PACE_S:
         _fade(x, p, state.belief[0], belief, q)
         state.belief[0] = 0.0
+    _take_bias_from_rest(x, p, state.rest)
+    taken = _correct(state, jumped, before, rate, h, imu, q) if has_rate else True
     state.belief[1] = _distance(x, belief)
-    since[:] = 0.0
-    _take_bias_from_rest(x, p, rest)
-    if not has_rate:
-        return True
-    return _correct(state, jumped, before, rate, h, imu, q)
+    return taken
+
+
+@inlined
+def _start(
+    state: State, first: bool, time_s: float, force: Vec, rate: Vec, imu: ImuCalibration, belief: SensorErrors,
+    q: JointInertialParameters, lever: Lever,
+) -> Now:  # fmt: skip
+    """From one sample, for the first time or after a gap that leaves nothing of the attitude."""
+    if first:
+        _begin(state, force, rate, imu, belief, q, lever)
+    else:
+        _set_upright(state, force, rate, imu)
+    return Now(time_s, 0.0, time_s, 0.0, force, rate, rate, _ZERO, _ZERO, _AT_ONCE)
+
+
+@inlined
+def _turn(now: Now, step: float, has_rate: bool, rate: Vec, jerk: Vec, jumped: bool, imu: ImuCalibration) -> Now:
+    """Adds to the angle, the gyro's bias in it, what the frame turned by up to a new rate, and to its variance."""
+    held = 0.0 if has_rate else now.held + step
+    angle = vec.plus(now.angle, 0.5 * step, now.newest)
+    angle = vec.plus(angle, 0.5 * step, now.newest if jumped else rate)
+    doubt = now.doubt + rotation_variance(step, held, imu)
+    if jumped:
+        doubt += 0.25 * step * step * vec.dot(jerk, jerk)
+    return Now(now.time, held, now.turned_at + step, doubt, now.force, now.rate, rate, angle, now.change, now.since)
+
+
+@inlined
+def _predict(x: Floats, now: Now, h: float, has_force: bool, force: Vec, bend: Vec, imu: ImuCalibration) -> Since:
+    """The mean over a step, by the angle turned and the forces at its ends; what the covariance will need of it."""
+    turn = _corrected(x, _MG, vec.plus(now.angle, -h, vec.at(x, _BG)))
+    begin = vec.minus(_corrected(x, _MA, now.force), vec.at(x, _BA))
+    predict_mean(x, turn, begin, vec.minus(_corrected(x, _MA, force), vec.at(x, _BA)), h)
+    since = now.since
+    return Since(
+        since.span + h,
+        vec.plus(since.turned, 1.0, turn),
+        vec.plus(vec.plus(since.impulse, 0.5 * h, now.force), 0.5 * h, force),
+        since.rotation + now.doubt,
+        since.velocity + _velocity_variance(bend, has_force, h, imu),
+    )
+
+
+@inlined
+def _advance(
+    state: State, x: Floats, now: Now, time_s: float, has_force: bool, force: Vec, has_rate: bool, rate: Vec,
+    imu: ImuCalibration, belief: SensorErrors, q: JointInertialParameters, lever: Lever,
+) -> tuple[Now, bool]:  # fmt: skip
+    """One sample later. False where what it read was refused."""
+    before_a, before_w = now.force, now.rate
+    force = force if has_force else before_a
+    rate = rate if has_rate else now.newest
+    h, step = time_s - now.time, time_s - now.turned_at
+    waits = has_force and has_rate and _same(force, before_a) and h < LONGEST_HOLD_S
+    jerk = vec.minus(rate, now.newest)
+    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
+    if step > 0.0 and not (waits and (jumped or _same(rate, now.newest))):
+        now = _turn(now, step, has_rate, rate, jerk, jumped, imu)
+    taken = True
+    if not waits:
+        change, since = vec.minus(force, before_a), now.since
+        jumped = jumped or vec.dot(change, change) > _JUMP_M_S2**2
+        if jumped and since.span > 0.0:  # that this reading be judged alone
+            _close(state, since, True, False, before_w, before_w, imu, belief, q, lever)
+            now = Now(
+                now.time, now.held, now.turned_at, now.doubt, before_a, before_w, now.newest, now.angle, now.change,
+                _AT_ONCE,
+            )  # fmt: skip
+        since = _predict(x, now, h, has_force, force, vec.minus(change, now.change), imu)
+        if has_force and has_rate:
+            _watch_rest(state.rest, force, rate, h, imu)
+        if jumped or since.span > _PACE_S:
+            taken = _close(state, since, has_rate, jumped, before_w, rate, imu, belief, q, lever)
+            since = _AT_ONCE
+        if not taken:
+            # A spike: what it did to this step is in doubt, and the next step goes without it.
+            gained = 0.25 * h * h * vec.dot(change, change)
+            add_noise(state.covariance, vec.at(x, _Z), vec.at(x, _V), 0.0, gained)
+            rate, force, change = before_w, before_a, _ZERO
+        if _runs_away(x) or state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2):
+            _begin(state, force, rate, imu, belief, q, lever)
+            state.counts[1] += 1
+            since = _AT_ONCE
+        now = Now(time_s, now.held, now.turned_at, 0.0, force, rate, rate, _ZERO, change, since)
+    return now, taken
+
+
+@inlined
+def _report(x: Floats, p: Floats, now: Now, found: float, time_s: float, delay_s: float, out: Floats, i: int) -> None:
+    """Row i: height and its standard deviation (m), Z at the time of the stamp, how far off the sensors are found."""
+    bias = vec.at(x, _BG)
+    ahead = vec.plus(_ZERO, delay_s, vec.minus(now.newest, bias))
+    if time_s > now.time:  # while the step waits
+        ahead = vec.plus(vec.plus(ahead, 1.0, now.angle), time_s - now.turned_at, now.newest)
+        ahead = vec.plus(ahead, now.time - time_s, bias)
+    ahead = _corrected(x, _MG, ahead)
+    tilt = vec.turn_back(ahead, vec.at(x, _Z))
+    out[i, 0], out[i, 1] = _height(tilt, x, p, vec.plus(now.since.turned, 1.0, ahead))
+    out[i, 2], out[i, 3], out[i, 4] = tilt
+    out[i, 5] = found
+
+
+@inlined
+def _recall(a: Floats) -> Now:
+    """The registers as they were left."""
+    since = Since(a[19], vec.at(a, 20), vec.at(a, 23), a[26], a[27])
+    return Now(
+        a[0], a[1], a[2], a[3], vec.at(a, 4), vec.at(a, 7), vec.at(a, 10), vec.at(a, 13), vec.at(a, 16), since
+    )  # fmt: skip
+
+
+@inlined
+def _keep(a: Floats, now: Now) -> None:
+    """The registers for the next block."""
+    a[0], a[1], a[2], a[3] = now.time, now.held, now.turned_at, now.doubt
+    vec.put(a, 4, now.force)
+    vec.put(a, 7, now.rate)
+    vec.put(a, 10, now.newest)
+    vec.put(a, 13, now.angle)
+    vec.put(a, 16, now.change)
+    a[19] = now.since.span
+    vec.put(a, 20, now.since.turned)
+    vec.put(a, 23, now.since.impulse)
+    a[26], a[27] = now.since.rotation, now.since.velocity
 
 
 @compiled
@@ -612,94 +749,31 @@ def _process(
     gyro: Floats,
     flags: NDArray[np.uint16],
     imu: ImuCalibration,
-    belief: Sensors,
+    belief: SensorErrors,
     q: JointInertialParameters,
     lever: Lever,
     state: State,
     out: Floats,
 ) -> None:
-    x, p, since, rest, misfit = state.mean, state.covariance, state.since, state.rest, state.misfit
-    last, held, turned_at, doubt = state.time[0], state.time[1], state.time[2], state.time[3]
-    before_a, before_w = vec.load(state.last[0]), vec.load(state.last[1])
-    newest_w, angle, change = vec.load(state.last[2]), vec.load(state.last[3]), vec.load(state.last[4])
-    rejected, restarts = state.counts[0], state.counts[1]
-    zero = (0.0, 0.0, 0.0)
+    x, p, found = state.mean, state.covariance, state.belief
+    now, rejected = _recall(state.now), 0
     for i in range(len(time_s)):
         has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        h = time_s[i] - last
-        good = has_force and has_rate
-        begins = math.isnan(last) or (good and max(h, held) > _LONGEST_BLIND_S)
-        if begins and good and math.isfinite(time_s[i]):
-            if math.isnan(last):
-                _begin(state, force, rate, imu, belief, q, lever)
-            else:
-                _set_upright(state, force, rate, imu)
-            since[:] = 0.0
-            last, turned_at, held, doubt = time_s[i], time_s[i], 0.0, 0.0
-            before_a, before_w, newest_w, angle, change = force, rate, rate, zero, zero
+        h, good, first = time_s[i] - now.time, has_force and has_rate, math.isnan(now.time)
+        if good and (first or max(h, now.held) > _LONGEST_BLIND_S) and math.isfinite(time_s[i]):
+            now = _start(state, first, time_s[i], force, rate, imu, belief, q, lever)
         elif h > 0.0:
-            force = force if has_force else before_a
-            rate = rate if has_rate else newest_w
-            step = time_s[i] - turned_at
-            waits = good and _same(force, before_a) and h < LONGEST_HOLD_S
-            jerk = _minus(rate, newest_w)
-            jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
-            if step > 0.0 and not (waits and (jumped or _same(rate, newest_w))):
-                held = 0.0 if has_rate else held + step
-                angle = _plus(_plus(angle, 0.5 * step, newest_w), 0.5 * step, newest_w if jumped else rate)
-                doubt += rotation_variance(step, held, imu)
-                if jumped:
-                    doubt += 0.25 * step * step * vec.dot(jerk, jerk)
-                turned_at, newest_w = time_s[i], rate
-            if not waits:
-                jump = _minus(force, before_a)
-                jumped = jumped or vec.dot(jump, jump) > _JUMP_M_S2**2
-                if jumped and since[0] > 0.0:  # that this reading be judged alone
-                    _close(state, True, False, before_w, before_w, imu, belief, q, lever)
-                turn = _corrected(x, _MG, _plus(angle, -h, vec.at(x, _BG)))
-                begin = _minus(_corrected(x, _MA, before_a), vec.at(x, _BA))
-                end = _minus(_corrected(x, _MA, force), vec.at(x, _BA))
-                predict_mean(x, turn, begin, end, h)
-                since[0] += h
-                vec.put(since, 1, _plus(vec.at(since, 1), 1.0, turn))
-                vec.put(since, 4, _plus(_plus(vec.at(since, 4), 0.5 * h, before_a), 0.5 * h, force))
-                since[7] += doubt
-                since[8] += _velocity_variance(_minus(jump, change), has_force, h, imu)
-                if good:
-                    _watch_rest(rest, force, rate, h, imu)
-                change = jump
-                if jumped or since[0] > _PACE_S:
-                    if not _close(state, has_rate, jumped, before_w, rate, imu, belief, q, lever):
-                        # A spike: what it did to this step is in doubt, and the next step goes without it.
-                        good = False
-                        add_noise(p, vec.at(x, _Z), vec.at(x, _V), 0.0, 0.25 * h * h * vec.dot(jump, jump))
-                        rate, force, change = before_w, before_a, zero
-                last, before_a, before_w, newest_w = time_s[i], force, rate, rate
-                angle, doubt = zero, 0.0
-                if _runs_away(x) or misfit[0] > _LOST * max(misfit[1], _LOST_M2_S2):
-                    _begin(state, force, rate, imu, belief, q, lever)
-                    since[:] = 0.0
-                    restarts += 1
+            now, taken = _advance(
+                state, x, now, time_s[i], has_force, force, has_rate, rate, imu, belief, q, lever
+            )  # fmt: skip
+            good = good and taken
         else:
             good = False
         rejected += not good
-        if math.isnan(last):
+        if math.isnan(now.time):
             out[i, :] = np.nan
         else:
-            tilt, turned, bias = vec.at(x, _Z), vec.at(since, 1), vec.at(x, _BG)
-            ahead_turn = zero
-            if time_s[i] > last:  # while the step waits
-                ahead_turn = _plus(_plus(angle, time_s[i] - turned_at, newest_w), last - time_s[i], bias)
-            ahead_turn = _plus(ahead_turn, imu.delay, _minus(newest_w, bias))
-            tilt = vec.turn_back(_corrected(x, _MG, ahead_turn), tilt)
-            out[i, 0], out[i, 1] = _height(tilt, x, p, _plus(turned, 1.0, ahead_turn))
-            out[i, 2], out[i, 3], out[i, 4] = tilt
-        out[i, 5] = state.belief[1]
-    state.time[0], state.time[1], state.time[2], state.time[3] = last, held, turned_at, doubt
-    vec.put(state.last[0], 0, before_a)
-    vec.put(state.last[1], 0, before_w)
-    vec.put(state.last[2], 0, newest_w)
-    vec.put(state.last[3], 0, angle)
-    vec.put(state.last[4], 0, change)
-    state.counts[0], state.counts[1] = rejected, restarts
+            _report(x, p, now, found[1], time_s[i], imu.delay, out, i)
+    _keep(state.now, now)
+    state.counts[0] += rejected

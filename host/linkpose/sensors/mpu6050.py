@@ -40,7 +40,6 @@ def temperature(count: Number) -> Number:
 # Of the readings through the low-pass filter at DLPF_CFG 0 to 6, by the slower of the two sensors; the other comes a
 # millisecond sooner at the most. Source: register map, 4.3, "Configuration".
 DLPF_DELAY_S = (0.00098, 0.0020, 0.0030, 0.0049, 0.0085, 0.0138, 0.0190)
-DEFAULT_DLPF = 3  # of the board
 
 
 SELF_TEST_LIMIT = 0.14  # of the factory's response (data sheet, 6.1 and 6.2)

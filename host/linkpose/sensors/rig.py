@@ -46,10 +46,8 @@ class Imu:
 
     @property
     def known_delay_s(self) -> float:
-        """The delay, that of the board's default setting where nothing is said of it."""
-        from linkpose.sensors.mpu6050 import DEFAULT_DLPF, DLPF_DELAY_S
-
-        return DLPF_DELAY_S[DEFAULT_DLPF] if self.delay_s is None else self.delay_s
+        """The delay, none where nothing is said of it."""
+        return self.delay_s or 0.0
 
 
 @dataclass(frozen=True, slots=True)
