@@ -189,6 +189,15 @@ def test_a_bias_of_the_gyro_is_in_the_standard_deviation(name):
     assert std == pytest.approx(abs(height) / np.sqrt(2), rel=0.1)  # of both axes across Z alike
 
 
+def test_baro_without_an_accelerometer_does_not_know_the_height_of_its_start():
+    run, block = recorded(1, 0)
+    blind = replace(block, accel_m_s2=np.full((len(block), 3), np.nan), gyro_rad_s=np.full((len(block), 3), np.nan))
+    estimate = filters.create("baro", run.rig).process(blind)
+    error = np.abs(estimate[:, 0] - run.truth().height_m)
+    assert error.min() > 0.3
+    assert (error < 3 * estimate[:, 1]).all()
+
+
 @pytest.mark.parametrize("name", INERTIAL)
 def test_what_is_not_known_of_j2s_is_in_the_standard_deviation(name):
     run, block = recorded(1, 0)

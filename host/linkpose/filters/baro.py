@@ -47,8 +47,9 @@ class StartState(NamedTuple):
 
     @staticmethod
     def fresh() -> StartState:
+        unsteady = np.array([0.0, 0.0, 1.0])  # without a force the tilt may be any
         return StartState(
-            np.full(1, np.nan), np.zeros(3), np.zeros(3), np.zeros(2), np.full(2, np.nan), np.zeros(1, np.int64)
+            np.full(1, np.nan), np.zeros(3), unsteady, np.zeros(2), np.full(2, np.nan), np.zeros(1, np.int64)
         )
 
 
