@@ -16,7 +16,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Rig, Vector
+from linkpose.sensors.rig import Rig, to_vector
 
 FEWEST_ATTITUDES = 6
 _APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
@@ -68,13 +68,13 @@ def with_calibration(rig: Rig, found: ImuCalibration) -> Rig:
     """The rig with what was found; the rest of it as it was."""
     imu = replace(
         rig.imu,
-        gyro_bias_rad_s=_vector(found.gyro_bias_rad_s),
+        gyro_bias_rad_s=to_vector(found.gyro_bias_rad_s),
         gyro_noise_rad_s=found.gyro_noise_rad_s,
         accel_noise_m_s2=found.accel_noise_m_s2,
     )
     if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
         imu = replace(
-            imu, accel_offset_m_s2=_vector(found.accel_offset_m_s2), accel_scale=_vector(found.accel_scale)
+            imu, accel_offset_m_s2=to_vector(found.accel_offset_m_s2), accel_scale=to_vector(found.accel_scale)
         )
     baro = rig.baro if found.pressure_noise_Pa is None else replace(rig.baro, pressure_noise_Pa=found.pressure_noise_Pa)
     return replace(rig, imu=imu, baro=baro)
@@ -136,8 +136,3 @@ def _pressure_noise(rests: Sequence[Measurements]) -> float | None:
     together = np.concatenate(steps)
     together = together[np.isfinite(together)]
     return max(float(np.sqrt(np.mean(together**2) / 2)), 0.1) if len(together) >= 20 else None
-
-
-def _vector(values: Floats) -> Vector:
-    x, y, z = (round(float(value), 8) for value in values)
-    return x, y, z

@@ -39,7 +39,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Rig, Vector
+from linkpose.sensors.rig import Imu, Joint, Rig, to_vector
 
 LARGE_RESIDUAL_M_S2 = 0.2  # what a joint that moves by centimetres leaves; one with a little play leaves 0.03
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
@@ -95,7 +95,7 @@ class _Sums(NamedTuple):
 
 def with_calibration(rig: Rig, found: JointCalibration, with_imu: bool) -> Rig:
     """The rig with J2S, and on request the sensor's errors, as they were found; the rest of it as it was."""
-    joint = Joint(_vector(found.j2s_m, 5), round(float(found.std_m.max()), 5))
+    joint = Joint(to_vector(found.j2s_m, 5), round(float(found.std_m.max()), 5))
     return replace(rig, joint=joint, imu=found.imu if with_imu else rig.imu)
 
 
@@ -128,15 +128,10 @@ def _with_errors(imu: Imu, unknowns: Floats) -> Imu:
     scale = np.array(imu.accel_scale)
     return replace(
         imu,
-        gyro_bias_rad_s=_vector(np.array(imu.gyro_bias_rad_s) + unknowns[GYRO_BIAS:ACCEL_BIAS], 8),
-        accel_offset_m_s2=_vector(np.array(imu.accel_offset_m_s2) + scale * unknowns[ACCEL_BIAS:ACCEL_MATRIX], 8),
-        accel_scale=_vector(scale / (1 - unknowns[_ACCEL_SCALES]), 8),
+        gyro_bias_rad_s=to_vector(np.array(imu.gyro_bias_rad_s) + unknowns[GYRO_BIAS:ACCEL_BIAS]),
+        accel_offset_m_s2=to_vector(np.array(imu.accel_offset_m_s2) + scale * unknowns[ACCEL_BIAS:ACCEL_MATRIX]),
+        accel_scale=to_vector(scale / (1 - unknowns[_ACCEL_SCALES])),
     )
-
-
-def _vector(values: Floats, decimals: int) -> Vector:
-    x, y, z = (round(float(value), decimals) for value in values)
-    return x, y, z
 
 
 def _samples_in_motion(parts: Iterable[Stretch], gyro_bias: Floats) -> int:
