@@ -191,6 +191,12 @@ def test_a_sensor_on_no_joint_is_refused():
         calibrate_joint([recording(replace(block, accel_m_s2=block.accel_m_s2 + carried))], Rig())
 
 
+def test_a_sensor_that_cannot_be_is_refused():
+    block = LinkRun(2, 0, 40.0).measurements()
+    with pytest.raises(LinkposeError, match=r"a scale of \[1\.15.*which no MPU-6050 has"):
+        calibrate_joint([recording(replace(block, accel_m_s2=1.15 * block.accel_m_s2))], Rig())
+
+
 @pytest.mark.parametrize(("axis", "others"), [("x", "y and z"), ("y", "x and z"), ("z", "x and y")])
 def test_rotation_about_one_axis_names_the_axis_it_does_not_tell(axis, others):
     t = np.arange(4000) / 100

@@ -20,7 +20,7 @@ from linkpose.sensors.rig import Rig, to_vector
 
 FEWEST_ATTITUDES = 6
 _APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
-_LARGEST_OFFSET_M_S2, _LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
+LARGEST_OFFSET_M_S2, LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
 _WORST_RESIDUAL_M_S2 = 0.1
 
 
@@ -100,7 +100,7 @@ def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
         if np.abs(change).max() < 1e-12:
             break
     residual = float(np.sqrt(np.mean((np.linalg.norm((forces - offset) / scale, axis=1) - STANDARD_GRAVITY) ** 2)))
-    if np.abs(offset).max() > _LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > _LARGEST_SCALE:
+    if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
         raise LinkposeError(
             f"the rests give an offset of {np.round(offset, 2)} m/s² and a scale of {np.round(scale, 3)}, which no "
             "MPU-6050 has: was it moved slowly, or is the range set wrong?"

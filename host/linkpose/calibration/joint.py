@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from linkpose.calibration.imu import LARGEST_OFFSET_M_S2, LARGEST_SCALE
 from linkpose.calibration.joint_constraint import (
     ACCEL_BIAS,
     ACCEL_MATRIX,
@@ -41,6 +42,7 @@ from linkpose.sensors.measurements import Floats
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig, to_vector
 
+_NO_JOINT_M_S2 = 1.0
 LARGE_RESIDUAL_M_S2 = 0.2  # what a joint that moves by centimetres leaves; one with a little play leaves 0.03
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
 _WORST_STD_M, _WORST_SHARE = 0.03, 0.05  # of an axis that the motion does not tell: metres, share of ‖d‖
@@ -118,9 +120,9 @@ def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibrati
     d, covariance = unknowns[J2S:GYRO_BIAS], covariance[J2S:GYRO_BIAS, J2S:GYRO_BIAS]
     covariance = covariance + _LOCAL_GRAVITY**2 * np.outer(d, d)
     _refuse_weak_axes(d, covariance, residual)
-    if not np.linalg.norm(d) < _FARTHEST_M:
-        raise LinkposeError(f"the fit gives a J2S of {np.round(d, 2)} m: is the link on a joint that is fixed?")
-    return JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples, _with_errors(rig.imu, unknowns))
+    found = JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples, _with_errors(rig.imu, unknowns))
+    _refuse_impossible(found)
+    return found
 
 
 def _with_errors(imu: Imu, unknowns: Floats) -> Imu:
@@ -154,15 +156,30 @@ def _refuse_weak_axes(d: Floats, covariance: Floats, residual: float) -> None:
     if std <= min(_WORST_STD_M, _WORST_SHARE * length):
         return
     if residual > LARGE_RESIDUAL_M_S2:
-        raise LinkposeError(
-            f"the readings fit no joint that stays in its place ({residual:.1f} m/s² rms are left over): fix the "
-            "joint, and the sensor firmly on the link"
-        )
+        raise _no_joint(residual)
     axis = int(np.argmax(np.abs(vectors[:, -1])))
     others = " and ".join(name for i, name in enumerate("xyz") if i != axis)
     raise LinkposeError(
         f"the motion does not tell J2S along the sensor's {'xyz'[axis]} axis (to {std:.3f} m only, of a J2S of "
         f"{length:.2f} m): turn the link about its {others} axes too, and faster"
+    )
+
+
+def _refuse_impossible(found: JointCalibration) -> None:
+    if found.residual_m_s2 > _NO_JOINT_M_S2 or np.linalg.norm(found.j2s_m) > _FARTHEST_M:
+        raise _no_joint(found.residual_m_s2)
+    offset, scale = np.array(found.imu.accel_offset_m_s2), np.array(found.imu.accel_scale)
+    if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
+        raise LinkposeError(
+            f"the fit needs an accelerometer with an offset of {np.round(offset, 2)} m/s² and a scale of "
+            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, and the range set right?"
+        )
+
+
+def _no_joint(residual: float) -> LinkposeError:
+    return LinkposeError(
+        f"the readings fit no joint that stays in its place ({residual:.1f} m/s² rms are left over): fix the joint, "
+        "and the sensor firmly on the link"
     )
 
 
