@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from linkpose import filters
 from linkpose.calibration.imu import calibrate_imu, with_calibration
-from linkpose.calibration.joint import JointCalibration, calibrate_joint
+from linkpose.calibration.joint import JointCalibration, calibrate_joint, is_calibrated
+from linkpose.calibration.joint import with_calibration as joint_with_calibration
 from linkpose.cli import calibrate_imu as imu_command
 from linkpose.cli import calibrate_joint as joint_command
 from linkpose.cli import simulate_link
@@ -111,6 +113,28 @@ def test_joint_from_a_sensor_that_was_never_calibrated():
     assert 0.3 <= np.sqrt(np.mean(np.square(scores))) <= 2.0
 
 
+def test_the_sensors_errors_are_found_with_the_joint():
+    """Over what the rig file knows already; without them the gyro's bias alone would lean the tilt by degrees."""
+    run = LinkRun(1, 0, 60.0, errors="datasheet")
+    errors, block = run.imu_errors, run.measurements()
+    known = Imu(gyro_bias_rad_s=(0.1, -0.1, 0.05), accel_offset_m_s2=(0.1, 0.0, -0.2), accel_scale=(1.01, 0.99, 1.02))
+    found = calibrate_joint([recording(block)], Rig(imu=known))
+    assert not is_calibrated(known, found)
+    assert found.imu.gyro_bias_rad_s == pytest.approx(errors.gyro_bias_rad_s, abs=0.001)
+    assert found.imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.1)
+    assert found.imu.accel_scale == pytest.approx(np.diag(errors.accel_matrix), abs=0.01)
+    again = calibrate_joint([recording(block)], Rig(imu=found.imu))
+    assert is_calibrated(found.imu, again)
+    with_j2s = joint_with_calibration(Rig(imu=known), found, with_imu=False)
+    assert with_j2s.imu == known and with_j2s.joint.j2s_m == pytest.approx(found.j2s_m, abs=1e-5)
+    estimates = [
+        filters.create("tilt", joint_with_calibration(Rig(imu=known), found, with_imu)).process(block)[500:, 0]
+        for with_imu in (False, True)
+    ]
+    before, after = (np.sqrt(np.mean((height - run.truth().height_m[500:]) ** 2)) for height in estimates)
+    assert after < 0.05 < 0.3 < before
+
+
 def test_joint_of_a_short_link_from_two_recordings():
     runs = [LinkRun(2, seed, 30.0, j2s_m=(0.05, -0.2, 0.3)) for seed in (0, 1)]
     found = calibrate_joint([recording(run.measurements()) for run in runs], Rig())
@@ -167,6 +191,12 @@ def test_a_sensor_on_no_joint_is_refused():
         calibrate_joint([recording(replace(block, accel_m_s2=block.accel_m_s2 + carried))], Rig())
 
 
+def test_a_sensor_that_cannot_be_is_refused():
+    block = LinkRun(2, 0, 40.0).measurements()
+    with pytest.raises(LinkposeError, match=r"a scale of \[1\.15.*which no MPU-6050 has"):
+        calibrate_joint([recording(replace(block, accel_m_s2=1.15 * block.accel_m_s2))], Rig())
+
+
 @pytest.mark.parametrize(("axis", "others"), [("x", "y and z"), ("y", "x and z"), ("z", "x and y")])
 def test_rotation_about_one_axis_names_the_axis_it_does_not_tell(axis, others):
     t = np.arange(4000) / 100
@@ -206,4 +236,21 @@ def test_commands_complete_the_rig_file(tmp_path):
     assert shown["j2s_m"] == pytest.approx(rig.joint.j2s_m, abs=1e-4)
     assert 0.0001 < rig.joint.j2s_std_m < 0.01
     assert (rig.mouse[0].x_m, rig.mouse[0].y_m) == (0.1, 0.2)
+    assert rig.imu.accel_offset_m_s2 == (0.0, 0.0, 0.0)
     assert rig.imu.gyro_bias_rad_s != (0.0, 0.0, 0.0)
+
+
+def test_a_sensor_that_is_not_calibrated_is_said_and_calibrated_on_request(tmp_path):
+    rec, truth, rig_file = tmp_path / "rec.csv", tmp_path / "truth.csv", tmp_path / "rig.toml"
+    CliRunner().invoke(simulate_link.command, ["-o", str(rec), "--truth", str(truth), "--errors", "datasheet"])
+    typed = [str(rec), "--rig", str(rig_file)]
+    told = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
+    assert "the sensor is not calibrated: add --imu" in told.stderr
+    assert Rig.load(rig_file).imu.gyro_bias_rad_s == (0.0, 0.0, 0.0)
+    asked = CliRunner().invoke(joint_command.command, [*typed, "--imu", "--json"], catch_exceptions=False)
+    assert "not calibrated" not in asked.stderr
+    rig, shown = Rig.load(rig_file), json.loads(asked.stdout)
+    assert list(rig.imu.gyro_bias_rad_s) == shown["gyro_bias_rad_s"]
+    assert list(rig.imu.accel_scale) == shown["accel_scale"] != [1.0, 1.0, 1.0]
+    again = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
+    assert "not calibrated" not in again.stderr

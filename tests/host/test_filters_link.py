@@ -158,7 +158,8 @@ def test_it_is_so_for_other_sensors_rates_links_and_starts(otherwise, start):
     for test, seed in [(1, 0), (2, 1), (3, 2)]:
         run = LinkRun(test, seed, 40.0, **otherwise)
         block, height = run.measurements()[start:], run.truth().height_m[start:]
-        found.append([height_nees(name, run.rig, block, height) for name in PAPER])
+        rig = replace(run.rig, joint=Joint(run.j2s_m, 1e-6))  # the simulated link's is exact
+        found.append([height_nees(name, rig, block, height) for name in PAPER])
     mean = dict(zip(PAPER, np.mean(found, axis=0), strict=True))
     assert all(0.3 < value < 3 for value in mean.values()), mean
 
@@ -186,6 +187,25 @@ def test_a_bias_of_the_gyro_is_in_the_standard_deviation(name):
     height, std = filters.create(name, Rig().with_j2s((1.0, 0.0, 0.0))).process(block)[-1, :2]
     assert abs(height) > 0.01
     assert std == pytest.approx(abs(height) / np.sqrt(2), rel=0.1)  # of both axes across Z alike
+
+
+def test_baro_without_an_accelerometer_does_not_know_the_height_of_its_start():
+    run, block = recorded(1, 0)
+    blind = replace(block, accel_m_s2=np.full((len(block), 3), np.nan), gyro_rad_s=np.full((len(block), 3), np.nan))
+    estimate = filters.create("baro", run.rig).process(blind)
+    error = np.abs(estimate[:, 0] - run.truth().height_m)
+    assert error.min() > 0.3
+    assert (error < 3 * estimate[:, 1]).all()
+
+
+@pytest.mark.parametrize("name", INERTIAL)
+def test_what_is_not_known_of_j2s_is_in_the_standard_deviation(name):
+    run, block = recorded(1, 0)
+    exact, rough = (
+        filters.create(name, replace(run.rig, joint=Joint(run.j2s_m, std_m))).process(block)[:, 1]
+        for std_m in (1e-6, 0.02)
+    )
+    assert rough**2 - exact**2 == pytest.approx(0.02**2)
 
 
 # ---- tilt-inertial: the gyro's bias, accelerations that last, delayed readings ----

@@ -6,6 +6,12 @@ import json
 
 import pytest
 
+from linkpose.cli import patience
+from linkpose.localization.carmen import read_carmen
+from linkpose.localization.ekf import ekf_step
+from linkpose.localization.grid import load_map
+from linkpose.localization.localizer import Settings, localize, warm_up
+from linkpose.localization.ukf import ukf_step
 from linkpose.recording.table import read_table
 
 
@@ -51,6 +57,37 @@ def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
     assert table.closing is not None
     assert linkpose(*arguments, "-o", out).status == 1  # never overwritten
     assert linkpose(*arguments, "-o", out, "--force").status == 0
+
+
+def test_a_compiler_at_work_is_told(indoor, linkpose, monkeypatch):
+    log, grid, _ = indoor
+
+    class OutOfPatience:
+        """A timer that is up at once."""
+
+        def __init__(self, _seconds, say, words):
+            self.start = lambda: say(*words)
+
+        def cancel(self):
+            pass
+
+    quiet = linkpose("localize", log, "--map", grid)
+    monkeypatch.setattr(patience.threading, "Timer", OutOfPatience)
+    told = linkpose("localize", log, "--map", grid)
+    assert told.err == "compiling the filters, this once (some seconds) ...\n"
+    assert told.out == quiet.out
+    out = linkpose("estimate", "--live", "--port", "sim://link?speed=0", "--duration", 1, "--json")
+    assert "compiling the filters" in out.err and "compiling" not in out.out
+
+
+def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
+    """What is told as a compiler at work is one: nothing is left to compile after it."""
+    log, grid, _ = indoor
+    warm_up(["ekf", "ukf"])
+    events, start = read_carmen(log)
+    for name, step in (("ekf", ekf_step), ("ukf", ukf_step)):
+        localize(events[:50], name, Settings(start=start), load_map(grid))
+        assert len(step.signatures) == 1
 
 
 @pytest.mark.parametrize("noise", ["fixed", "adaptive", "affine"])

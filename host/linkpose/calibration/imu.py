@@ -16,11 +16,11 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Rig, Vector
+from linkpose.sensors.rig import Rig, to_vector
 
 FEWEST_ATTITUDES = 6
 _APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
-_LARGEST_OFFSET_M_S2, _LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
+LARGEST_OFFSET_M_S2, LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
 _WORST_RESIDUAL_M_S2 = 0.1
 
 
@@ -68,13 +68,13 @@ def with_calibration(rig: Rig, found: ImuCalibration) -> Rig:
     """The rig with what was found; the rest of it as it was."""
     imu = replace(
         rig.imu,
-        gyro_bias_rad_s=_vector(found.gyro_bias_rad_s),
+        gyro_bias_rad_s=to_vector(found.gyro_bias_rad_s),
         gyro_noise_rad_s=found.gyro_noise_rad_s,
         accel_noise_m_s2=found.accel_noise_m_s2,
     )
     if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
         imu = replace(
-            imu, accel_offset_m_s2=_vector(found.accel_offset_m_s2), accel_scale=_vector(found.accel_scale)
+            imu, accel_offset_m_s2=to_vector(found.accel_offset_m_s2), accel_scale=to_vector(found.accel_scale)
         )
     baro = rig.baro if found.pressure_noise_Pa is None else replace(rig.baro, pressure_noise_Pa=found.pressure_noise_Pa)
     return replace(rig, imu=imu, baro=baro)
@@ -100,7 +100,7 @@ def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
         if np.abs(change).max() < 1e-12:
             break
     residual = float(np.sqrt(np.mean((np.linalg.norm((forces - offset) / scale, axis=1) - STANDARD_GRAVITY) ** 2)))
-    if np.abs(offset).max() > _LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > _LARGEST_SCALE:
+    if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
         raise LinkposeError(
             f"the rests give an offset of {np.round(offset, 2)} m/s² and a scale of {np.round(scale, 3)}, which no "
             "MPU-6050 has: was it moved slowly, or is the range set wrong?"
@@ -136,8 +136,3 @@ def _pressure_noise(rests: Sequence[Measurements]) -> float | None:
     together = np.concatenate(steps)
     together = together[np.isfinite(together)]
     return max(float(np.sqrt(np.mean(together**2) / 2)), 0.1) if len(together) >= 20 else None
-
-
-def _vector(values: Floats) -> Vector:
-    x, y, z = (round(float(value), 8) for value in values)
-    return x, y, z

@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from linkpose.calibration.imu import LARGEST_OFFSET_M_S2, LARGEST_SCALE
 from linkpose.calibration.joint_constraint import (
     ACCEL_BIAS,
     ACCEL_MATRIX,
@@ -39,8 +40,9 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Joint, Rig
+from linkpose.sensors.rig import Imu, Joint, Rig, to_vector
 
+_NO_JOINT_M_S2 = 1.0
 LARGE_RESIDUAL_M_S2 = 0.2  # what a joint that moves by centimetres leaves; one with a little play leaves 0.03
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
 _WORST_STD_M, _WORST_SHARE = 0.03, 0.05  # of an axis that the motion does not tell: metres, share of ‖d‖
@@ -65,18 +67,23 @@ _GROUPS = (
 )
 _ACCEL_SCALES = _GROUPS[0][0]
 _FREE_PASSES = 2  # before the residuals tell anything of themselves
+_AS_CALIBRATED = (0.01, 0.15, 0.01)  # gyro bias (rad/s), accelerometer offset (m/s²) and scale: off by no more
 _FIRST_STD = 0.01
 _USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, worth so many members
 
 
 @dataclass(frozen=True, slots=True)
 class JointCalibration:
-    """What was found. The residual of a good joint is 0.03 m/s² or less."""
+    """What was found. The residual of a good joint is 0.03 m/s² or less.
+
+    `imu` is the rig's with the sensor's bias, offset and scale as the same fit has them.
+    """
 
     j2s_m: Floats  # (3,)
     std_m: Floats  # (3,)
     residual_m_s2: float  # rms, by axis, of the smoothed specific force that is not explained
     samples: int  # in motion
+    imu: Imu
 
 
 class _Sums(NamedTuple):
@@ -88,10 +95,18 @@ class _Sums(NamedTuple):
     equations: float  # how many, less what the robust weights take
 
 
-def with_calibration(rig: Rig, found: JointCalibration) -> Rig:
-    """The rig with J2S as it was found; the rest of it as it was."""
-    x, y, z = (round(float(value), 5) for value in found.j2s_m)
-    return replace(rig, joint=Joint((x, y, z), round(float(found.std_m.max()), 5)))
+def with_calibration(rig: Rig, found: JointCalibration, with_imu: bool) -> Rig:
+    """The rig with J2S, and on request the sensor's errors, as they were found; the rest of it as it was."""
+    joint = Joint(to_vector(found.j2s_m, 5), round(float(found.std_m.max()), 5))
+    return replace(rig, joint=joint, imu=found.imu if with_imu else rig.imu)
+
+
+def is_calibrated(imu: Imu, found: JointCalibration) -> bool:
+    """Whether what was found of the sensor's errors is next to what was known of them."""
+    before, after = (
+        np.array([i.gyro_bias_rad_s, i.accel_offset_m_s2, i.accel_scale], dtype=np.float64) for i in (imu, found.imu)
+    )
+    return bool((np.abs(after - before).max(axis=1) <= _AS_CALIBRATED).all())
 
 
 def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibration:
@@ -105,9 +120,20 @@ def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibrati
     d, covariance = unknowns[J2S:GYRO_BIAS], covariance[J2S:GYRO_BIAS, J2S:GYRO_BIAS]
     covariance = covariance + _LOCAL_GRAVITY**2 * np.outer(d, d)
     _refuse_weak_axes(d, covariance, residual)
-    if not np.linalg.norm(d) < _FARTHEST_M:
-        raise LinkposeError(f"the fit gives a J2S of {np.round(d, 2)} m: is the link on a joint that is fixed?")
-    return JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples)
+    found = JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples, _with_errors(rig.imu, unknowns))
+    _refuse_impossible(found)
+    return found
+
+
+def _with_errors(imu: Imu, unknowns: Floats) -> Imu:
+    """The sensor's calibration with what the readings that it gave still err by."""
+    scale = np.array(imu.accel_scale)
+    return replace(
+        imu,
+        gyro_bias_rad_s=to_vector(np.array(imu.gyro_bias_rad_s) + unknowns[GYRO_BIAS:ACCEL_BIAS]),
+        accel_offset_m_s2=to_vector(np.array(imu.accel_offset_m_s2) + scale * unknowns[ACCEL_BIAS:ACCEL_MATRIX]),
+        accel_scale=to_vector(scale / (1 - unknowns[_ACCEL_SCALES])),
+    )
 
 
 def _samples_in_motion(parts: Iterable[Stretch], gyro_bias: Floats) -> int:
@@ -130,15 +156,30 @@ def _refuse_weak_axes(d: Floats, covariance: Floats, residual: float) -> None:
     if std <= min(_WORST_STD_M, _WORST_SHARE * length):
         return
     if residual > LARGE_RESIDUAL_M_S2:
-        raise LinkposeError(
-            f"the readings fit no joint that stays in its place ({residual:.1f} m/s² rms are left over): fix the "
-            "joint, and the sensor firmly on the link"
-        )
+        raise _no_joint(residual)
     axis = int(np.argmax(np.abs(vectors[:, -1])))
     others = " and ".join(name for i, name in enumerate("xyz") if i != axis)
     raise LinkposeError(
         f"the motion does not tell J2S along the sensor's {'xyz'[axis]} axis (to {std:.3f} m only, of a J2S of "
         f"{length:.2f} m): turn the link about its {others} axes too, and faster"
+    )
+
+
+def _refuse_impossible(found: JointCalibration) -> None:
+    if found.residual_m_s2 > _NO_JOINT_M_S2 or np.linalg.norm(found.j2s_m) > _FARTHEST_M:
+        raise _no_joint(found.residual_m_s2)
+    offset, scale = np.array(found.imu.accel_offset_m_s2), np.array(found.imu.accel_scale)
+    if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
+        raise LinkposeError(
+            f"the fit needs an accelerometer with an offset of {np.round(offset, 2)} m/s² and a scale of "
+            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, and the range set right?"
+        )
+
+
+def _no_joint(residual: float) -> LinkposeError:
+    return LinkposeError(
+        f"the readings fit no joint that stays in its place ({residual:.1f} m/s² rms are left over): fix the joint, "
+        "and the sensor firmly on the link"
     )
 
 

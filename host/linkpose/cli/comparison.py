@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import click
 
-from linkpose.errors import LinkposeError
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.tables import Score
 
@@ -90,13 +89,9 @@ def plot(path: Path, title: str, variants: Sequence[Variant], labels: Sequence[s
     """Draws each variant's position error, a dot a seed. Raises LinkposeError without matplotlib, or where the file
     cannot be written.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise LinkposeError(
-            "matplotlib, which draws the plot, is not installed; type `pip install linkpose[plot]`"
-        ) from error
-    figure = Figure(figsize=(9.0, 1.5 + 0.22 * len(variants)), layout="constrained")
+    from linkpose import plotting
+
+    figure = plotting.new_figure(9.0, 1.5 + 0.22 * len(variants))
     axes = figure.add_subplot()
     for row, variant in enumerate(variants):
         errors = [score.position_rmse_m for score in variant.scores]
@@ -109,9 +104,4 @@ def plot(path: Path, title: str, variants: Sequence[Variant], labels: Sequence[s
     axes.set_title(title)
     axes.grid(axis="x", alpha=0.3)
     axes.invert_yaxis()
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise LinkposeError(
-            f"cannot write the plot {path}: {error}; name a .png file in a folder you may write to"
-        ) from error
+    plotting.save(figure, path)

@@ -6,8 +6,6 @@ import contextlib
 import json
 import os
 import sys
-import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,7 @@ import click
 
 from linkpose.cli import options
 from linkpose.cli.board_settings import apply, board_settings
+from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint
 
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from linkpose.device.session import Placement
     from linkpose.estimation import EstimateWriter, Estimator
 
-COMPILER_PATIENCE_S = 0.7  # before the user is told what is going on
 WORST_STD_M = 0.03  # of a J2S that the motion has told
 
 
@@ -105,7 +103,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     for remark in recording.remarks:
         console.say(remark)
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
-    with _patience(console):
+    with while_compiling(console.say):
         measurements = recording.measurements
         estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
         _check(estimator, request, console)
@@ -154,7 +152,7 @@ def _live(
         apply(board, session)
         rig = options.resolve_rig(request.rig_file, request.joint, session.rig)
         session.wait_for_mice(len(rig.mouse))
-        with _patience(console):  # before the board is started: no sample waits for a compiler
+        with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
             settings, sensors = Settings.of(session.hello), Sensors(session.hello.sensors)
@@ -213,18 +211,6 @@ def _tell_j2s(estimator: Estimator, console: Console) -> None:
             f"the motion did not tell J2S along the sensor's {found.worst_axis} axis (to {found.worst_std_m:.2f} m "
             "only), so the heights are rough: swing the link longer, in all directions"
         )
-
-
-@contextlib.contextmanager
-def _patience(console: Console) -> Iterator[None]:
-    """Says that the filters are being compiled when that takes long enough to be wondered at: the first time."""
-    timer = threading.Timer(COMPILER_PATIENCE_S, console.say, ["compiling the filters, this once (some seconds) ..."])
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 class _Sink:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from linkpose import __version__
 from linkpose.cli import options
+from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
+    from linkpose.localization.kalman import FilterName
     from linkpose.localization.localizer import Settings, Track
     from linkpose.localization.tables import Score
 
@@ -193,7 +196,7 @@ def command(
     from linkpose.localization.carmen import is_carmen, read_carmen
     from linkpose.localization.events import read_events
     from linkpose.localization.grid import load_map
-    from linkpose.localization.localizer import localize, most_at_once
+    from linkpose.localization.localizer import localize, most_at_once, warm_up
     from linkpose.localization.tables import read_beacons, read_truth, score
 
     grid = load_map(map_path) if map_path else None
@@ -207,7 +210,10 @@ def command(
     chosen = _settings(settings, own_start)
     if chosen.ranges.correlation and most_at_once(events) == 1:
         click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
-    tracks = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in dict.fromkeys(filters)}  # type: ignore[arg-type]
+    names = cast("list[FilterName]", list(dict.fromkeys(filters)))
+    with while_compiling(functools.partial(click.echo, err=True)):
+        warm_up(names)
+    tracks: dict[str, Track] = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in names}
     if output is not None:
         write_tracks(output, tracks, log, force)
     for name, track in tracks.items():

@@ -95,6 +95,16 @@ def rig_and_j2s(function: Function) -> Function:
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
 
 
+def sensor_errors(function: Function) -> Function:
+    return click.option(
+        "--errors",
+        type=click.Choice(["calibrated", "datasheet", "none"]),
+        default="calibrated",
+        show_default=True,
+        help="What the sensors get wrong.",
+    )(function)
+
+
 def as_json(function: Function) -> Function:
     return click.option("--json", "json_lines", is_flag=True, help="One JSON object a line on stdout.")(function)
 

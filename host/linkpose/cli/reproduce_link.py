@@ -19,13 +19,7 @@ _SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
 
 @click.command("link")
 @click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="How many runs of each Test.")
-@click.option(
-    "--errors",
-    type=click.Choice(["calibrated", "datasheet", "none"]),
-    default="calibrated",
-    show_default=True,
-    help="What the sensors get wrong.",
-)
+@options.sensor_errors
 @click.option("--plot", "plot_path", type=options.FILE, metavar="FILE.png", help="Draw Figure 2.")
 @options.as_json
 def command(seeds: int, errors: str, plot_path: Path | None, json_lines: bool) -> None:

@@ -65,13 +65,9 @@ def _show(rows: list[Redundancy], seeds: int) -> None:
 
 
 def _plot(path: Path, run: PaperRun) -> None:
-    from linkpose.errors import LinkposeError
+    from linkpose import plotting
 
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise LinkposeError("plots need matplotlib; type `pip install linkpose[plot]`") from None
-    figure = Figure(figsize=(11, 7), layout="constrained")
+    figure = plotting.new_figure(11.0, 7.0)
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
     labels = ("v_x (cm/s)", "v_y (cm/s)", "ω (rad/s)")
     for j, (label, scale) in enumerate(zip(labels, (100.0, 100.0, 1.0), strict=True)):
@@ -86,7 +82,4 @@ def _plot(path: Path, run: PaperRun) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("time (s)")
         axis.set_xlim(0, PLOTTED_S)
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise LinkposeError(f"cannot write {path}: {error}; name a .png in a folder you may write to") from error
+    plotting.save(figure, path)

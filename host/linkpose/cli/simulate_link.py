@@ -17,13 +17,7 @@ from linkpose.sensors.rig import Vector
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Motion, errors and noise.")
 @click.option("--duration", type=float, default=65.0, show_default=True, metavar="S", help="Length in seconds.")
 @click.option("--rate", type=click.IntRange(50, 500), default=100, show_default=True, help="Samples a second.")
-@click.option(
-    "--errors",
-    type=click.Choice(["calibrated", "datasheet", "none"]),
-    default="calibrated",
-    show_default=True,
-    help="What the sensors get wrong.",
-)
+@options.sensor_errors
 @click.option(
     "--j2s",
     type=options.VectorType(),

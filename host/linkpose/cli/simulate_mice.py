@@ -27,13 +27,7 @@ from linkpose.cli import options
     help="Manoeuvres up to 1 m/s; the paper's steady (1, 1) cm/s; a straight line; a full turn on the spot.",
 )
 @click.option("--length", type=float, default=2.0, show_default=True, metavar="M", help="Of the path `line` (m).")
-@click.option(
-    "--errors",
-    type=click.Choice(["calibrated", "datasheet", "none"]),
-    default="calibrated",
-    show_default=True,
-    help="What the sensors get wrong.",
-)
+@options.sensor_errors
 @click.option(
     "--fault",
     "faults",

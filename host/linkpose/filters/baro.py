@@ -29,7 +29,7 @@ HEIGHT_SCALE_M = 44330.77
 HEIGHT_EXPONENT = 0.190263
 START_S = 1.0  # over which the start's pressure and tilt are averaged
 # What a pressure says besides height and noise: standard deviations.
-_SLOW_PA, _SLOW_S = 3.5, 12.0  # draughts, and what the sensor's compensation leaves of the temperature; how soon
+_SLOW_PA, _SLOW_S = 3.5, 5.0  # draughts, and what the compensation leaves of the temperature; half of it by when
 _WEATHER_PA_S = 0.01  # 1 hPa in three hours
 _SUCTION = 0.3  # of the dynamic pressure ½ρv²
 _AIR_KG_M3 = 1.2
@@ -40,16 +40,17 @@ class StartState(NamedTuple):
 
     time: Floats  # (1,) of the first sample (s), NaN before it
     force: Floats  # (3,) sum of the usable forces (m/s²)
-    unsteady: Floats  # (2,) sum of their squares (m²/s⁴), and how many
+    unsteady: Floats  # (3,) sum of their squares (m²/s⁴), how many, variance of the tilt by them (rad²)
     pressure: Floats  # (2,) sum of the usable pressures (Pa), and how many
-    height: Floats  # (1,) last height (m), NaN before the first pressure
-    air: Floats  # (1,) variance of the last pressure that height and noise do not explain (Pa²)
+    height: Floats  # (2,) last height and its standard deviation (m), NaN before the first pressure
     rejected: NDArray[np.int64]  # (1,) fresh pressures that could not be used
 
     @staticmethod
     def fresh() -> StartState:
-        unknown, zero = np.full(1, np.nan), np.zeros(1)
-        return StartState(unknown, np.zeros(3), np.zeros(2), np.zeros(2), unknown.copy(), zero, np.zeros(1, np.int64))
+        unsteady = np.array([0.0, 0.0, 1.0])  # without a force the tilt may be any
+        return StartState(
+            np.full(1, np.nan), np.zeros(3), unsteady, np.zeros(2), np.full(2, np.nan), np.zeros(1, np.int64)
+        )
 
 
 class BaroFilter:
@@ -83,6 +84,13 @@ class BaroFilter:
 
 
 @inlined
+def tilt_variance(force: Vec, squares: float, number: float) -> float:
+    """Variance (rad²) of a mean force's direction: what varied was not gravity, and half of it may not average out."""
+    varied = squares / number - vec.dot(force, force) / (number * number)
+    return float(0.25 * max(varied, 0.0) / GRAVITY**2)
+
+
+@inlined
 def listen(
     time_s: float, raw_accel: Vec, flags: int, pressure: float, fresh: bool, imu: ImuCalibration, state: StartState
 ) -> bool:
@@ -99,6 +107,7 @@ def listen(
                 state.force[j] += force[j]
             state.unsteady[0] += vec.dot(force, force)
             state.unsteady[1] += 1.0
+            state.unsteady[2] = tilt_variance(vec.load(state.force), state.unsteady[0], state.unsteady[1])
     elif state.pressure[1] > 0.0:
         return good
     if good:
@@ -116,28 +125,21 @@ def start_height(state: StartState, j2s: Vec) -> float:
 
 
 @inlined
-def start_variance(state: StartState, j2s: Vec) -> float:
-    """Variance (m²) of `start_height`: what a force varied by was not gravity, and half of it may not average out."""
-    number = state.unsteady[1]
-    if number == 0.0:
-        return 0.0
-    force = vec.load(state.force)
-    varied = state.unsteady[0] / number - vec.dot(force, force) / (number * number)
-    across = vec.dot(j2s, j2s) - start_height(state, j2s) ** 2
-    return float(0.25 * max(varied, 0.0) / GRAVITY**2 * max(across, 0.0))
+def start_variance(state: StartState, height: float, j2s: Vec) -> float:
+    """Variance (m²) of `start_height`, which is `height`."""
+    return float(state.unsteady[2] * max(vec.dot(j2s, j2s) - height * height, 0.0))
 
 
 @inlined
-def air_variance(time_s: float, raw_gyro: Vec, flags: int, imu: ImuCalibration, j2s: Vec, state: StartState) -> float:
-    """Variance (Pa²) of what else than height a fresh pressure may differ from the start's by."""
-    since_s = time_s - state.time[0]
+def air_variance(since_s: float, raw_gyro: Vec, flags: int, imu: ImuCalibration, j2s: Vec) -> float:
+    """Variance (Pa²) of what else than height a pressure differs by from the one `since_s` ago, at rest."""
     if not since_s > 0.0:
         return 0.0
     has_rate, rate = read_gyro(raw_gyro, flags, imu)
     velocity = vec.cross(rate, j2s)
     suction = _SUCTION * 0.5 * _AIR_KG_M3 * vec.dot(velocity, velocity) if has_rate else 0.0
     weather = _WEATHER_PA_S * since_s
-    slow = _SLOW_PA**2 * (1.0 - math.exp(-since_s / _SLOW_S))
+    slow = _SLOW_PA**2 * since_s / (since_s + _SLOW_S)
     return float(slow + weather * weather + suction * suction)
 
 
@@ -152,6 +154,18 @@ def barometric_height(pressure: float, state: StartState) -> float:
 def metres_per_pascal(state: StartState) -> float:
     """|dh/dp| at the start's mean pressure."""
     return float(HEIGHT_SCALE_M * HEIGHT_EXPONENT * state.pressure[1] / state.pressure[0])
+
+
+@inlined
+def measure(
+    pressure: float, time_s: float, raw_gyro: Vec, flags: int,
+    imu: ImuCalibration, j2s: Vec, noise_Pa: float, state: StartState,
+) -> tuple[float, float, float]:
+    """Height (m) by a fresh pressure, and its variance by the sensor's noise and by all else (m²)."""
+    began, scale = start_height(state, j2s), metres_per_pascal(state)
+    air = air_variance(time_s - state.time[0], raw_gyro, flags, imu, j2s)
+    other = scale * scale * air + start_variance(state, began, j2s)
+    return began + barometric_height(pressure, state), (noise_Pa * scale) ** 2, other
 
 
 @compiled
@@ -171,12 +185,8 @@ def _process(
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
         if listen(time_s[i], a, flags[i], pressure_Pa[i], fresh[i], imu, state):
-            state.height[0] = start_height(state, j2s) + barometric_height(pressure_Pa[i], state)
             w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-            state.air[0] = air_variance(time_s[i], w, flags[i], imu, j2s, state)
-        out[i, 0] = state.height[0]
-        if math.isnan(state.height[0]):
-            out[i, 1] = np.nan
-        else:
-            pressure = noise_Pa * noise_Pa * (1.0 + 1.0 / state.pressure[1]) + state.air[0]
-            out[i, 1] = math.sqrt(metres_per_pascal(state) ** 2 * pressure + start_variance(state, j2s))
+            height, noise, other = measure(pressure_Pa[i], time_s[i], w, flags[i], imu, j2s, noise_Pa, state)
+            state.height[0] = height
+            state.height[1] = math.sqrt(noise * (1.0 + 1.0 / state.pressure[1]) + other)
+        out[i, 0], out[i, 1] = state.height[0], state.height[1]

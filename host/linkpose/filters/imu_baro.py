@@ -27,9 +27,8 @@ from linkpose.filters._vector import Sym, Vec, compiled, inlined
 from linkpose.filters.baro import (
     START_S,
     StartState,
-    air_variance,
-    barometric_height,
     listen,
+    measure,
     metres_per_pascal,
     start_height,
     start_variance,
@@ -56,11 +55,12 @@ class VerticalState(NamedTuple):
     mean: Floats  # (3,) h (m), v (m/s), b (m/s²)
     covariance: Floats  # (6,) hh hv hb vv vb bb
     lasting: Floats  # (3,) mean innovation (m), over how long it has been taken (s), time of the last (s)
+    other: Floats  # (1,) variance of the last barometric height besides the noise's (m²)
     started: NDArray[np.bool_]  # (1,) whether the start has passed
 
     @staticmethod
     def fresh() -> VerticalState:
-        return VerticalState(np.zeros(3), np.zeros(6), np.zeros(3), np.zeros(1, np.bool_))
+        return VerticalState(np.zeros(3), np.zeros(6), np.zeros(3), np.zeros(1), np.zeros(1, np.bool_))
 
 
 class ImuBaroFilter:
@@ -147,20 +147,14 @@ def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym
 
 
 @inlined
-def hear(innovation: float, time_s: float, vertical: VerticalState) -> None:
-    """Takes the innovation (m) of a fresh pressure into the lasting one."""
-    step_s = time_s - vertical.lasting[2]
-    if step_s > 0.0:
-        span_s = min(vertical.lasting[1] + step_s, _LASTING_S)
-        vertical.lasting[0] += min(step_s / span_s, 1.0) * (innovation - vertical.lasting[0])
-        vertical.lasting[1], vertical.lasting[2] = span_s, time_s
-
-
-@inlined
-def height_std(covariance: Sym, start: StartState, vertical: VerticalState, j2s: Vec) -> float:
-    """Standard deviation of the height (m): of the model, of what innovations show beyond it, of air and start."""
-    air = metres_per_pascal(start) ** 2 * start.air[0]
-    return math.sqrt(covariance[0] + vertical.lasting[0] ** 2 + air + start_variance(start, j2s))
+def hear(lasting: Vec, innovation: float, time_s: float) -> Vec:
+    """The lasting innovation (m), over how long it has been taken and the time of the last (s), with one more."""
+    mean, span_s, last_s = lasting
+    step_s = time_s - last_s
+    if not step_s > 0.0:
+        return lasting
+    span_s = min(span_s + step_s, _LASTING_S)
+    return (mean + min(step_s / span_s, 1.0) * (innovation - mean), span_s, time_s)
 
 
 @compiled
@@ -183,6 +177,7 @@ def _process(
 ) -> None:
     now = recall(tilt_state)
     mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
+    lasting = vec.load(vertical.lasting)
     rejected = 0
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])
@@ -199,7 +194,8 @@ def _process(
             variance = (noise_Pa * metres_per_pascal(start)) ** 2
             mean = (start_height(start, j2s), 0.0, 0.0)
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
-            vertical.lasting[2] = time_s[i]
+            vertical.other[0] = start_variance(start, mean[0], j2s)
+            lasting = (0.0, 0.0, time_s[i])
             vertical.started[0] = time_s[i] - start.time[0] > START_S
         elif known:
             if now.time > before:
@@ -208,19 +204,19 @@ def _process(
                 seen = has_force and step_s <= LONGEST_STEP_S
                 mean, covariance = propagate(mean, covariance, lifted, seen, step_s, q)
             if measured:
-                start.air[0] = air_variance(time_s[i], w, flags[i], imu, j2s, start)
-                height = start_height(start, j2s) + barometric_height(pressure_Pa[i], start)
-                variance = (noise_Pa * metres_per_pascal(start)) ** 2
-                hear(height - mean[0], time_s[i], vertical)
-                mean, covariance = correct(mean, covariance, height, variance)
+                height, noise, vertical.other[0] = measure(
+                    pressure_Pa[i], time_s[i], w, flags[i], imu, j2s, noise_Pa, start
+                )
+                lasting = hear(lasting, height - mean[0], time_s[i])
+                mean, covariance = correct(mean, covariance, height, noise)
         out[i, 0] = mean[0] if known else np.nan
-        out[i, 1] = height_std(covariance, start, vertical, j2s) if known else np.nan
+        out[i, 1] = math.sqrt(covariance[0] + lasting[0] ** 2 + vertical.other[0]) if known else np.nan
         if math.isnan(now.time):
             out[i, 2] = out[i, 3] = np.nan
         else:
             _, _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
     keep(tilt_state, now, rejected)
     for j in range(3):
-        vertical.mean[j] = mean[j]
+        vertical.mean[j], vertical.lasting[j] = mean[j], lasting[j]
     for j in range(6):
         vertical.covariance[j] = covariance[j]

@@ -76,7 +76,7 @@ class JointFilter:
         self.state = TiltState.fresh()
         self._history = History.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.j2s_m
+        self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.j2s_std_m
 
     @property
     def rejected(self) -> int:
@@ -91,7 +91,7 @@ class JointFilter:
         out = np.empty((len(block), 4))
         _process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._j2s, self.state, self._history, out,
+            self._imu, self.parameters, self._j2s, self._j2s_std, self.state, self._history, out,
         )  # fmt: skip
         return out
 
@@ -162,6 +162,7 @@ def _process(
     imu: ImuCalibration,
     parameters: TiltParameters,
     d: Vec,
+    d_std: float,
     state: TiltState,
     history: History,
     out: Floats,
@@ -191,7 +192,7 @@ def _process(
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
             out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, d)
-            out[i, 1] = height_std(now, d)
+            out[i, 1] = height_std(now, d, d_std)
     keep(state, now, rejected)
     history.time[0], history.time[1] = t1, t2
     for j in range(3):

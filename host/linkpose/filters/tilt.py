@@ -17,9 +17,9 @@ the tilt. Along Z, where a tilt does not err, it is the accelerometer's own, whi
 With the lasting residual r, and m for what a calibration leaves of the accelerometer's error (both in g),
 
     σ² = ½ (‖r‖² + (r·Z)²) + m²                          beyond P, on each axis across Z
-    std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)²                  of the height Zᵀd
+    std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)² + σ_d²           of the height Zᵀd
 
-where the last term is what a link that leans loses in height, 1 − cos. No estimate is changed by it.
+where 2σ⁴ is of what a link that leans loses in height, 1 − cos, and σ_d of J2S. No estimate is changed by it.
 
 Sources: the link paper, equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and
 external acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas.
@@ -110,6 +110,7 @@ class TiltFilter:
         self.state = TiltState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
         self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
+        self._j2s_std = rig.joint.j2s_std_m
 
     @property
     def rejected(self) -> int:
@@ -124,7 +125,7 @@ class TiltFilter:
         out = np.empty((len(block), 4))
         _process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._j2s, self.state, out,
+            self._imu, self.parameters, self._j2s, self._j2s_std, self.state, out,
         )  # fmt: skip
         return out
 
@@ -217,13 +218,13 @@ def hear_accel(now: Now) -> Now:
 
 
 @inlined
-def height_std(now: Now, j2s: Vec) -> float:
-    """Standard deviation of the height (m): of the modelled noise, and what the lasting residual says beyond it."""
+def height_std(now: Now, j2s: Vec, j2s_std: float) -> float:
+    """Standard deviation of the height (m): of the modelled noise, of what lasts in the residual, and of J2S."""
     mean, z = now.lasting.mean, now.tilt
     along, height = vec.dot(mean, z), vec.dot(z, j2s)
     variance = 0.5 * (vec.dot(mean, mean) + along * along) + (_ACCEL_ERROR_M_S2 / GRAVITY) ** 2
     beyond = variance * (vec.dot(j2s, j2s) + (2.0 * variance - 1.0) * height * height)
-    return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0))
+    return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0) + j2s_std * j2s_std)
 
 
 @inlined
@@ -304,6 +305,7 @@ def _process(
     imu: ImuCalibration,
     parameters: TiltParameters,
     j2s: Vec,
+    j2s_std: float,
     state: TiltState,
     out: Floats,
 ) -> None:
@@ -321,5 +323,5 @@ def _process(
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
             out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
-            out[i, 1] = height_std(now, j2s)
+            out[i, 1] = height_std(now, j2s, j2s_std)
     keep(state, now, rejected)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,6 +110,13 @@ def localize(
     """
     _check(log, settings, grid, beacons or {}, origin)
     return _Run(log, name, settings, grid or no_map(), beacons or {}).track()
+
+
+def warm_up(names: Iterable[FilterName]) -> None:
+    """Compiles the filters, or loads them compiled."""
+    at_one_place: Log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(0.1, "pose", (0.0, 0.0, 0.0))]
+    for name in names:
+        localize(at_one_place, name, Settings())
 
 
 class _Run:

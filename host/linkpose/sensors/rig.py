@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,12 @@ class Rig:
                 lines += [f"{key} = {list(value) if isinstance(value, tuple) else value}" for key, value in row.items()]
                 lines.append("")
         return "\n".join(lines)
+
+
+def to_vector(values: Iterable[float], decimals: int = 8) -> Vector:
+    """Three numbers as a rig holds them."""
+    x, y, z = (round(float(value), decimals) for value in values)
+    return x, y, z
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: list[str], origin: str, where: str) -> None:
