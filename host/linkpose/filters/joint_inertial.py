@@ -665,7 +665,7 @@ def _advance(
     imu: ImuCalibration, belief: SensorErrors, q: JointInertialParameters, lever: Lever,
 ) -> tuple[Now, bool]:  # fmt: skip
     """One sample later. False where what it read was refused."""
-    before_a, before_w = now.force, now.rate
+    before_a, before_w, had_rate = now.force, now.rate, now.held == 0.0
     force = force if has_force else before_a
     rate = rate if has_rate else now.newest
     h, step = time_s - now.time, time_s - now.turned_at
@@ -679,7 +679,7 @@ def _advance(
         change, since = vec.minus(force, before_a), now.since
         jumped = jumped or vec.dot(change, change) > _JUMP_M_S2**2
         if jumped and since.span > 0.0:  # that this reading be judged alone
-            _close(state, since, True, False, before_w, before_w, imu, belief, q, lever)
+            _close(state, since, had_rate, False, before_w, before_w, imu, belief, q, lever)
             now = Now(
                 now.time, now.held, now.turned_at, now.doubt, before_a, before_w, now.newest, now.angle, now.change,
                 _AT_ONCE,
