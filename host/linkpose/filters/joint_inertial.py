@@ -96,7 +96,7 @@ _OCCAM = 8.0  # the wider belief can explain what is no error of a sensor: what 
 class JointInertialParameters(NamedTuple):
     """What the filter assumes."""
 
-    gyro_bias_walk_rad_s: float = 1e-4  # in a second
+    gyro_bias_walk_rad_s: float = 3e-4  # in a second: 1 °/s in the hour of warming up
     fade_s: float = 200.0  # after which e⁻¹ of what was believed of the sensors' errors is left
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
     least_misfit: float = 0.0013  # of the constraint, as a share of ‖ω×d‖
