@@ -216,6 +216,13 @@ def test_rotation_about_one_axis_names_the_axis_it_does_not_tell(axis, others):
         calibrate_joint([recording(block)], Rig())
 
 
+def test_samples_that_come_too_rarely_are_refused():
+    block = LinkRun(1, 0, 40.0).measurements()
+    with pytest.raises(LinkposeError, match=r"rec\.csv: nowhere is a second with 20 samples"):
+        calibrate_joint([recording(block[::10])], Rig())
+    assert calibrate_joint([recording(block[::5])], Rig()).std_m.max() < 0.005
+
+
 def test_rest_alone_is_refused():
     with pytest.raises(LinkposeError, match="swing the link"):
         calibrate_joint([turned_over(SIX_SIDES[:1])], Rig())

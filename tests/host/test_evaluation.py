@@ -81,6 +81,16 @@ def test_a_lag_of_the_filter_is_its_own_fault(tmp_path, reference):
     assert found["height_rmse_cm"] == pytest.approx(100 * np.std(height(T - 0.004) - height(T)), rel=0.01)
 
 
+def test_bad_first_rows_are_not_pushed_out_of_the_comparison(tmp_path, reference):
+    """A filter that starts 2 m too low is scored with those rows: no offset is found between identical clocks."""
+    late = height(T) + 0.01 * np.cos(2 * np.pi * T)
+    late[:2] -= 2.0
+    found = scores(write(tmp_path / "estimate.csv", {"time_s": T, "joint_height_m": late}), reference)["joint"]
+    assert found["time_offset_s"] == 0
+    assert found["rows"] == len(T)
+    assert found["height_rmse_cm"] == pytest.approx(100 * np.sqrt(np.mean((late - height(T)) ** 2)))
+
+
 def test_gaps_and_missing_values_are_left_out(tmp_path):
     h = height(T)
     h[1000:1100] = np.nan

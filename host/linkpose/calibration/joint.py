@@ -29,6 +29,7 @@ from linkpose.calibration.joint_constraint import (
     GYRO_BIAS,
     GYRO_MATRIX,
     J2S,
+    LONGEST_STEP_S,
     UNKNOWNS,
     Equations,
     Stretch,
@@ -114,7 +115,7 @@ def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibrati
     parts = [stretch for r in recordings for stretch in stretches(r.measurements, rig.imu)]
     if not any(True for part in parts for _ in pieces(part, _PIECE_S)):
         names = ", ".join(str(r.path) for r in recordings)
-        raise LinkposeError(f"{names} has no unbroken stretch of samples; record again")
+        raise LinkposeError(f"{names}: nowhere is a second with {1 / LONGEST_STEP_S:.0f} samples or more; record again")
     unknowns, covariance, residual = _fit(parts)
     samples = _samples_in_motion(parts, unknowns[GYRO_BIAS:ACCEL_BIAS])
     d, covariance = unknowns[J2S:GYRO_BIAS], covariance[J2S:GYRO_BIAS, J2S:GYRO_BIAS]

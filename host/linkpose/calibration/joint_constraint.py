@@ -35,7 +35,7 @@ J2S, GYRO_BIAS, ACCEL_BIAS, ACCEL_MATRIX, GYRO_MATRIX, UNKNOWNS = 0, 3, 6, 9, 18
 
 _WEIGHT_S = 0.3  # over which a weight w reaches; half of it weighs little
 _FEWEST_READINGS = 8  # within a weight
-_LONGEST_STEP_S = 0.05  # over lost samples that a trapezoid still bridges
+LONGEST_STEP_S = 0.051  # that a trapezoid bridges: of 20 samples a second, or over lost ones
 _SPIKE_RAD_S, _SPIKE_M_S2 = 1.0, 10.0  # away from the neighbours on both sides: no motion of a link
 _OF_GYRO = [*range(GYRO_BIAS, ACCEL_BIAS), *range(GYRO_MATRIX, UNKNOWNS)]
 _SATURATED = int(SampleFlags.ACCEL_SATURATED | SampleFlags.GYRO_SATURATED)
@@ -65,17 +65,19 @@ def stretches(block: Measurements, imu: Imu) -> list[Stretch]:
     usable[usable] = ~(_spikes(force[usable], _SPIKE_M_S2) | _spikes(rate[usable], _SPIKE_RAD_S))
     time_s, force, rate = block.time_s[usable], force[usable], rate[usable]
     steps = np.diff(time_s)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    breaks = np.flatnonzero((steps > max(_LONGEST_STEP_S, 1.5 * usual)) | (steps <= 0)) + 1
+    breaks = np.flatnonzero((steps > LONGEST_STEP_S) | (steps <= 0)) + 1
     return [Stretch(time_s[r], force[r], rate[r]) for r in np.split(np.arange(len(time_s)), breaks)]
 
 
 def pieces(stretch: Stretch, longest_s: float) -> Iterator[Stretch]:
-    """The stretch in pieces of equal length, none where it is too short for an equation."""
+    """The stretch in pieces of equal length, none where it is too short for equations.
+
+    A piece is longer than asked where samples are so rare that a weight takes up a good part of it.
+    """
     time_s = stretch.time_s
     if len(time_s) < 2 * _FEWEST_READINGS:
         return
-    count = max(1, int((time_s[-1] - time_s[0]) / longest_s))
+    count = max(1, int((time_s[-1] - time_s[0]) / max(longest_s, 4 * _weight_length(time_s))))
     edges = np.searchsorted(time_s, np.linspace(time_s[0], time_s[-1], count + 1))
     for first, last in itertools.pairwise(edges):
         rows = slice(int(first), int(last) + 1)

@@ -14,6 +14,7 @@ from linkpose.sensors.measurements import Floats
 _LONGEST_HOLE = 3.5
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
 _CLEARLY_BETTER = 0.7
+_FEWEST = 10  # instants that a fit is judged by
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -60,25 +61,46 @@ def find_offset(pairs: Sequence[tuple[Series, Series]]) -> tuple[float, float]:
     `pairs` are (estimate, reference) of one filter. 0 unless another offset fits clearly better. The residual is the
     RMS of the differences less their means, each over the reference's standard deviation; inf without an overlap.
     """
-    here = _residual(pairs, 0.0)
     step = max(interval(pairs[0][0].time_s), interval(pairs[0][1].time_s))
     if step == 0.0:
-        return 0.0, here
+        return 0.0, _residual(pairs, 0.0)
     coarse = _strongest_lag(pairs, step)
     offset = _refine(pairs, coarse - 2 * step, coarse + 2 * step)
-    there = _residual(pairs, offset)
-    if abs(offset) > 0.5 * step and there < _CLEARLY_BETTER * here:
-        return offset, there
-    return 0.0, here
+    if abs(offset) > 0.5 * step and _fits_clearly_better(pairs, offset):
+        return offset, _residual(pairs, offset)
+    return 0.0, _residual(pairs, 0.0)
 
 
-def _residual(pairs: Sequence[tuple[Series, Series]], offset_s: float) -> float:
+def _fits_clearly_better(pairs: Sequence[tuple[Series, Series]], offset_s: float) -> bool:
+    """Whether the offset fits better than none on the instants that have a reference either way.
+
+    On all instants an offset would look better for merely pushing a bad one, often the first, out of the reference.
+    """
+    both = _instants(pairs, (0.0, offset_s))
+    here, there = _residual(pairs, 0.0, both), _residual(pairs, offset_s, both)
+    if there < float("inf"):
+        return there < _CLEARLY_BETTER * here
+    return _residual(pairs, 0.0) == float("inf")
+
+
+def _instants(pairs: Sequence[tuple[Series, Series]], offsets_s: Sequence[float]) -> list[NDArray[np.bool_]]:
+    """Of each pair, which of the estimate's instants (N,) can be compared with each of these offsets."""
+    return [
+        np.logical_and.reduce([np.isfinite(difference(*pair, offset_s)) for offset_s in offsets_s]) for pair in pairs
+    ]
+
+
+def _residual(
+    pairs: Sequence[tuple[Series, Series]], offset_s: float, instants: Sequence[NDArray[np.bool_]] | None = None
+) -> float:
     squares: list[float] = []
-    for estimate, reference in pairs:
+    for i, (estimate, reference) in enumerate(pairs):
         error = difference(estimate, reference, offset_s)
+        if instants is not None:
+            error = error[instants[i]]
         error = error[np.isfinite(error)]
         spread = np.nanstd(reference.value)
-        if len(error) < 10 or not spread > 0:
+        if len(error) < _FEWEST or not spread > 0:
             continue
         squares.append(float(np.var(error) / spread**2))
     return float(np.sqrt(np.mean(squares))) if squares else float("inf")
@@ -110,16 +132,17 @@ def _standard(value: Floats) -> Floats:
 
 def _refine(pairs: Sequence[tuple[Series, Series]], low: float, high: float) -> float:
     """The offset with the least residual within the bracket, by golden section to 10 µs."""
+    instants = _instants(pairs, (low, high))
     a, b = low, high
     c, d = b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)
-    at_c, at_d = _residual(pairs, c), _residual(pairs, d)
+    at_c, at_d = _residual(pairs, c, instants), _residual(pairs, d, instants)
     while b - a > 1e-5:
         if at_c < at_d:
             b, d, at_d = d, c, at_c
             c = b - _GOLDEN * (b - a)
-            at_c = _residual(pairs, c)
+            at_c = _residual(pairs, c, instants)
         else:
             a, c, at_c = c, d, at_d
             d = a + _GOLDEN * (b - a)
-            at_d = _residual(pairs, d)
+            at_d = _residual(pairs, d, instants)
     return 0.5 * (a + b)
