@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from click.testing import CliRunner
 
 from linkpose.cli.evaluate import command
 from linkpose.errors import LinkposeError
+from linkpose.evaluation.motive import read_motive
 from linkpose.simulation.link import LinkRun
 
 T = np.arange(0, 30, 0.01)
@@ -221,11 +223,43 @@ def test_motive_export_as_reference(tmp_path):
     assert found["pitch_rmse_deg"] == pytest.approx(0.5, abs=0.01)
 
 
+def edited(path, change):
+    """The export again, its lines changed."""
+    lines = Path(path).read_text().splitlines()
+    Path(path).write_text("\n".join(change(lines)) + "\n")
+    return path
+
+
+def with_time_code(lines):
+    """As format 1.24 writes it: a column of time codes behind the seconds."""
+    cells = [line.split(",") for line in lines]
+    for i, row in enumerate(cells[2:], 2):
+        row.insert(2, "" if i < 5 else "TimeCode" if i == 5 else "15:26:46:12.02")
+    return [",".join(row) for row in cells]
+
+
+def with_an_old_header(lines):
+    return [line.replace("Time (Seconds)", "Time") for line in lines]
+
+
+@pytest.mark.parametrize("change", [with_time_code, with_an_old_header])
+def test_motive_exports_of_other_versions(tmp_path, change):
+    run = LinkRun(2, 1, 30.0)
+    t = np.arange(0, 30, 1 / 50)
+    path = motive(tmp_path / "take.csv", run, t)
+    usual = read_motive(Path(path)).columns
+    other = read_motive(Path(edited(path, change))).columns
+    for name, column in usual.items():
+        assert np.array_equal(other[name], column, equal_nan=True)
+
+
 def test_motive_exports_that_do_not_do(tmp_path):
     run, path = LinkRun(2, 1, 30.0), estimate(tmp_path)
     t = np.arange(0, 20, 0.05)
     with pytest.raises(LinkposeError, match="2 markers"):
         scores(path, motive(tmp_path / "two.csv", run, t, markers=2))
+    with pytest.raises(LinkposeError, match="has a header but no frame"):
+        scores(path, edited(motive(tmp_path / "none.csv", run, t), lambda lines: lines[:6]))
     with pytest.raises(LinkposeError, match="furlongs"):
         scores(path, motive(tmp_path / "unit.csv", run, t, unit="Furlongs"))
     with pytest.raises(LinkposeError, match="tells no joint"):

@@ -180,6 +180,14 @@ BAD_FILES = {
     "only a head": (lambda lines: lines[:3], "has a header but no row"),
     "cut in its head": (lambda lines: [*lines[:2], "time_s,se"], "ends before its first row"),
     "metadata that is no JSON": (lambda lines: [lines[0], "# {oops\n", *lines[2:]], "line 2: the metadata is not JSON"),
+    "settings that are none": (
+        lambda lines: [lines[0], '# {"settings": 5}\n', *lines[2:]],
+        "line 2: settings is 5; it must be a JSON object, or be left out",
+    ),
+    "a rig that is none": (
+        lambda lines: [lines[0], '# {"rig": null}\n', *lines[2:]],
+        "line 2: rig is null; it must be a JSON object, or be left out",
+    ),
     "an unknown column": (
         lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_x_rad"),
         "unknown column gyro_x_rad; did you mean gyro_x_rad_s?",

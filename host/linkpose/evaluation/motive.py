@@ -34,20 +34,20 @@ def read_motive(path: Path, up: str = "y") -> Table:
     Raises LinkposeError naming the file and what is missing in it.
     """
     rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
-    header = next((i for i, row in enumerate(rows) if row[:2] == ["Frame", "Time (Seconds)"]), None)
+    header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
     if header is None:
         raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
-    scale = _unit(path, rows[0])
-    places = _marker_columns(rows[:header], rows[header])
-    if len(places) < 3:
-        raise LinkposeError(f"{path} has {len(places)} markers with X, Y, Z; three are needed: export Markers as well")
-    body = [row for row in rows[header + 1 :] if row]
-    width = max(column + 3 for column in places[:3])
-    time_s = np.array([_number(path, row, 1, header + 2 + i) for i, row in enumerate(body)])
-    check_times(path, time_s, header + 2)
-    values = [[_number(path, row, j, header + 2 + i) for j in range(2, width)] for i, row in enumerate(body)]
-    table = scale * np.array(values)
-    markers = np.stack([table[:, column - 2 : column + 1] for column in places[:3]], axis=1)
+    body, first_line = [row for row in rows[header + 1 :] if row], header + 2
+    if not body:
+        raise LinkposeError(f"{path} has a header but no frame: export the take with its frames")
+    starts = _marker_columns(rows[:header], rows[header])
+    if len(starts) < 3:
+        raise LinkposeError(f"{path} has {len(starts)} markers with X, Y, Z; three are needed: export Markers as well")
+    used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
+    table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
+    time_s = table[:, 0]
+    check_times(path, time_s, first_line)
+    markers = _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3)
     tilt = _tilt(markers, np.eye(3)["xyz".index(up)])
     height = (markers[:, 0] - _centre(path, markers[:, 0]))[:, "xyz".index(up)]
     columns = {
@@ -57,7 +57,7 @@ def read_motive(path: Path, up: str = "y") -> Table:
         "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
     }
     columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, header + 2)
+    return Table(path, "motive", columns, {}, None, first_line)
 
 
 def _unit(path: Path, head: list[str]) -> float:
@@ -67,6 +67,12 @@ def _unit(path: Path, head: list[str]) -> float:
     if name not in _METRES:
         raise LinkposeError(f"{path}, line 1: unknown length unit {name!r}; export in {', '.join(_METRES)}")
     return _METRES[name]
+
+
+def _time_column(header: list[str]) -> int:
+    """Where the header has the time in seconds; 0, which is the frame's, where it has none. A time code is another."""
+    names = [name.strip().lower() for name in header]
+    return next((i for i, name in enumerate(names) if name in ("time (seconds)", "time")), 0)
 
 
 def _marker_columns(above: list[list[str]], header: list[str]) -> list[int]:

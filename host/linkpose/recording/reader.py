@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def _from_csv(path: Path) -> Recording:
         _flags(table),
     )
     remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
-    rig = Rig.from_dict(table.metadata["rig"], f"{path}, line 2") if "rig" in table.metadata else None
+    rig = Rig.from_dict(_metadata_object(table, "rig"), f"{path}, line 2") if "rig" in table.metadata else None
     return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
 
 
@@ -126,9 +127,19 @@ def _flags(table: Table) -> NDArray[np.uint16]:
     return flags.astype(np.uint16)
 
 
+def _metadata_object(table: Table, name: str) -> dict[str, Any]:
+    """This part of the metadata, empty where there is none; raises LinkposeError where it is no object."""
+    part = table.metadata.get(name, {})
+    if not isinstance(part, dict):
+        raise LinkposeError(
+            f"{table.path}, line 2: {name} is {json.dumps(part)[:40]}; it must be a JSON object, or be left out"
+        )
+    return part
+
+
 def _rate(table: Table) -> float:
     """The sample rate that the metadata tells, or else the usual interval's."""
-    rate = table.metadata.get("settings", {}).get("sample_rate_hz")
+    rate = _metadata_object(table, "settings").get("sample_rate_hz")
     if isinstance(rate, int | float) and rate > 0:
         return float(rate)
     intervals = np.diff(table.columns["time_s"])
