@@ -31,7 +31,12 @@ def write(path, columns, kind=None):
 
 def scores(*paths):
     result = CliRunner().invoke(command, [*paths, "--json"], catch_exceptions=False)
-    return {row["filter"]: row for row in map(json.loads, result.output.splitlines())}
+    return {row["filter"]: row for row in map(json.loads, result.stdout.splitlines())}
+
+
+def complaints(*paths):
+    """What is said on stderr."""
+    return CliRunner().invoke(command, [*paths, "--json"], catch_exceptions=False).stderr
 
 
 @pytest.fixture
@@ -242,7 +247,15 @@ def with_an_old_header(lines):
     return [line.replace("Time (Seconds)", "Time") for line in lines]
 
 
-@pytest.mark.parametrize("change", [with_time_code, with_an_old_header])
+def with_an_unlabeled_marker_first(lines):
+    cells = [line.split(",") for line in lines]
+    for i, row in enumerate(cells[2:], 2):
+        cell = ["Marker", "Unlabeled 2034", "Position", *"XYZ"] if i < 6 else ["1.0", "0.3", "-2.0"]
+        row[2:2] = cell[3:] if i == 5 else [cell[i - 2]] * 3 if i < 5 else cell
+    return [",".join(row) for row in cells]
+
+
+@pytest.mark.parametrize("change", [with_time_code, with_an_old_header, with_an_unlabeled_marker_first])
 def test_motive_exports_of_other_versions(tmp_path, change):
     run = LinkRun(2, 1, 30.0)
     t = np.arange(0, 30, 1 / 50)
@@ -253,10 +266,17 @@ def test_motive_exports_of_other_versions(tmp_path, change):
         assert np.array_equal(other[name], column, equal_nan=True)
 
 
+def test_an_unlabeled_marker_is_left_out_and_said(tmp_path):
+    path = motive(tmp_path / "take.csv", LinkRun(2, 1, 30.0), np.arange(0, 30, 1 / 50))
+    assert "1 unlabeled markers are left out" in complaints(
+        estimate(tmp_path), edited(path, with_an_unlabeled_marker_first)
+    )
+
+
 def test_motive_exports_that_do_not_do(tmp_path):
     run, path = LinkRun(2, 1, 30.0), estimate(tmp_path)
     t = np.arange(0, 20, 0.05)
-    with pytest.raises(LinkposeError, match="2 markers"):
+    with pytest.raises(LinkposeError, match="2 labeled markers"):
         scores(path, motive(tmp_path / "two.csv", run, t, markers=2))
     with pytest.raises(LinkposeError, match="has a header but no frame"):
         scores(path, edited(motive(tmp_path / "none.csv", run, t), lambda lines: lines[:6]))

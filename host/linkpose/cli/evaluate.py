@@ -43,6 +43,8 @@ def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
     from linkpose.recording.table import read_table
 
     truth = read_motive(reference, up) if is_motive(reference) else read_table(reference)
+    for remark in truth.remarks:
+        click.echo(remark, err=True)
     scores = evaluate(read_table(estimate), truth)
     if json_lines:
         for score in scores:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,21 +34,8 @@ def read_motive(path: Path, up: str = "y") -> Table:
     `up` is the axis of the room that points upwards: "y" unless Motive was told to export with Z up.
     Raises LinkposeError naming the file and what is missing in it.
     """
-    rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
-    header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
-    if header is None:
-        raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
-    body, first_line = [row for row in rows[header + 1 :] if row], header + 2
-    if not body:
-        raise LinkposeError(f"{path} has a header but no frame: export the take with its frames")
-    starts = _marker_columns(rows[:header], rows[header])
-    if len(starts) < 3:
-        raise LinkposeError(f"{path} has {len(starts)} markers with X, Y, Z; three are needed: export Markers as well")
-    used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
-    table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
-    time_s = table[:, 0]
-    check_times(path, time_s, first_line)
-    markers = _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3)
+    take = _read_take(path)
+    time_s, markers = take.time_s, take.markers
     tilt = _tilt(markers, np.eye(3)["xyz".index(up)])
     height = (markers[:, 0] - _centre(path, markers[:, 0]))[:, "xyz".index(up)]
     columns = {
@@ -57,7 +45,36 @@ def read_motive(path: Path, up: str = "y") -> Table:
         "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
     }
     columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, first_line)
+    return Table(path, "motive", columns, {}, None, take.first_line, tuple(take.remarks))
+
+
+@dataclass(frozen=True, slots=True)
+class _Take:
+    """The three markers of the plate over time."""
+
+    time_s: Floats  # (N,)
+    markers: Floats  # (N, 3 markers, 3) in metres, NaN where a marker is hidden
+    first_line: int
+    remarks: list[str]
+
+
+def _read_take(path: Path) -> _Take:
+    rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
+    header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
+    if header is None:
+        raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
+    body, first_line = [row for row in rows[header + 1 :] if row], header + 2
+    if not body:
+        raise LinkposeError(f"{path} has a header but no frame: export the take with its frames")
+    starts, unlabeled = _marker_columns(rows[:header], rows[header])
+    if len(starts) < 3:
+        cure = "label the plate's three in Motive" if unlabeled else "export Markers as well"
+        raise LinkposeError(f"{path} has {len(starts)} labeled markers with X, Y, Z; three are needed: {cure}")
+    remarks = [f"{path}: {unlabeled} unlabeled markers are left out"] if unlabeled else []
+    used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
+    table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
+    check_times(path, table[:, 0], first_line)
+    return _Take(table[:, 0], _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3), first_line, remarks)
 
 
 def _unit(path: Path, head: list[str]) -> float:
@@ -75,15 +92,22 @@ def _time_column(header: list[str]) -> int:
     return next((i for i, name in enumerate(names) if name in ("time (seconds)", "time")), 0)
 
 
-def _marker_columns(above: list[list[str]], header: list[str]) -> list[int]:
-    """First column of each marker's position. Rigid bodies, which also have one, are not markers."""
+def _marker_columns(above: list[list[str]], header: list[str]) -> tuple[list[int], int]:
+    """First column of each labeled marker's position, and the number of unlabeled ones.
+
+    Rigid bodies, which also have a position, are not markers. An unlabeled marker may be anything that reflects.
+    """
     kinds = next((row for row in above if row[1:2] == ["Type"]), [])
-    found = []
+    names = next((row for row in above if row[1:2] == ["Name"]), [])
+    found, unlabeled = [], 0
     for i in range(2, len(header) - 2):
         is_marker = "marker" in (kinds[i].lower() if i < len(kinds) else "marker")
         if is_marker and [name.strip().upper() for name in header[i : i + 3]] == ["X", "Y", "Z"]:
-            found.append(i)
-    return found
+            if i < len(names) and "unlabeled" in names[i].lower():
+                unlabeled += 1
+            else:
+                found.append(i)
+    return found, unlabeled
 
 
 def _number(path: Path, row: list[str], column: int, line: int) -> float:

@@ -23,6 +23,7 @@ class Table:
     metadata: dict[str, Any]
     closing: dict[str, Any] | None  # None: the file was cut, or never closed
     first_line: int  # line number of the first row
+    remarks: tuple[str, ...] = ()  # what the reader should know
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
