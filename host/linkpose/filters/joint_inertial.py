@@ -39,30 +39,47 @@ from numpy.typing import NDArray
 
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
-    GRAVITY,
     Floats,
     ImuCalibration,
     read_accel,
     read_gyro,
     rotation_variance,
 )
-from linkpose.filters._inertial import add_noise, predict_mean, rotation_rows, spread, take
+from linkpose.filters._inertial import (
+    AT_ONCE,
+    BA,
+    BG,
+    MA,
+    MG,
+    OTHERS,
+    PACE_S,
+    SIZE,
+    ZERO,
+    D,
+    SensorErrors,
+    Since,
+    V,
+    Z,
+    add_noise,
+    catch_up,
+    corrected,
+    error,
+    fade,
+    others,
+    predict,
+    prior,
+    put_errors,
+    set_upright,
+    take,
+    take_three,
+)
 from linkpose.filters._vector import Vec, compiled, inlined
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-_N = 33
-_Z, _V, _BG, _BA, _D, _MA, _MG = 0, 3, 6, 9, 12, 15, 24  # where each begins in the state
-_ZERO = (0.0, 0.0, 0.0)
-_OTHERS = ((1, 2), (2, 0), (0, 1))  # components that a cross product's takes
-_PACE_S = 0.035  # between two corrections, at least
 _CLEAR = 30.0  # ‖ω‖² over its noise's, from which on it tells d; noise that is read as a rotation would, too
 _GATE = 25.0  # χ² with 3 degrees of freedom: one sound sample in 65 000
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of a link, but a spike
-_SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
-_NONE_RAD2 = 1e-6  # and has no more than this along it
-_GAP_ACCEL_M_S2 = 200.0  # where the accelerometer did not see, or beyond its range: a blow
-_BEND = 1.0 / 12.0  # of the second difference
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0  # angular acceleration that the first sample may hold, and to a rate of 1 rad/s
 _LONGEST_BLIND_S = 0.3  # without a rate, a moving link has turned by more than its tilt can be guessed to
 LONGEST_HOLD_S = 0.1  # readings that stay the same, all axes to the last bit, for less are an old one read again
@@ -73,17 +90,6 @@ _TURN_SIGMAS = 3.0  # beyond which a rate is a turn, and no bias
 _FADING_PACE_S = 0.5
 _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, where there is that much: the tilt is wrong
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
-
-
-class SensorErrors(NamedTuple):
-    """How far off the sensors may be: standard deviations of one axis."""
-
-    gyro_bias_rad_s: float
-    gyro_scale: float
-    gyro_cross: float
-    accel_bias_m_s2: float
-    accel_scale: float
-    accel_cross: float
 
 
 CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005)
@@ -110,19 +116,6 @@ class Lever(NamedTuple):
 
     j2s: Vec  # m
     variance: float  # each axis (m²)
-
-
-class Since(NamedTuple):
-    """What has come since the covariance was brought up to the mean."""
-
-    span: float  # s
-    turned: Vec  # angle (rad)
-    impulse: Vec  # ∫ force (m/s)
-    rotation: float  # variance of the angle, each axis (rad²)
-    velocity: float  # variance of the velocity gained, each axis (m²/s²)
-
-
-_AT_ONCE = Since(0.0, _ZERO, _ZERO, 0.0, 0.0)
 
 
 class Now(NamedTuple):
@@ -157,13 +150,13 @@ class State(NamedTuple):
     def fresh() -> State:
         return State(
             np.concatenate([[np.nan], np.zeros(27)]),
-            np.zeros(_N),
-            np.zeros((_N, _N)),
+            np.zeros(SIZE),
+            np.zeros((SIZE, SIZE)),
             np.zeros(2),
             np.zeros(7),
             np.zeros(2),
-            np.zeros((12, _N)),
-            np.zeros((3, _N)),
+            np.zeros((12, SIZE)),
+            np.zeros((3, SIZE)),
             np.zeros(2, np.int64),
         )
 
@@ -208,17 +201,17 @@ class JointInertialFilter:
         """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m². Before the first sample, the rig's."""
         if math.isnan(self.state.now[0]):
             return np.array(self._lever.j2s), self._lever.variance * np.eye(3)
-        return self.state.mean[_D:_MA].copy(), self.state.covariance[_D:_MA, _D:_MA].copy()
+        return self.state.mean[D:].copy(), self.state.covariance[D:, D:].copy()
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
         """(3,) as estimated so far, over the rig's calibration."""
-        return self.state.mean[_BG:_BA].copy()
+        return self.state.mean[BG:BA].copy()
 
     @property
     def accel_bias_m_s2(self) -> Floats:
         """(3,) as estimated so far, over the rig's calibration."""
-        return self.state.mean[_BA:_D].copy()
+        return self.state.mean[BA:MA].copy()
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
@@ -256,57 +249,17 @@ def _mix(first: Floats, second: Floats, out: Floats) -> None:
 
 
 @inlined
-def _corrected(x: Floats, first: int, reading: Vec) -> Vec:
-    """The reading less its share by the matrix in the state from `first` on."""
-    m = (vec.at(x, first), vec.at(x, first + 3), vec.at(x, first + 6))
-    return (
-        reading[0] - vec.dot(m[0], reading),
-        reading[1] - vec.dot(m[1], reading),
-        reading[2] - vec.dot(m[2], reading),
-    )
-
-
-@inlined
-def _error(p: Floats, bias: int, matrix: int, reading: Vec, j: int) -> Vec:
-    """Column j's error of ω or f: that of the bias and of the matrix's share of a reading, both taken off."""
-    return (
-        -p[bias, j] - p[matrix, j] * reading[0] - p[matrix + 1, j] * reading[1] - p[matrix + 2, j] * reading[2],
-        -p[bias + 1, j] - p[matrix + 3, j] * reading[0] - p[matrix + 4, j] * reading[1] - p[matrix + 5, j] * reading[2],
-        -p[bias + 2, j] - p[matrix + 6, j] * reading[0] - p[matrix + 7, j] * reading[1] - p[matrix + 8, j] * reading[2],
-    )
-
-
-@inlined
-def _others(a: Vec, c: int) -> tuple[float, float]:
-    """The components of a vector that a cross product's component c takes."""
-    return (a[1], a[2]) if c == 0 else (a[2], a[0]) if c == 1 else (a[0], a[1])
-
-
-@compiled
-def _along(variance: float) -> float:
-    """Variance of Z along itself when it is turned by angles of this variance: cosines fall short of 1."""
-    return 0.5 * min(max(variance - _SMALL_RAD2, 0.0), 1.0) ** 2
-
-
-@compiled
-def _prior(belief: SensorErrors, i: int) -> float:
-    """Variance of state i, one of the sensors' errors, before anything was measured."""
-    if i < _BA:
-        return belief.gyro_bias_rad_s**2
-    if i < _D:
-        return belief.accel_bias_m_s2**2
-    if i < _MG:
-        return (belief.accel_scale if (i - _MA) % 4 == 0 else belief.accel_cross) ** 2
-    return (belief.gyro_scale if (i - _MG) % 4 == 0 else belief.gyro_cross) ** 2
+def _trace(p: Floats, k: int) -> float:
+    """The sum of the variances of three states from k on."""
+    return float(p[k, k] + p[k + 1, k + 1] + p[k + 2, k + 2])
 
 
 @compiled
 def _distance(x: Floats, belief: SensorErrors) -> float:
     """Half the χ² of the errors that were found, by what is believed of the sensors; the gyro's bias may be any."""
     square = 0.0
-    for i in range(_BA, _N):
-        if not _D <= i < _MA:
-            square += x[i] * x[i] / _prior(belief, i)
+    for i in range(BA, D):
+        square += x[i] * x[i] / prior(belief, i)
     return 0.5 * square
 
 
@@ -323,101 +276,21 @@ def _begin(
     """Mean and covariance from one sample and the priors."""
     state.mean[:] = 0.0
     state.covariance[:] = 0.0
-    for i in range(_BG, _N):
-        state.covariance[i, i] = lever.variance if _D <= i < _MA else _prior(belief, i)
-    vec.put(state.mean, _D, lever.j2s)
-    _set_upright(state, force, rate, imu)
+    for i in range(BG, SIZE):
+        state.covariance[i, i] = lever.variance if i >= D else prior(belief, i)
+    vec.put(state.mean, D, lever.j2s)
+    _set_upright(state.mean, state.covariance, force, rate, imu)
     state.misfit[0], state.misfit[1] = 0.5 * q.first_misfit**2, 0.5
 
 
 @compiled
-def _set_upright(state: State, force: Vec, rate: Vec, imu: ImuCalibration) -> None:
+def _set_upright(x: Floats, p: Floats, force: Vec, rate: Vec, imu: ImuCalibration) -> None:
     """Tilt from the force, velocity from the constraint, as if nothing had been known of them."""
-    x, p = state.mean, state.covariance
-    reading = force
-    force = vec.minus(_corrected(x, _MA, force), vec.at(x, _BA))
-    w, d = _corrected(x, _MG, vec.minus(rate, vec.at(x, _BG))), vec.at(x, _D)
-    tilt = vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0)
-    vec.put(x, _Z, tilt)
-    vec.put(x, _V, vec.cross(w, d))
-    tangent = vec.cross_square(tilt, -1.0 / GRAVITY)
-    for i in range(6):
-        p[i, :] = 0.0
-        p[:, i] = 0.0
-    # An error of the accelerometer leans the tilt that is read off it: δZ = −(I − ZZᵀ) δf / g
-    for j in range(_BG, _N):
-        z = vec.apply(tangent, _error(p, _BA, _MA, reading, j))
-        z = (-z[0], -z[1], -z[2])
-        for i in range(3):
-            p[i, j] = p[j, i] = z[i]
-    for j in range(3):
-        z = vec.apply(tangent, _error(p, _BA, _MA, reading, j))
-        for i in range(3):
-            p[i, j] = -z[i]
+    w, d = corrected(x, MG, vec.minus(rate, vec.at(x, BG))), vec.at(x, D)
     # The acceleration that there may be: of a link that starts to turn, that swings, that whirls.
-    reach = vec.dot(d, d) + p[_D, _D] + p[_D + 1, _D + 1] + p[_D + 2, _D + 2]
-    speed = vec.dot(w, w) + p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2]
-    accel = reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
-    variance = min((imu.accel_variance + accel) / GRAVITY**2, 1.0)
-    s, k = vec.add(vec.cross_square(tilt, variance), _along(variance), vec.outer(tilt)), 0
-    for i in range(3):
-        p[_V + i, _V + i] = speed * reach + 1e-4
-        for j in range(i, 3):
-            p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i]) + s[k]
-            k += 1
-
-
-@inlined
-def _put_errors(p: Floats, bias: int, matrix: int, reading: Vec, out: Floats, k: int) -> None:
-    """`_error` of all columns into three rows of `out` from k on. One row after the other, for the vector unit."""
-    for c in range(3):
-        for j in range(_N):
-            by_matrix = p[matrix + 3 * c, j] * reading[0] + p[matrix + 3 * c + 1, j] * reading[1]
-            out[k + c, j] = -p[bias + c, j] - by_matrix - p[matrix + 3 * c + 2, j] * reading[2]
-
-
-@compiled
-def _predict_covariance(
-    p: Floats, work: Floats, turn: Vec, tilt: Vec, velocity: Vec, rate: Vec, force: Vec, h: float
-) -> None:
-    """F P Fᵀ over a step of mean rate and force; only the rows and columns of tilt and velocity change."""
-    rows, g = rotation_rows(turn), GRAVITY * h
-    _put_errors(p, _BG, _MG, rate, work, 6)
-    _put_errors(p, _BA, _MA, force, work, 9)
-    for c in range(3):
-        r, (a, b), (at, bt), (av, bv) = rows[c], _OTHERS[c], _others(tilt, c), _others(velocity, c)
-        for j in range(_N):
-            turned = r[0] * p[0, j] + r[1] * p[1, j] + r[2] * p[2, j]
-            work[c, j] = turned + h * (at * work[6 + b, j] - bt * work[6 + a, j])
-            work[3 + c, j] = -g * turned + h * (av * work[6 + b, j] - bv * work[6 + a, j] + work[9 + c, j])
-        for j in range(_N):
-            work[3 + c, j] += r[0] * p[3, j] + r[1] * p[4, j] + r[2] * p[5, j]
-    turned_ = work.T
-    for i in range(6):
-        z, v = spread(
-            (work[i, 0], work[i, 1], work[i, 2]), (work[i, 3], work[i, 4], work[i, 5]),
-            _error(turned_, _BG, _MG, rate, i), _error(turned_, _BA, _MA, force, i), rows, tilt, velocity, h,
-        )  # fmt: skip
-        p[i, 0], p[i, 1], p[i, 2] = z
-        p[i, 3], p[i, 4], p[i, 5] = v
-        for j in range(6, _N):
-            p[i, j] = work[i, j]
-        for j in range(6, _N):
-            p[j, i] = work[i, j]
-
-
-@compiled
-def _fade(x: Floats, p: Floats, passed_s: float, belief: SensorErrors, q: JointInertialParameters) -> None:
-    """First-order Gauss-Markov: what was found of the sensors' errors, but for the gyro's bias, returns to nothing."""
-    kept = math.exp(-passed_s / q.fade_s)
-    for i in range(_BA, _N):
-        if not _D <= i < _MA:
-            x[i] *= kept
-            for j in range(_N):
-                p[i, j] *= kept
-            for j in range(_N):
-                p[j, i] *= kept
-            p[i, i] += (1.0 - kept * kept) * _prior(belief, i)
+    reach, speed = vec.dot(d, d) + _trace(p, D), vec.dot(w, w) + _trace(p, BG)
+    accel = imu.accel_variance + reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
+    set_upright(x, p, force, accel, vec.cross(w, d), speed * reach + 1e-4)
 
 
 @compiled
@@ -430,21 +303,21 @@ def _correct(
     follows as P − KHP − PHᵀKᵀ + KSKᵀ.
     """
     x, p, work, cross, misfit = state.mean, state.covariance, state.work, state.cross, state.misfit
-    d, velocity = vec.at(x, _D), vec.at(x, _V)
-    reading = vec.minus(rate, vec.at(x, _BG))
-    w = _corrected(x, _MG, reading)
+    d, velocity = vec.at(x, D), vec.at(x, V)
+    reading = vec.minus(rate, vec.at(x, BG))
+    w = corrected(x, MG, reading)
     y = vec.minus(vec.cross(w, d), velocity)
-    _put_errors(p, _BG, _MG, reading, work, 6)
+    put_errors(p, BG, MG, reading, work, 6)
     for c in range(3):
-        (a, b), (ad, bd), (aw, bw) = _OTHERS[c], _others(d, c), _others(w, c)
-        for j in range(_N):
-            by_lever = aw * p[_D + b, j] - bw * p[_D + a, j]
-            cross[c, j] = p[_V + c, j] + ad * work[6 + b, j] - bd * work[6 + a, j] - by_lever
+        (a, b), (ad, bd), (aw, bw) = OTHERS[c], others(d, c), others(w, c)
+        for j in range(SIZE):
+            by_lever = aw * p[D + b, j] - bw * p[D + a, j]
+            cross[c, j] = p[V + c, j] + ad * work[6 + b, j] - bd * work[6 + a, j] - by_lever
     s = _innovation_covariance(cross, d, w, reading)
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
-    product = 0.5 * (p[6, 6] + p[7, 7] + p[8, 8]) * (p[12, 12] + p[13, 13] + p[14, 14])
+    product = 0.5 * _trace(p, BG) * _trace(p, D)
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
-    moved = vec.minus(before, vec.at(x, _BG)) if jumped else w  # a spike must not excuse itself
+    moved = vec.minus(before, vec.at(x, BG)) if jumped else w  # a spike must not excuse itself
     reach = vec.dot(moved, moved) * vec.dot(d, d)
     share = min(max(misfit[0] / misfit[1], q.least_misfit**2), 1.0)
     keep = min(h / q.misfit_time_s, 1.0)
@@ -459,49 +332,17 @@ def _correct(
             return False
         inverse = vec.scaled(_GATE / distance, inverse)  # it is the state that is doubted, but with care
     told = min(max(vec.dot(w, w) / (_CLEAR * 3.0 * imu.gyro_variance) - 1.0, 0.0), 1.0)
-    _take_constraint(x, p, cross, y, inverse, told)
+    if told == 1.0:
+        take_three(x, p, cross, y, inverse)
+    else:
+        before = vec.at(x, D)
+        take_three(x, p, cross, y, inverse)
+        vec.put(x, D, vec.plus(vec.plus(ZERO, 1.0 - told, before), told, vec.at(x, D)))
+        for i in range(D, SIZE):
+            for j in range(D, SIZE):
+                own = cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j]
+                p[i, j] += (1.0 - told) * (1.0 - told) * own
     return True
-
-
-@compiled
-def _take_constraint(x: Floats, p: Floats, cross: Floats, y: Vec, inverse: vec.Sym, told: float) -> None:
-    """The Kalman correction by an innovation y, with H P, the inverse of S, and the share of it that d takes."""
-    # With S⁻¹ = L Lᵀ and C = Lᵀ H P, K y = Cᵀ Lᵀ y and K S Kᵀ = Cᵀ C, which is symmetric to the last bit.
-    l00, l10, l20, l11, l21, l22 = vec.cholesky(inverse)
-    z = (l00 * y[0] + l10 * y[1] + l20 * y[2], l11 * y[1] + l21 * y[2], l22 * y[2])
-    for j in range(_N):
-        cross[0, j] = l00 * cross[0, j] + l10 * cross[1, j] + l20 * cross[2, j]
-        cross[1, j] = l11 * cross[1, j] + l21 * cross[2, j]
-        cross[2, j] = l22 * cross[2, j]
-    for j in range(_N):
-        share = told if _D <= j < _MA else 1.0
-        x[j] += share * (z[0] * cross[0, j] + z[1] * cross[1, j] + z[2] * cross[2, j])
-    kept = (1.0 - told) * (1.0 - told)
-    for i in range(_N):
-        c0, c1, c2 = cross[0, i], cross[1, i], cross[2, i]
-        for j in range(_N):
-            p[i, j] -= c0 * cross[0, j] + c1 * cross[1, j] + c2 * cross[2, j]
-    for i in range(_D, _MA):
-        for j in range(_D, _MA):
-            p[i, j] += kept * (cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j])
-    tilt = vec.unit(vec.at(x, _Z))
-    vec.put(x, _Z, tilt)
-    block = (p[0, 0], p[0, 1], p[0, 2], p[1, 1], p[1, 2], p[2, 2])
-    if vec.quadratic(block, tilt) > _NONE_RAD2 and vec.trace(block) < _SMALL_RAD2:
-        _flatten(p, tilt)
-
-
-@compiled
-def _flatten(p: Floats, tilt: Vec) -> None:
-    """‖Z‖ = 1 into the covariance: a tilt that is nearly known errs across itself alone."""
-    for _ in range(2):  # rows, then by the transposed matrix columns
-        for j in range(_N):
-            along = vec.dot(tilt, (p[0, j], p[1, j], p[2, j]))
-            for i in range(3):
-                p[i, j] -= along * tilt[i]
-        for i in range(_N):
-            for j in range(i):
-                p[i, j], p[j, i] = p[j, i], p[i, j]
 
 
 @inlined
@@ -516,8 +357,8 @@ def _innovation_covariance(cross: Floats, d: Vec, w: Vec, reading: Vec) -> vec.S
 
 @inlined
 def _column(ph: Floats, c: int, d: Vec, w: Vec, reading: Vec) -> Vec:
-    by_rate = vec.cross(d, _error(ph, _BG, _MG, reading, c))
-    by_lever = vec.cross(w, (ph[_D, c], ph[_D + 1, c], ph[_D + 2, c]))
+    by_rate = vec.cross(d, error(ph, BG, MG, reading, c))
+    by_lever = vec.cross(w, (ph[D, c], ph[D + 1, c], ph[D + 2, c]))
     return (
         ph[3, c] + by_rate[0] - by_lever[0],
         ph[4, c] + by_rate[1] - by_lever[1],
@@ -549,20 +390,20 @@ def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibrati
 def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
     """The gyro's bias is its mean since the rest began, where that says more than is known and can be."""
     variance = _REST_STD_RAD_S**2
-    if rest[0] <= _REST_S or p[_BG, _BG] + p[_BG + 1, _BG + 1] + p[_BG + 2, _BG + 2] <= 6.0 * variance:
+    if rest[0] <= _REST_S or _trace(p, BG) <= 6.0 * variance:
         return
-    for c in range(_BG, _BA):
-        innovation = rest[4 + c - _BG] / rest[0] - x[c]
+    for c in range(BG, BA):
+        innovation = rest[4 + c - BG] / rest[0] - x[c]
         if innovation * innovation > _TURN_SIGMAS**2 * (p[c, c] + variance):
             return  # no rest, but a turn at a constant rate
-    for c in range(_BG, _BA):
-        take(x, p, c, rest[4 + c - _BG] / rest[0] - x[c], variance)
+    for c in range(BG, BA):
+        take(x, p, c, rest[4 + c - BG] / rest[0] - x[c], variance)
 
 
 @inlined
 def _runs_away(x: Floats) -> bool:
     """Whether the state is beyond what can be; NaN is."""
-    bg, ba, d = vec.at(x, _BG), vec.at(x, _BA), vec.at(x, _D)
+    bg, ba, d = vec.at(x, BG), vec.at(x, BA), vec.at(x, D)
     can_be = (
         vec.dot(bg, bg) < _LARGEST[0] ** 2 and vec.dot(ba, ba) < _LARGEST[1] ** 2 and vec.dot(d, d) < _LARGEST[2] ** 2
     )
@@ -572,26 +413,19 @@ def _runs_away(x: Floats) -> bool:
 @inlined
 def _height(tilt: Vec, x: Floats, p: Floats, turned: Vec) -> tuple[float, float]:
     """Height Zᵀd and its standard deviation (m), the frame having turned since the covariance was brought forward."""
-    d = vec.at(x, _D)
+    d = vec.at(x, D)
     back = (-turned[0], -turned[1], -turned[2])
     by_tilt, variance = vec.turn_back(back, d), 0.0
     for i in range(3):
         for j in range(3):
-            variance += by_tilt[i] * by_tilt[j] * p[_Z + i, _Z + j] + tilt[i] * tilt[j] * p[_D + i, _D + j]
-            variance += 2.0 * by_tilt[i] * tilt[j] * p[_Z + i, _D + j]
+            variance += by_tilt[i] * by_tilt[j] * p[Z + i, Z + j] + tilt[i] * tilt[j] * p[D + i, D + j]
+            variance += 2.0 * by_tilt[i] * tilt[j] * p[Z + i, D + j]
     return vec.dot(tilt, d), math.sqrt(max(variance, 0.0))
 
 
 @inlined
 def _same(a: Vec, b: Vec) -> bool:
     return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
-
-
-@inlined
-def _velocity_variance(bend: Vec, has_force: bool, h: float, imu: ImuCalibration) -> float:
-    """Variance (m²/s²) of the velocity gained over a step: noise, and what a trapezoid leaves of the force."""
-    bent = _BEND * math.sqrt(vec.dot(bend, bend)) if has_force else _GAP_ACCEL_M_S2
-    return (imu.accel_variance + min(bent, _GAP_ACCEL_M_S2) ** 2) * h * h
 
 
 @compiled
@@ -601,16 +435,12 @@ def _close(
 ) -> bool:  # fmt: skip
     """Brings the covariance up to the mean, and corrects both. False where the correction was refused."""
     x, p, h = state.mean, state.covariance, since.span
-    tilt, velocity = vec.at(x, _Z), vec.at(x, _V)
-    mean_rate, mean_force = vec.plus(_ZERO, 1.0 / h, since.turned), vec.plus(_ZERO, 1.0 / h, since.impulse)
-    _predict_covariance(p, state.work, since.turned, tilt, velocity, mean_rate, mean_force, h)
-    add_noise(p, tilt, velocity, since.rotation, since.velocity)
-    for i in range(3):
-        p[_BG + i, _BG + i] += q.gyro_bias_walk_rad_s**2 * h
-        p[_D + i, _D + i] += q.j2s_walk**2 * lever.variance * h
+    catch_up(x, p, state.work, since, 0.0, 0.0, q.gyro_bias_walk_rad_s**2 * h)
+    for i in range(D, SIZE):
+        p[i, i] += q.j2s_walk**2 * lever.variance * h
     state.belief[0] += h
     if state.belief[0] > _FADING_PACE_S:
-        _fade(x, p, state.belief[0], belief, q)
+        fade(x, p, state.belief[0], q.fade_s, belief)
         state.belief[0] = 0.0
     _take_bias_from_rest(x, p, state.rest)
     taken = _correct(state, jumped, before, rate, h, imu, q) if has_rate else True
@@ -627,8 +457,8 @@ def _start(
     if first:
         _begin(state, force, rate, imu, belief, q, lever)
     else:
-        _set_upright(state, force, rate, imu)
-    return Now(time_s, 0.0, time_s, 0.0, force, rate, rate, _ZERO, _ZERO, _AT_ONCE)
+        _set_upright(state.mean, state.covariance, force, rate, imu)
+    return Now(time_s, 0.0, time_s, 0.0, force, rate, rate, ZERO, ZERO, AT_ONCE)
 
 
 @inlined
@@ -641,22 +471,6 @@ def _turn(now: Now, step: float, has_rate: bool, rate: Vec, jerk: Vec, jumped: b
     if jumped:
         doubt += 0.25 * step * step * vec.dot(jerk, jerk)
     return Now(now.time, held, now.turned_at + step, doubt, now.force, now.rate, rate, angle, now.change, now.since)
-
-
-@inlined
-def _predict(x: Floats, now: Now, h: float, has_force: bool, force: Vec, bend: Vec, imu: ImuCalibration) -> Since:
-    """The mean over a step, by the angle turned and the forces at its ends; what the covariance will need of it."""
-    turn = _corrected(x, _MG, vec.plus(now.angle, -h, vec.at(x, _BG)))
-    begin = vec.minus(_corrected(x, _MA, now.force), vec.at(x, _BA))
-    predict_mean(x, turn, begin, vec.minus(_corrected(x, _MA, force), vec.at(x, _BA)), h)
-    since = now.since
-    return Since(
-        since.span + h,
-        vec.plus(since.turned, 1.0, turn),
-        vec.plus(vec.plus(since.impulse, 0.5 * h, now.force), 0.5 * h, force),
-        since.rotation + now.doubt,
-        since.velocity + _velocity_variance(bend, has_force, h, imu),
-    )
 
 
 @inlined
@@ -682,37 +496,38 @@ def _advance(
             _close(state, since, had_rate, False, before_w, before_w, imu, belief, q, lever)
             now = Now(
                 now.time, now.held, now.turned_at, now.doubt, before_a, before_w, now.newest, now.angle, now.change,
-                _AT_ONCE,
+                AT_ONCE,
             )  # fmt: skip
-        since = _predict(x, now, h, has_force, force, vec.minus(change, now.change), imu)
+        bend = vec.minus(change, now.change)
+        since = predict(x, now.since, now.angle, now.doubt, before_a, force, bend, has_force, h, imu)
         if has_force and has_rate:
             _watch_rest(state.rest, force, rate, h, imu)
-        if jumped or since.span > _PACE_S:
+        if jumped or since.span > PACE_S:
             taken = _close(state, since, has_rate, jumped, before_w, rate, imu, belief, q, lever)
-            since = _AT_ONCE
+            since = AT_ONCE
         if not taken:
             # A spike: what it did to this step is in doubt, and the next step goes without it.
             gained = 0.25 * h * h * vec.dot(change, change)
-            add_noise(state.covariance, vec.at(x, _Z), vec.at(x, _V), 0.0, gained)
-            rate, force, change = before_w, before_a, _ZERO
+            add_noise(state.covariance, vec.at(x, Z), vec.at(x, V), 0.0, gained)
+            rate, force, change = before_w, before_a, ZERO
         if _runs_away(x) or state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2):
             _begin(state, force, rate, imu, belief, q, lever)
             state.counts[1] += 1
-            since = _AT_ONCE
-        now = Now(time_s, now.held, now.turned_at, 0.0, force, rate, rate, _ZERO, change, since)
+            since = AT_ONCE
+        now = Now(time_s, now.held, now.turned_at, 0.0, force, rate, rate, ZERO, change, since)
     return now, taken
 
 
 @inlined
 def _report(x: Floats, p: Floats, now: Now, found: float, time_s: float, delay_s: float, out: Floats, i: int) -> None:
     """Row i: height and its standard deviation (m), Z at the time of the stamp, how far off the sensors are found."""
-    bias = vec.at(x, _BG)
-    ahead = vec.plus(_ZERO, delay_s, vec.minus(now.newest, bias))
+    bias = vec.at(x, BG)
+    ahead = vec.plus(ZERO, delay_s, vec.minus(now.newest, bias))
     if time_s > now.time:  # while the step waits
         ahead = vec.plus(vec.plus(ahead, 1.0, now.angle), time_s - now.turned_at, now.newest)
         ahead = vec.plus(ahead, now.time - time_s, bias)
-    ahead = _corrected(x, _MG, ahead)
-    tilt = vec.turn_back(ahead, vec.at(x, _Z))
+    ahead = corrected(x, MG, ahead)
+    tilt = vec.turn_back(ahead, vec.at(x, Z))
     out[i, 0], out[i, 1] = _height(tilt, x, p, vec.plus(now.since.turned, 1.0, ahead))
     out[i, 2], out[i, 3], out[i, 4] = tilt
     out[i, 5] = found
