@@ -5,6 +5,10 @@
 FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder and broad, each as its authors
 published it; one that is not there is named and left out. Nothing is calibrated beforehand. The error is the root mean
 square angle between the tilts.
+
+Sensor and reference do not share a clock: the sensors' readings come late by what their filter and the logger take. The
+delay is the lag of the gyro behind the reference's rate, one for all trials of a kind, and is the rig's. VQF's estimate
+is scored as it comes, and (vqf_undelayed_deg) turned on by the last rate for the same time.
 """
 
 from __future__ import annotations
@@ -24,9 +28,10 @@ from vqf import VQF
 from linkpose import filters
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Joint, Rig
+from linkpose.sensors.rig import Imu, Joint, Rig
 
 PENDULUM_J2S = Joint((-0.15, 0.0, 0.0), 0.03)  # by a ruler
+BROAD_DELAY_S, ENCODER_DELAY_S = 0.0038, 0.011
 
 
 class Case(NamedTuple):
@@ -38,6 +43,7 @@ class Case(NamedTuple):
     gyro_rad_s: Floats
     error_deg: Callable[[Floats], float]  # of tilts (N, 3)
     joint: Joint | None
+    delay_s: float = 0.0
 
 
 def pendulum(folder: Path) -> Iterator[Case]:
@@ -61,7 +67,7 @@ def broad(folder: Path) -> Iterator[Case]:
         tilt = _matrices(data["opt_quat"])[:, 2, :]
         use = data["movement"].ravel().astype(bool) & np.isfinite(tilt).all(axis=1)
         time_s = np.arange(len(accel)) / float(data["sampling_rate"].item())
-        yield Case("broad " + path.stem[:2], time_s, accel, gyro, _against(tilt, use), None)
+        yield Case("broad " + path.stem[:2], time_s, accel, gyro, _against(tilt, use), None, BROAD_DELAY_S)
 
 
 def encoder(folder: Path) -> Iterator[Case]:
@@ -81,7 +87,8 @@ def encoder(folder: Path) -> Iterator[Case]:
             return float(np.degrees(min(np.std(difference) for difference in both)))
 
         force, rate = STANDARD_GRAVITY * accel[use], np.radians(gyro[use])
-        yield Case("encoder " + path.stem[4:], time_s[use] - time_s[use][0], force, rate, error_deg, None)
+        start = time_s[use][0]
+        yield Case("encoder " + path.stem[4:], time_s[use] - start, force, rate, error_deg, None, ENCODER_DELAY_S)
 
 
 def _matrices(quaternion: Floats) -> Floats:
@@ -109,9 +116,21 @@ def tilt_of(name: str, case: Case) -> Floats:
         case.time_s, case.accel_m_s2, case.gyro_rad_s, nothing, nothing, nothing, np.zeros(n, bool),
         np.empty((n, 0, 2)), np.ones(n, np.uint16),
     )  # fmt: skip
-    estimate = filters.create(name, Rig(joint=case.joint or Joint())).process(block)
+    estimate = filters.create(name, Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))).process(block)
     roll, pitch = np.radians(estimate[:, 2]), np.radians(estimate[:, 3])
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+
+
+def vqf_tilt(case: Case) -> Floats:
+    """VQF's tilts (N, 3)."""
+    step = (case.time_s[-1] - case.time_s[0]) / (len(case.time_s) - 1)
+    return _matrices(VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)["quat6D"])[:, 2, :]
+
+
+def undelayed(tilt: Floats, case: Case) -> Floats:
+    """Tilts (N, 3) turned on by the last rate for as long as the readings are late."""
+    turned = tilt - np.cross(case.delay_s * case.gyro_rad_s, tilt)
+    return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
 
 def main() -> None:
@@ -124,13 +143,14 @@ def main() -> None:
             print(f"{options.data / name} is not there: left out", file=sys.stderr)
             continue
         for case in read(options.data / name):
-            step = (case.time_s[-1] - case.time_s[0]) / (len(case.time_s) - 1)
-            peer = _matrices(VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)["quat6D"])[:, 2, :]
+            peer = vqf_tilt(case)
+            vqf, late = case.error_deg(peer), case.error_deg(undelayed(peer, case))
             for used in (*(("joint-inertial", "joint") if case.joint else ()), "tilt", "tilt-inertial"):
-                ours, vqf = case.error_deg(tilt_of(used, case)), case.error_deg(peer)
+                ours = case.error_deg(tilt_of(used, case))
                 row = {"data": case.name, "filter": used, "ours_deg": ours, "vqf_deg": vqf, "ratio": ours / vqf}
+                row |= {"delay_s": case.delay_s, "vqf_undelayed_deg": late}
                 text = f"{case.name:18} {used:15} {ours:7.3f}°   vqf {vqf:7.3f}°   ratio {ours / vqf:.2f}"
-                print(json.dumps(row) if options.json else text)
+                print(json.dumps(row) if options.json else f"{text}   vqf undelayed {late:7.3f}°")
 
 
 if __name__ == "__main__":

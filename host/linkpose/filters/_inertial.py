@@ -29,6 +29,7 @@ from linkpose.filters._vector import Vec, compiled, inlined
 Z, V, BG, BA, MA, MG, D = 0, 3, 6, 9, 12, 21, 30  # where each begins in the state
 SIZE = 33
 PACE_S = 0.035  # between two corrections, at least
+FADING_PACE_S = 0.5  # between two times that beliefs fade
 GAP_ACCEL_M_S2 = 200.0  # where the accelerometer did not see, or beyond its range: a blow
 _BEND = 1.0 / 12.0  # of the force's second difference: what a trapezoid leaves of a parabola
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
@@ -346,3 +347,15 @@ def take(x: Floats, p: Floats, c: int, innovation: float, noise: float) -> None:
                     p[j, i] = p[i, j]
     for i in range(SIZE):
         p[i, c] = p[c, i] = p[i, c] * noise * scale
+
+
+@inlined
+def height(tilt: Vec, d: Vec, p: Floats, turned: Vec) -> tuple[float, float]:
+    """Height Zᵀd and its standard deviation (m), the frame having `turned` (rad) since the covariance was caught up."""
+    back = (-turned[0], -turned[1], -turned[2])
+    by_tilt, variance = vec.turn_back(back, d), 0.0
+    for i in range(3):
+        for j in range(3):
+            variance += by_tilt[i] * by_tilt[j] * p[Z + i, Z + j] + tilt[i] * tilt[j] * p[D + i, D + j]
+            variance += 2.0 * by_tilt[i] * tilt[j] * p[Z + i, D + j]
+    return vec.dot(tilt, d), math.sqrt(max(variance, 0.0))

@@ -218,3 +218,10 @@ def turn_back_sym(r: Vec, s: Sym) -> Sym:
         m12 + r[1] * m10 - r[0] * m11,
         m22 + r[1] * m20 - r[0] * m21,
     )
+
+
+@compiled
+def roll_pitch(tilt: Vec) -> tuple[float, float]:
+    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖), degrees."""
+    roll, pitch = math.atan2(tilt[1], tilt[2]), math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))
+    return math.degrees(roll), math.degrees(pitch)

@@ -49,6 +49,7 @@ from linkpose.filters._inertial import (
     AT_ONCE,
     BA,
     BG,
+    FADING_PACE_S,
     MA,
     MG,
     OTHERS,
@@ -65,6 +66,7 @@ from linkpose.filters._inertial import (
     corrected,
     error,
     fade,
+    height,
     others,
     predict,
     prior,
@@ -87,7 +89,6 @@ _REST_S = 0.5  # of stillness that tells the gyro's bias
 _REST_STD_RAD_S = 0.001  # of a link that is held still
 _REST_SIGMAS = 5.0  # within which the readings stay at rest
 _TURN_SIGMAS = 3.0  # beyond which a rate is a turn, and no bias
-_FADING_PACE_S = 0.5
 _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, where there is that much: the tilt is wrong
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
 
@@ -245,7 +246,7 @@ def _mix(first: Floats, second: Floats, out: Floats) -> None:
         out[i, 1] = math.sqrt(share * first[i, 1] ** 2 + rest * second[i, 1] ** 2 + share * rest * apart * apart)
         x, y = share * first[i, 2] + rest * second[i, 2], share * first[i, 3] + rest * second[i, 3]
         z = share * first[i, 4] + rest * second[i, 4]
-        out[i, 2], out[i, 3] = math.degrees(math.atan2(y, z)), math.degrees(math.atan2(-x, math.sqrt(y * y + z * z)))
+        out[i, 2], out[i, 3] = vec.roll_pitch((x, y, z))
 
 
 @inlined
@@ -411,19 +412,6 @@ def _runs_away(x: Floats) -> bool:
 
 
 @inlined
-def _height(tilt: Vec, x: Floats, p: Floats, turned: Vec) -> tuple[float, float]:
-    """Height Zᵀd and its standard deviation (m), the frame having turned since the covariance was brought forward."""
-    d = vec.at(x, D)
-    back = (-turned[0], -turned[1], -turned[2])
-    by_tilt, variance = vec.turn_back(back, d), 0.0
-    for i in range(3):
-        for j in range(3):
-            variance += by_tilt[i] * by_tilt[j] * p[Z + i, Z + j] + tilt[i] * tilt[j] * p[D + i, D + j]
-            variance += 2.0 * by_tilt[i] * tilt[j] * p[Z + i, D + j]
-    return vec.dot(tilt, d), math.sqrt(max(variance, 0.0))
-
-
-@inlined
 def _same(a: Vec, b: Vec) -> bool:
     return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
 
@@ -439,7 +427,7 @@ def _close(
     for i in range(D, SIZE):
         p[i, i] += q.j2s_walk**2 * lever.variance * h
     state.belief[0] += h
-    if state.belief[0] > _FADING_PACE_S:
+    if state.belief[0] > FADING_PACE_S:
         fade(x, p, state.belief[0], q.fade_s, belief)
         state.belief[0] = 0.0
     _take_bias_from_rest(x, p, state.rest)
@@ -528,7 +516,7 @@ def _report(x: Floats, p: Floats, now: Now, found: float, time_s: float, delay_s
         ahead = vec.plus(ahead, now.time - time_s, bias)
     ahead = corrected(x, MG, ahead)
     tilt = vec.turn_back(ahead, vec.at(x, Z))
-    out[i, 0], out[i, 1] = _height(tilt, x, p, vec.plus(now.since.turned, 1.0, ahead))
+    out[i, 0], out[i, 1] = height(tilt, vec.at(x, D), p, vec.plus(now.since.turned, 1.0, ahead))
     out[i, 2], out[i, 3], out[i, 4] = tilt
     out[i, 5] = found
 
