@@ -9,9 +9,10 @@ with the angular rate ω and the specific force f that each makes of what the se
 
 from __future__ import annotations
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, Floats
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._vector import Vec
 
 Z, V = 0, 3  # where each begins in the state
 Rows = tuple[Vec, Vec, Vec]

@@ -37,6 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
@@ -47,7 +48,7 @@ from linkpose.filters._imu import (
     rotation_variance,
 )
 from linkpose.filters._inertial import add_noise, predict_mean, rotation_rows, spread, take
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
