@@ -43,14 +43,14 @@ def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
     from linkpose.recording.table import read_table
 
     truth = read_motive(reference, up) if is_motive(reference) else read_table(reference)
-    for remark in truth.remarks:
+    found = evaluate(read_table(estimate), truth)
+    for remark in (*truth.remarks, *found.remarks):
         click.echo(remark, err=True)
-    scores = evaluate(read_table(estimate), truth)
     if json_lines:
-        for score in scores:
+        for score in found.scores:
             click.echo(json.dumps(score.as_dict()))
     else:
-        _show(scores)
+        _show(found.scores)
 
 
 def _show(scores: list[Score]) -> None:
