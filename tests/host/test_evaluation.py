@@ -81,6 +81,25 @@ def test_another_rate_and_an_offset(tmp_path):
     assert scores(estimate(tmp_path), reference)["joint"]["time_offset_s"] == pytest.approx(7.5, abs=5e-4)
 
 
+def test_a_reference_that_comes_rarely_is_compared_at_its_own_instants(tmp_path):
+    """Lines between its 5 readings a second would miss the motion by millimetres."""
+    t = T[::20] + 0.003
+    reference = write(tmp_path / "truth.csv", {"time_s": t, "height_m": height(t)})
+    found = scores(estimate(tmp_path), reference)["joint"]
+    assert found["time_offset_s"] == 0
+    assert found["rows"] == len(t)
+    assert found["height_rmse_cm"] == pytest.approx(2.0, abs=0.005)
+
+
+def test_files_of_different_runs_are_scored_and_doubted(tmp_path, reference):
+    rng = np.random.default_rng(3)
+    other = np.convolve(rng.standard_normal(len(T) + 60), np.ones(61) / 61, "valid")
+    path = write(tmp_path / "other.csv", {"time_s": T, "joint_height_m": 1.5 + other})
+    assert scores(path, reference)["joint"]["height_rmse_cm"] > 5
+    assert "are they of the same run?" in complaints(path, reference)
+    assert complaints(estimate(tmp_path), reference) == ""
+
+
 def test_a_lag_of_the_filter_is_its_own_fault(tmp_path, reference):
     """Half a sample is not taken for a clock's offset."""
     path = write(tmp_path / "late.csv", {"time_s": T, "joint_height_m": height(T - 0.004)})
@@ -229,6 +248,23 @@ def test_motive_export_as_reference(tmp_path):
     assert found["pitch_rmse_deg"] == pytest.approx(0.5, abs=0.01)
 
 
+def test_motive_exports_in_another_frame_are_doubted(tmp_path):
+    """Y for Z upwards, and two markers in each other's place: scored, but not without a word."""
+    run = LinkRun(2, 1, 30.0)
+    truth = run.truth()
+    path = write(
+        tmp_path / "estimate.csv",
+        {"time_s": truth.time_s, "joint_height_m": truth.height_m, "joint_roll_deg": truth.roll_deg,
+         "joint_pitch_deg": truth.pitch_deg},
+    )  # fmt: skip
+    take = motive(tmp_path / "take.csv", run, np.arange(0, 30, 1 / 50))
+    assert complaints(path, take) == ""
+    result = CliRunner().invoke(command, [path, take, "--up", "z"], catch_exceptions=False)
+    assert "is --up the axis that points upwards" in result.stderr
+    said = complaints(path, edited(take, with_markers_swapped))
+    assert "widest angle is at marker 2" in said and "are its markers in order" in said
+
+
 def swinging(angle_x, angle_y):
     """A link of 0.3 m whose z axis leans by these angles (N,) (rad), as `motive` takes runs."""
     z = np.column_stack([np.sin(angle_y), np.cos(angle_y) * np.sin(angle_x), np.cos(angle_y) * np.cos(angle_x)])
@@ -294,6 +330,12 @@ def with_an_unlabeled_marker_first(lines):
     return [",".join(row) for row in cells]
 
 
+def with_markers_swapped(lines):
+    cells = [line.split(",") for line in lines]
+    swapped = [[*row[:2], *row[5:8], *row[2:5], *row[8:]] for row in cells[6:]]
+    return lines[:6] + [",".join(row) for row in swapped]
+
+
 @pytest.mark.parametrize("change", [with_time_code, with_an_old_header, with_an_unlabeled_marker_first])
 def test_motive_exports_of_other_versions(tmp_path, change):
     run = LinkRun(2, 1, 30.0)
@@ -319,5 +361,11 @@ def test_motive_exports_that_do_not_do(tmp_path):
         scores(path, motive(tmp_path / "two.csv", run, t, markers=2))
     with pytest.raises(LinkposeError, match="has a header but no frame"):
         scores(path, edited(motive(tmp_path / "none.csv", run, t), lambda lines: lines[:6]))
+    hidden = edited(
+        motive(tmp_path / "hidden.csv", run, t),
+        lambda lines: lines[:6] + [",".join([*line.split(",")[:8], "", "", ""]) for line in lines[6:]],
+    )
+    with pytest.raises(LinkposeError, match="no frame with all three markers"):
+        scores(path, hidden)
     with pytest.raises(LinkposeError, match="furlongs"):
         scores(path, motive(tmp_path / "unit.csv", run, t, unit="Furlongs"))

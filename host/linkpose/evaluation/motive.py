@@ -24,6 +24,7 @@ _WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker 
 _WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be judged are better than a centimetre
 _LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
 _STILL = 10.0  # times its noise: noise alone also lies about a sphere, of some two and a half times its deviation
+_CLEARLY_WIDER_DEG = 15.0
 _LONGEST_LINK_M = 10.0
 _MOST_STEPS = 50
 
@@ -51,7 +52,7 @@ def read_motive(path: Path, up: str = "y") -> Table:
         "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
     }
     columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, take.first_line, tuple(take.remarks))
+    return Table(path, "motive", columns, {}, None, take.first_line, (*take.remarks, *_order_remarks(path, markers)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +81,8 @@ def _read_take(path: Path) -> _Take:
     used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
     check_times(path, table[:, 0], first_line)
+    if not np.isfinite(table).all(axis=1).any():
+        raise LinkposeError(f"{path} has no frame with all three markers: fill their gaps in Motive")
     return _Take(table[:, 0], _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3), first_line, remarks)
 
 
@@ -124,6 +127,22 @@ def _number(path: Path, row: list[str], column: int, line: int) -> float:
         return float(text)
     except ValueError:
         raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number") from None
+
+
+def _order_remarks(path: Path, markers: Floats) -> list[str]:
+    """A remark where the plate's corner seems to be at another marker than the first."""
+    angles = []
+    for corner in range(3):
+        one, two = (markers[:, (corner + i) % 3] - markers[:, corner] for i in (1, 2))
+        angle = np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), (one * two).sum(axis=1))
+        angles.append(float(np.degrees(np.nanmedian(angle))))
+    widest = int(np.argmax(angles))
+    if angles[widest] < angles[0] + _CLEARLY_WIDER_DEG:
+        return []
+    return [
+        f"{path}: the markers' widest angle is at marker {widest + 1} ({angles[widest]:.0f}°) rather than marker 1 "
+        f"({angles[0]:.0f}°), which must be at the sensor: order them in Motive, if it is not"
+    ]
 
 
 def _tilt(markers: Floats, up: Floats) -> Floats:
