@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from linkpose.cli.evaluate import command
+from linkpose.cli.plot import command as plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.motive import read_motive
 from linkpose.simulation.link import LinkRun
@@ -260,9 +261,9 @@ def test_motive_exports_in_another_frame_are_doubted(tmp_path):
     take = motive(tmp_path / "take.csv", run, np.arange(0, 30, 1 / 50))
     assert complaints(path, take) == ""
     result = CliRunner().invoke(command, [path, take, "--up", "z"], catch_exceptions=False)
-    assert "is --up the axis that points upwards" in result.stderr
+    assert "try the other axis with --up" in result.stderr
     said = complaints(path, edited(take, with_markers_swapped))
-    assert "widest angle is at marker 2" in said and "are its markers in order" in said
+    assert "widest angle is at marker 2" in said and "check the order of the markers" in said
 
 
 def swinging(angle_x, angle_y):
@@ -345,6 +346,12 @@ def test_motive_exports_of_other_versions(tmp_path, change):
     other = read_motive(Path(edited(path, change))).columns
     for name, column in usual.items():
         assert np.array_equal(other[name], column, equal_nan=True)
+
+
+def test_motive_exports_are_drawn(tmp_path):
+    path = motive(tmp_path / "take.csv", LinkRun(2, 1, 30.0), np.arange(0, 30, 1 / 50))
+    assert CliRunner().invoke(plot, [path], catch_exceptions=False).exit_code == 0
+    assert (tmp_path / "take.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_an_unlabeled_marker_is_left_out_and_said(tmp_path):

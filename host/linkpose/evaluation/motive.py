@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.recording.table import Table, check_times, read_bytes
+from linkpose.recording.table import Table, check_times, read_bytes, read_table
 from linkpose.sensors.measurements import Floats
 
 _SIGNATURE = b"Format Version,"
@@ -29,9 +29,10 @@ _LONGEST_LINK_M = 10.0
 _MOST_STEPS = 50
 
 
-def is_motive(path: Path) -> bool:
-    """Whether the file begins as Motive's exports do. Raises LinkposeError where it cannot be read."""
-    return read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+def read_any(path: Path, up: str) -> Table:
+    """A Motive export by `read_motive`, any other CSV by `read_table`, with their errors."""
+    is_motive = read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+    return read_motive(path, up) if is_motive else read_table(path)
 
 
 def read_motive(path: Path, up: str = "y") -> Table:

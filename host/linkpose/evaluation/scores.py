@@ -89,7 +89,7 @@ def _doubts(
     apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
     if apart > _SAME_TILT_DEG:
         cure = (
-            "is --up the axis that points upwards in the take, and are its markers in order?"
+            "try the other axis with --up y or z, and check the order of the markers"
             if reference.kind == "motive"
             else "are they of the same run, and of the same axes?"
         )

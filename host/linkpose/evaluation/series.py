@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from linkpose.sensors.measurements import Floats
 
 # A reference is interpolated over at most so many of its usual intervals; a longer hole is a gap.
-_LONGEST_HOLE = 3.5
+LONGEST_HOLE = 3.5
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
 _CLEARLY_BETTER = 0.7
 _SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter
@@ -37,7 +37,7 @@ class Series:
             value = np.unwrap(value)
         found = np.interp(time_s, t, value, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
-        hole = (t[after] - t[after - 1] > _LONGEST_HOLE * interval(self.time_s)) & (t[after] != time_s)
+        hole = (t[after] - t[after - 1] > LONGEST_HOLE * interval(self.time_s)) & (t[after] != time_s)
         return np.where(hole, np.nan, found)
 
 
