@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.evaluation.series import LONGEST_HOLE, interval
 from linkpose.recording.table import Table
+from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +33,7 @@ _PANELS = {
     "_temp_degC": "temperature (°C)",
     "_counts": "mouse (counts)",
 }
+_TURNS = {"roll_deg": 360.0, "pitch_deg": 360.0, "heading_rad": 2 * np.pi}
 _PANEL_INCHES = 2.2
 
 
@@ -76,11 +79,11 @@ def plot_tables(tables: Sequence[Table]) -> Figure:
     for place, (panel, columns) in zip(axes, panels.items(), strict=False):
         for table, column in sorted(columns, key=_roughness, reverse=True):  # what is noisy goes behind
             label = _label(table, column, several)
-            place.plot(table.columns["time_s"], table.columns[column], linewidth=0.8, label=label)
+            place.plot(*_line(table, column), linewidth=0.8, label=label)
         _finish(place, "time (s)", panel)
     if paths:
         for table, prefix in paths:
-            x, y = table.columns[f"{prefix}x_m"], table.columns[f"{prefix}y_m"]
+            (_, x), (_, y) = (_line(table, f"{prefix}{axis}_m") for axis in "xy")
             axes[-1].plot(x, y, linewidth=0.8, label=_label(table, prefix or "path", several))
         axes[-1].set_aspect("equal", "datalim")
         _finish(axes[-1], "x (m)", "y (m)")
@@ -94,11 +97,21 @@ def _panel_of(column: str) -> str | None:
     return None
 
 
+def _line(table: Table, column: str) -> tuple[Floats, Floats]:
+    """Times and values to draw, with a break (NaN) at gaps in time and where an angle goes once around."""
+    time_s, value = table.columns["time_s"], table.columns[column]
+    value = np.where(np.isfinite(value), value, np.nan)
+    is_break = np.diff(time_s) > LONGEST_HOLE * interval(time_s)
+    turn = next((turn for ending, turn in _TURNS.items() if column.endswith(ending)), np.inf)
+    at = np.flatnonzero(is_break | (np.abs(np.diff(value)) > turn / 2)) + 1
+    return np.insert(time_s, at, time_s[at]), np.insert(value, at, np.nan)
+
+
 def _roughness(item: tuple[Table, str]) -> float:
     """How much a column jumps from sample to sample."""
     table, column = item
-    steps = np.abs(np.diff(table.columns[column]))
-    steps = steps[np.isfinite(steps)]
+    value = table.columns[column]
+    steps = np.abs(np.diff(value[np.isfinite(value)]))
     return float(steps.mean()) if len(steps) else 0.0
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 from hypothesis import settings
 
-from linkpose.cli import main
+from linkpose.cli import main, patience
 
 # The first example may wait for a compiler.
 settings.register_profile("linkpose", deadline=None)
@@ -52,3 +52,19 @@ def refused(linkpose: Callable[..., Result]) -> Callable[..., str]:
         return sentence
 
     return run
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """From its call on, any wait for the compiler is one to be wondered at."""
+
+    class OutOfPatience:
+        """A timer that is up at once."""
+
+        def __init__(self, _seconds: float, say: Callable[[str], object], words: list[str]) -> None:
+            self.start = lambda: say(*words)
+
+        def cancel(self) -> None:
+            """Too late."""
+
+    return lambda: monkeypatch.setattr(patience.threading, "Timer", OutOfPatience)

@@ -6,7 +6,6 @@ import json
 
 import pytest
 
-from linkpose.cli import patience
 from linkpose.localization.carmen import read_carmen
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.grid import load_map
@@ -59,20 +58,10 @@ def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
     assert linkpose(*arguments, "-o", out, "--force").status == 0
 
 
-def test_a_compiler_at_work_is_told(indoor, linkpose, monkeypatch):
+def test_a_compiler_at_work_is_told(indoor, linkpose, impatient):
     log, grid, _ = indoor
-
-    class OutOfPatience:
-        """A timer that is up at once."""
-
-        def __init__(self, _seconds, say, words):
-            self.start = lambda: say(*words)
-
-        def cancel(self):
-            pass
-
     quiet = linkpose("localize", log, "--map", grid)
-    monkeypatch.setattr(patience.threading, "Timer", OutOfPatience)
+    impatient()
     told = linkpose("localize", log, "--map", grid)
     assert told.err == "compiling the filters, this once (some seconds) ...\n"
     assert told.out == quiet.out
@@ -187,9 +176,11 @@ def test_the_same_seed_gives_the_same_files(linkpose, tmp_path, rig):
 
 
 @pytest.mark.parametrize(("rig", "checks"), [("indoor", 0), ("underwater", 14)])
-def test_reproduce_prints_every_variant(linkpose, tmp_path, rig, checks):
+def test_reproduce_prints_every_variant(linkpose, impatient, tmp_path, rig, checks):
     picture = tmp_path / "variants.png"
+    impatient()
     result = linkpose("reproduce", rig, "--seeds", 1, "--json", "--plot", picture)
+    assert result.err == "compiling the filters, this once (some seconds) ...\n"
     rows = [json.loads(line) for line in result.out.splitlines()]
     assert [set(row) for row in rows[:checks]] == [{"check", "asked", "measured"}] * checks
     variants = rows[checks:]

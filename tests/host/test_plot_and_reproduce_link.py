@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from linkpose.cli import plot, reproduce_link
+from linkpose import plotting
+from linkpose.cli import plot
 from linkpose.errors import LinkposeError
+from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
 
@@ -27,15 +30,22 @@ def estimate(tmp_path):
 
 
 def test_plot_draws_each_quantity_once(tmp_path, estimate):
-    from linkpose import plotting
-    from linkpose.recording.table import read_table
-
     truth = write(tmp_path / "truth.csv", {"time_s": [0, 1], "height_m": [1, 2]})
     figure = plotting.plot_tables([read_table(tmp_path / "estimate.csv"), read_table(tmp_path / "truth.csv")])
     assert [axes.get_ylabel() for axes in figure.axes] == ["height (m)", "y (m)"]
     assert [len(axes.lines) for axes in figure.axes] == [2, 1]
     assert CliRunner().invoke(plot.command, [estimate, truth, "-o", str(tmp_path / "both.png")]).exit_code == 0
     assert (tmp_path / "both.png").read_bytes().startswith(PNG)
+
+
+def test_lines_break_at_gaps_and_where_an_angle_goes_around(tmp_path):
+    t = np.delete(np.arange(100) / 100, range(30, 50))
+    columns = {"time_s": t, "joint_height_m": t, "joint_roll_deg": (1000 * t + 180) % 360 - 180}
+    columns["joint_height_m"] = np.where(t == t[10], np.inf, t)
+    figure = plotting.plot_tables([read_table(Path(write(tmp_path / "e.csv", columns)))])
+    height, roll = (axes.lines[0].get_ydata() for axes in figure.axes)
+    assert np.flatnonzero(np.isnan(height)).tolist() == [10, 30]
+    assert np.nanmax(np.abs(np.diff(roll))) < 180
 
 
 def test_a_plot_is_named_after_its_file(tmp_path, estimate):
@@ -52,12 +62,12 @@ def test_what_cannot_be_drawn_or_written_is_said(tmp_path, estimate):
         CliRunner().invoke(plot.command, [estimate, "-o", str(tmp_path / "no" / "p.png")], catch_exceptions=False)
 
 
-def test_reproduce_link_prints_every_method_on_every_test(tmp_path):
+def test_reproduce_link_prints_every_method_on_every_test(linkpose, impatient, tmp_path):
     picture = tmp_path / "figure2.png"
-    result = CliRunner().invoke(
-        reproduce_link.command, ["--seeds", "1", "--json", "--plot", str(picture)], catch_exceptions=False
-    )
-    rows = [json.loads(line) for line in result.output.splitlines()]
+    impatient()
+    result = linkpose("reproduce", "link", "--seeds", 1, "--json", "--plot", picture)
+    assert result.err == "compiling the filters, this once (some seconds) ...\n"
+    rows = [json.loads(line) for line in result.out.splitlines()]
     assert [row["filter"] for row in rows[:5]] == ["joint", "tilt", "imu-baro", "baro", "joint-inertial"]
     assert len(rows) == 15
     for row in rows:
@@ -68,6 +78,6 @@ def test_reproduce_link_prints_every_method_on_every_test(tmp_path):
     assert picture.read_bytes().startswith(PNG)
 
 
-def test_reproduce_link_shows_the_papers_tables_beside():
-    shown = CliRunner().invoke(reproduce_link.command, ["--seeds", "1"], catch_exceptions=False).output
+def test_reproduce_link_shows_the_papers_tables_beside(linkpose):
+    shown = linkpose("reproduce", "link", "--seeds", 1).out
     assert "Table 1" in shown and "Table 2" in shown and "17.34" in shown and "joint A" in shown

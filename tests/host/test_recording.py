@@ -179,6 +179,11 @@ BAD_FILES = {
     "an empty file": (lambda _: [], "is no linkpose recording"),
     "only a head": (lambda lines: lines[:3], "has a header but no row"),
     "cut in its head": (lambda lines: [*lines[:2], "time_s,se"], "ends before its first row"),
+    "a later version": (
+        lambda lines: ["# linkpose recording 2\n", *lines[1:]],
+        "is a linkpose recording of version 2, and this program reads version 1",
+    ),
+    "nothing but blank lines": (lambda lines: [*lines[:3], "\n", "\n"], "has a header but no row"),
     "metadata that is no JSON": (lambda lines: [lines[0], "# {oops\n", *lines[2:]], "line 2: the metadata is not JSON"),
     "settings that are none": (
         lambda lines: [lines[0], '# {"settings": 5}\n', *lines[2:]],
@@ -251,6 +256,23 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
     assert equal(part.measurements, whole[: len(part.measurements)])
     assert len(part.measurements) >= 99 - cut // 80
     assert "has no closing line" in part.remarks[0]
+
+
+@pytest.mark.parametrize(
+    "save",
+    [
+        lambda data: b"\xef\xbb\xbf" + data,
+        lambda data: data + b"\n\n",
+        lambda data: b"\xef\xbb\xbf" + data.replace(b"\n", b"\r\n") + b"\r\n  \r\n",
+    ],
+    ids=["byte order mark", "blank lines at the end", "both, and other line ends"],
+)
+def test_what_editors_add_to_a_recording_does_no_harm(recording, save):
+    before = load_recording(recording)
+    recording.write_bytes(save(recording.read_bytes()))
+    after = load_recording(recording)
+    assert equal(after.measurements, before.measurements)
+    assert after.remarks == [] and after.metadata == before.metadata
 
 
 def test_a_plain_file_needs_no_newline_at_its_end(tmp_path):

@@ -27,9 +27,7 @@ _HEADINGS = {
 @click.command("evaluate")
 @click.argument("estimate", type=options.FILE)
 @click.argument("reference", type=options.FILE)
-@click.option(
-    "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Upward axis of a Motive export."
-)
+@options.up
 @options.as_json
 def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
     """Root mean square errors of each filter in ESTIMATE.csv against REFERENCE.csv.
@@ -38,19 +36,19 @@ def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
     is a truth of `linkpose simulate`, any CSV with such columns, or OptiTrack Motive's export of three markers: the
     first at the sensor, the second along its x axis, the third on the side of its y axis.
     """
-    from linkpose.evaluation.motive import is_motive, read_motive
+    from linkpose.evaluation.motive import read_any
     from linkpose.evaluation.scores import evaluate
     from linkpose.recording.table import read_table
 
-    truth = read_motive(reference, up) if is_motive(reference) else read_table(reference)
-    for remark in truth.remarks:
+    truth = read_any(reference, up)
+    found = evaluate(read_table(estimate), truth)
+    for remark in (*truth.remarks, *found.remarks):
         click.echo(remark, err=True)
-    scores = evaluate(read_table(estimate), truth)
     if json_lines:
-        for score in scores:
+        for score in found.scores:
             click.echo(json.dumps(score.as_dict()))
     else:
-        _show(scores)
+        _show(found.scores)
 
 
 def _show(scores: list[Score]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -211,7 +210,7 @@ def command(
     if chosen.ranges.correlation and most_at_once(events) == 1:
         click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
     names = cast("list[FilterName]", list(dict.fromkeys(filters)))
-    with while_compiling(functools.partial(click.echo, err=True)):
+    with while_compiling():
         warm_up(names)
     tracks: dict[str, Track] = {name: localize(events, name, chosen, grid, beacons, str(log)) for name in names}
     if output is not None:

@@ -105,6 +105,12 @@ def sensor_errors(function: Function) -> Function:
     )(function)
 
 
+def up(function: Function) -> Function:
+    return click.option(
+        "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Upward axis of a Motive export."
+    )(function)
+
+
 def as_json(function: Function) -> Function:
     return click.option("--json", "json_lines", is_flag=True, help="One JSON object a line on stdout.")(function)
 

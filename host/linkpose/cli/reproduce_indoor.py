@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
@@ -36,10 +37,12 @@ def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
     """
     from linkpose.cli.comparison import as_table, plot, progress
     from linkpose.localization.carmen import as_log
-    from linkpose.localization.localizer import localize
+    from linkpose.localization.localizer import localize, warm_up
     from linkpose.localization.tables import score
     from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
 
+    with while_compiling():
+        warm_up(FILTERS)
     variants = list(_variants())
     grid = office_map()
     for seed, unmapped in progress(itertools.product(range(seeds), UNMAPPED), "drives"):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
     from linkpose.evaluation.link import Entry, Traces
@@ -24,8 +25,11 @@ _SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
 @options.as_json
 def command(seeds: int, errors: str, plot_path: Path | None, json_lines: bool) -> None:
     """Measure Methods A to D, and joint-inertial, on Tests 1 to 3, beside the paper's Tables 1 and 2."""
-    from linkpose.evaluation.link import reproduce, traces
+    from linkpose import filters
+    from linkpose.evaluation.link import METHODS, reproduce, traces
 
+    with while_compiling():
+        filters.warm_up(METHODS)
     entries = [entry for test in (1, 2, 3) for entry in reproduce(test, seeds, errors)]
     if json_lines:
         for entry in entries:

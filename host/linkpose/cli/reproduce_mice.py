@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
     from linkpose.evaluation.mice import PaperRun, Redundancy
@@ -22,8 +23,11 @@ PLOTTED_S = 4.0
 @options.as_json
 def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
     """Compare two and three optical mice with one: the robot drives at (1, 1) cm/s, mice err within ± 0.25 cm/s."""
+    from linkpose import filters
     from linkpose.evaluation.mice import paper_run, redundancy
 
+    with while_compiling():
+        filters.warm_up(["mice"])
     rows = [row for mice in (2, 3) for row in redundancy(mice, seeds)]
     if json_lines:
         for row in rows:

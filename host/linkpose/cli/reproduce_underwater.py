@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
@@ -81,7 +82,10 @@ def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
     gate. The thesis's own values and result tables are not public.
     """
     from linkpose.cli.comparison import as_table, plot, progress
+    from linkpose.localization.localizer import warm_up
 
+    with while_compiling():
+        warm_up(FILTERS)
     cases = [
         _case(timing, correlated, n)
         for timing, correlated, n in itertools.product(TIMINGS, (False, True), (0, OUTLIERS))

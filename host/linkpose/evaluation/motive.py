@@ -15,17 +15,24 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.recording.table import Table, check_times, read_bytes
+from linkpose.recording.table import Table, check_times, read_bytes, read_table
 from linkpose.sensors.measurements import Floats
 
 _SIGNATURE = b"Format Version,"
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker moves
+_WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be judged are better than a centimetre
+_LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
+_STILL = 10.0  # times its noise: noise alone also lies about a sphere, of some two and a half times its deviation
+_CLEARLY_WIDER_DEG = 15.0
+_LONGEST_LINK_M = 10.0
+_MOST_STEPS = 50
 
 
-def is_motive(path: Path) -> bool:
-    """Whether the file begins as Motive's exports do. Raises LinkposeError where it cannot be read."""
-    return read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+def read_any(path: Path, up: str) -> Table:
+    """A Motive export by `read_motive`, any other CSV by `read_table`, with their errors."""
+    is_motive = read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+    return read_motive(path, up) if is_motive else read_table(path)
 
 
 def read_motive(path: Path, up: str = "y") -> Table:
@@ -36,8 +43,9 @@ def read_motive(path: Path, up: str = "y") -> Table:
     """
     take = _read_take(path)
     time_s, markers = take.time_s, take.markers
-    tilt = _tilt(markers, np.eye(3)["xyz".index(up)])
-    height = (markers[:, 0] - _centre(path, markers[:, 0]))[:, "xyz".index(up)]
+    axis = "xyz".index(up)
+    tilt = _tilt(markers, np.eye(3)[axis])
+    height = markers[:, 0, axis] - _joint_height(path, markers[:, 0], axis)
     columns = {
         "time_s": time_s,
         "height_m": height,
@@ -45,7 +53,7 @@ def read_motive(path: Path, up: str = "y") -> Table:
         "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
     }
     columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, take.first_line, tuple(take.remarks))
+    return Table(path, "motive", columns, {}, None, take.first_line, (*take.remarks, *_order_remarks(path, markers)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +82,8 @@ def _read_take(path: Path) -> _Take:
     used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
     check_times(path, table[:, 0], first_line)
+    if not np.isfinite(table).all(axis=1).any():
+        raise LinkposeError(f"{path} has no frame with all three markers: fill their gaps in Motive")
     return _Take(table[:, 0], _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3), first_line, remarks)
 
 
@@ -120,6 +130,22 @@ def _number(path: Path, row: list[str], column: int, line: int) -> float:
         raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number") from None
 
 
+def _order_remarks(path: Path, markers: Floats) -> list[str]:
+    """A remark where the plate's corner seems to be at another marker than the first."""
+    angles = []
+    for corner in range(3):
+        one, two = (markers[:, (corner + i) % 3] - markers[:, corner] for i in (1, 2))
+        angle = np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), (one * two).sum(axis=1))
+        angles.append(float(np.degrees(np.nanmedian(angle))))
+    widest = int(np.argmax(angles))
+    if angles[widest] < angles[0] + _CLEARLY_WIDER_DEG:
+        return []
+    return [
+        f"{path}: the markers' widest angle is at marker {widest + 1} ({angles[widest]:.0f}°) rather than marker 1 "
+        f"({angles[0]:.0f}°), which must be at the sensor: order them in Motive, if it is not"
+    ]
+
+
 def _tilt(markers: Floats, up: Floats) -> Floats:
     """Z (N, 3) from markers (N, 3 markers, 3)."""
     x = markers[:, 1] - markers[:, 0]
@@ -130,20 +156,57 @@ def _tilt(markers: Floats, up: Floats) -> Floats:
     return np.column_stack([x @ up, np.cross(z, x) @ up, z @ up])
 
 
-def _centre(path: Path, positions: Floats) -> Floats:
-    """Centre of the sphere on which the positions (N, 3) lie: |p|² = 2 p·c + (r² − |c|²) is linear in both."""
+def _joint_height(path: Path, positions: Floats, up: int) -> float:
+    """Height (m) of the centre of the sphere on which the positions (N, 3) lie; raises LinkposeError unless they do."""
     seen = positions[np.isfinite(positions).all(axis=1)]
     if len(seen) < 10:
         raise LinkposeError(f"{path}: marker 1 is seen in {len(seen)} frames only; no joint can be fitted to that")
     middle = seen.mean(axis=0)
-    p = seen - middle
-    design = np.column_stack([2 * p, np.ones(len(p))])
-    solution, _, rank, singular = np.linalg.lstsq(design, (p**2).sum(axis=1), rcond=None)
-    if rank < 4 or singular[-1] < 1e-4 * singular[0]:
-        raise LinkposeError(f"{path}: marker 1 hardly leaves a circle, which tells no joint: swing it both ways")
-    distance = np.linalg.norm(p - solution[:3], axis=1)
-    if distance.std() > _WORST_SPHERE_M:
+    centre, radius, noise, std = _fit_sphere(seen - middle)
+    if radius < _STILL * noise:
         raise LinkposeError(
-            f"{path}: marker 1 is {100 * distance.std():.1f} cm rms off any sphere: is the joint fixed to the ground?"
+            f"{path}: marker 1 hardly moves, which tells no joint: tilt the link to all sides in the take"
         )
-    return np.asarray(middle + solution[:3])
+    if noise > _WORST_SPHERE_M:
+        raise LinkposeError(
+            f"{path}: marker 1 is {100 * noise:.1f} cm rms off any sphere: is the joint fixed to the ground?"
+        )
+    if std[up] > _WORST_HEIGHT_STD_M:
+        raise LinkposeError(
+            f"{path}: the motion of marker 1 tells the joint's height to ±{100 * std[up]:.1f} cm only: "
+            "tilt the link further, for turning about the vertical tells nothing of it"
+        )
+    return float(middle[up] + centre[up])
+
+
+def _fit_sphere(p: Floats) -> tuple[Floats, float, float, Floats]:
+    """Centre (3,), radius, rms distance from the sphere, and the centre's standard deviations (3,), all in metres.
+
+    Least squares of the distances by Gauss and Newton. |p|² = 2 p·c + (r² − |c|²), linear in both, is the start only:
+    the markers' noise pulls its centre towards the positions, by decimetres where they cover a small cap.
+    """
+    design = np.column_stack([2 * p, np.ones(len(p))])
+    centre = np.linalg.lstsq(design, (p**2).sum(axis=1), rcond=1e-6)[0][:3]
+    state = np.append(centre, np.linalg.norm(p - centre, axis=1).mean())
+    for _ in range(_MOST_STEPS):
+        away = p - state[:3]
+        distance = np.linalg.norm(away, axis=1)
+        jacobian = np.column_stack([away / np.maximum(distance, 1e-9)[:, None], np.ones(len(p))])
+        off = distance - state[3]
+        told = jacobian.T @ jacobian
+        step = _solve(told, jacobian.T @ off, 1e-12 * len(p))
+        state = state + step / max(1.0, float(np.linalg.norm(step)))
+        if np.linalg.norm(step) < 1e-6:
+            break
+    noise = max(float(np.sqrt(np.mean(off**2))), _LEAST_NOISE_M)
+    radius = max(float(state[3]), noise)
+    # Noise across the radius turns the rows of the Jacobian, which looks like motion and tells nothing.
+    told[:3, :3] -= (noise / radius) ** 2 * (len(p) * np.eye(3) - told[:3, :3])
+    covariance = noise**2 * _solve(told, np.eye(4), (noise / _LONGEST_LINK_M) ** 2)
+    return state[:3], radius, noise, np.sqrt(np.diag(covariance))[:3]
+
+
+def _solve(information: Floats, right: Floats, least: float) -> Floats:
+    """information⁻¹ · right, with at least so much information in each direction."""
+    told, directions = np.linalg.eigh(information)
+    return np.asarray(directions / np.maximum(told, least) @ (directions.T @ right))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.series import Series, difference, find_offset
+from linkpose.evaluation.series import Series, difference, find_offset, paired
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
@@ -17,6 +17,8 @@ _LINK = ("height_m", "roll_deg", "pitch_deg")
 _PLANAR = ("vx_m_s", "vy_m_s", "wz_rad_s", "x_m", "y_m", "heading_rad")
 _POSE = ("x_m", "y_m", "heading_rad")
 _ODOMETRIC = ("mice", "planar-ekf", "planar-ukf")  # their poses count from where the robot stood at their first sample
+_UNRELATED = 0.9  # share of the reference's motion that is left when even the best filter's is taken away
+_SAME_TILT_DEG = 30.0
 _ANGLES = {"roll_deg": np.pi / 180, "pitch_deg": np.pi / 180, "heading_rad": 1.0}  # radians in a unit
 
 
@@ -25,7 +27,7 @@ class Score:
     """Root mean square errors of one filter; only of what the reference has."""
 
     filter: str
-    rows: int  # estimates that were compared
+    rows: int  # instants that were compared
     errors: dict[str, float]  # by the names of the JSON keys, in their units
     time_offset_s: float  # added to the estimate's clock to have the reference's
     is_planar: bool
@@ -36,8 +38,16 @@ class Score:
         return {"filter": self.filter, "rows": self.rows, **self.errors, **offset}
 
 
-def evaluate(estimate: Table, reference: Table) -> list[Score]:
-    """Scores of all filters in the file, in its order, on one common offset between the two clocks.
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """The scores of all filters in a file, in its order."""
+
+    scores: list[Score]
+    remarks: list[str]  # what makes the comparison itself doubtful
+
+
+def evaluate(estimate: Table, reference: Table) -> Evaluation:
+    """Compares all filters of the estimate with the reference, on one common offset between the two clocks.
 
     Raises LinkposeError where the files have nothing in common: no filter, no quantity, no time.
     """
@@ -61,8 +71,40 @@ def evaluate(estimate: Table, reference: Table) -> list[Score]:
             f"{reference.path} has {', '.join(known)}, and no filter in {estimate.path} estimates any of it"
         )
     offsets = [find_offset(list(both.values())) for both in pairs.values()]
-    offset_s = min(offsets, key=lambda found: found[1])[0]
-    return [_score(estimate, reference, name, both, offset_s) for name, both in pairs.items()]
+    offset_s, residual = min(offsets, key=lambda found: found[1])
+    scores = [_score(estimate, reference, name, both, offset_s) for name, both in pairs.items()]
+    return Evaluation(scores, _doubts(estimate, reference, pairs.values(), offset_s, residual))
+
+
+def _doubts(
+    estimate: Table,
+    reference: Table,
+    compared: Iterable[Mapping[str, tuple[Series, Series]]],
+    offset_s: float,
+    residual: float,
+) -> list[str]:
+    """What speaks against one run, or one frame, in both files."""
+    both_files = f"{estimate.path} and {reference.path}"
+    tilts = [both for both in compared if "roll_deg" in both and "pitch_deg" in both]
+    apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
+    if apart > _SAME_TILT_DEG:
+        cure = (
+            "try the other axis with --up y or z, and check the order of the markers"
+            if reference.kind == "motive"
+            else "are they of the same run, and of the same axes?"
+        )
+        return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]
+    if _UNRELATED < residual < np.inf:
+        return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
+    return []
+
+
+def _tilt_apart_deg(both: Mapping[str, tuple[Series, Series]], offset_s: float) -> float:
+    """Median angle between the two verticals, seen by the sensor; 0 without an instant in common."""
+    roll, pitch = (np.array(paired(*both[quantity], offset_s)) for quantity in ("roll_deg", "pitch_deg"))
+    z = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])  # (3, 2, N)
+    angle = np.arccos(np.clip((z[:, 0] * z[:, 1]).sum(axis=0), -1.0, 1.0))
+    return float(np.degrees(np.median(angle[np.isfinite(angle)]))) if np.isfinite(angle).any() else 0.0
 
 
 def _filters(table: Table) -> dict[str, dict[str, str]]:
@@ -94,7 +136,7 @@ def _score(
     errors = {quantity: difference(ours, theirs, offset_s) for quantity, (ours, theirs) in both.items()}
     is_planar = not any(quantity in _LINK for quantity in errors)
     if name in _ODOMETRIC and all(quantity in errors for quantity in _POSE):
-        errors |= _from_common_start({quantity: both[quantity][0].value for quantity in _POSE}, errors)
+        errors |= _from_common_start({q: paired(*both[q], offset_s)[0] for q in _POSE}, errors)
     compared = np.logical_or.reduce([np.isfinite(error) for error in errors.values()])
     if not compared.any():
         raise LinkposeError(

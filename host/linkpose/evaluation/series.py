@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from linkpose.sensors.measurements import Floats
 
 # A reference is interpolated over at most so many of its usual intervals; a longer hole is a gap.
-_LONGEST_HOLE = 3.5
+LONGEST_HOLE = 3.5
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
 _CLEARLY_BETTER = 0.7
+_SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter
 _FEWEST = 10  # instants that a fit is judged by
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -36,7 +37,7 @@ class Series:
             value = np.unwrap(value)
         found = np.interp(time_s, t, value, left=np.nan, right=np.nan)
         after = np.clip(np.searchsorted(t, time_s), 1, len(t) - 1)
-        hole = (t[after] - t[after - 1] > _LONGEST_HOLE * interval(self.time_s)) & (t[after] != time_s)
+        hole = (t[after] - t[after - 1] > LONGEST_HOLE * interval(self.time_s)) & (t[after] != time_s)
         return np.where(hole, np.nan, found)
 
 
@@ -47,9 +48,21 @@ def interval(time_s: Floats) -> float:
     return float(np.median(steps)) if len(steps) else 0.0
 
 
+def paired(estimate: Series, reference: Series, offset_s: float) -> tuple[Floats, Floats]:
+    """Both at the instants of the one that has fewer, (N,), NaN where either has none; angles as they come.
+
+    `offset_s` is added to the estimate's clock to have the reference's. The denser one is interpolated, for that is
+    nearer to the motion than lines between the other's samples.
+    """
+    if interval(reference.time_s) > _SPARSER * interval(estimate.time_s):
+        return estimate.at(reference.time_s - offset_s), reference.value
+    return estimate.value, reference.at(estimate.time_s + offset_s)
+
+
 def difference(estimate: Series, reference: Series, offset_s: float) -> Floats:
-    """estimate − reference at the estimate's instants, reference clock = estimate clock + `offset_s`; angles in ±π."""
-    error = estimate.value - reference.at(estimate.time_s + offset_s)
+    """estimate − reference at the instants of `paired`; angles in ±π."""
+    ours, theirs = paired(estimate, reference, offset_s)
+    error = ours - theirs
     if estimate.is_angle:
         error = (error + np.pi) % (2 * np.pi) - np.pi
     return error
@@ -84,7 +97,7 @@ def _fits_clearly_better(pairs: Sequence[tuple[Series, Series]], offset_s: float
 
 
 def _instants(pairs: Sequence[tuple[Series, Series]], offsets_s: Sequence[float]) -> list[NDArray[np.bool_]]:
-    """Of each pair, which of the estimate's instants (N,) can be compared with each of these offsets."""
+    """Of each pair, which of its instants (N,) can be compared with each of these offsets."""
     return [
         np.logical_and.reduce([np.isfinite(difference(*pair, offset_s)) for offset_s in offsets_s]) for pair in pairs
     ]

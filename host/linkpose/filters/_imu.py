@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.filters._vector import Vec, compiled
+from linkpose.compiling import compiled
+from linkpose.filters._vector import Vec
 from linkpose.sensors.rig import Imu
 from linkpose.wire.messages import SampleFlags
 

@@ -22,9 +22,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._vector import Vec
 
 Z, V, BG, BA, MA, MG, D = 0, 3, 6, 9, 12, 21, 30  # where each begins in the state
 SIZE = 33

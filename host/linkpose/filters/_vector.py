@@ -1,7 +1,6 @@
 """Vectors and symmetric matrices of three, as tuples that the compiler keeps in registers.
 
 A vector is (x, y, z); a symmetric matrix is (xx, xy, xz, yy, yz, zz). All are compiled into the filters that use them.
-Numba's cache does not see a change of this file from there: after editing it, delete the filters' `__pycache__`.
 """
 
 from __future__ import annotations
@@ -9,13 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-# Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
-compiled = njit(cache=True, error_model="numpy")
-# For the parts of a step that are long: put into the caller before it is compiled, else they stay calls.
-inlined = njit(cache=True, error_model="numpy", inline="always")
+from linkpose.compiling import compiled
 
 Floats = NDArray[np.float64]
 Vec = tuple[float, float, float]

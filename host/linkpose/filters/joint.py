@@ -27,9 +27,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
-from linkpose.filters._vector import Sym, Vec, compiled, inlined
+from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.tilt import (
     Now,
     TiltParameters,

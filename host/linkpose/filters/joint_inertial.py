@@ -37,6 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     Floats,
@@ -75,7 +76,7 @@ from linkpose.filters._inertial import (
     take,
     take_three,
 )
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 

@@ -26,16 +26,16 @@ Source: the redundant-mice paper, equations (1)-(17).
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inner
 from linkpose.filters import CannotRun
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import LONGEST_STEP_S, Floats, ImuCalibration, read_gyro
-from linkpose.filters._vector import Vec, compiled
+from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.wire.messages import SampleFlags
@@ -169,12 +169,6 @@ def check_placement(mice: tuple[Mouse, ...]) -> None:
 
 # ---- compiled ----
 
-# Called from compiled code only: without the wrappers for Python, which take a quarter of the time to compile.
-if TYPE_CHECKING:  # numba's own types do not know these options
-    _inner = compiled
-else:
-    _inner = njit(cache=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-
 # Σ w A_iᵀA_i and Σ w A_iᵀ s_i of some mice: (Σw, Σw p_x, Σw p_y, Σw ‖p‖²) and (Σw s_x, Σw s_y, Σw (p_x s_y − p_y s_x)).
 Normal = tuple[float, float, float, float]
 
@@ -188,13 +182,13 @@ class Reading(NamedTuple):
     weight: Floats  # (M,) 1/σ_i² over the window (1/m²)
 
 
-@_inner
+@inner
 def room(mice: int) -> Reading:
     """A reading to be filled."""
     return Reading(np.zeros((mice, 2)), np.zeros(mice, np.bool_), np.zeros(mice, np.bool_), np.zeros(mice))
 
 
-@_inner
+@inner
 def add_mouse(normal: Normal, right: Vec, w: float, p: Floats, sx: float, sy: float) -> tuple[Normal, Vec]:
     """One mouse more in the normal equations."""
     return (
@@ -203,7 +197,7 @@ def add_mouse(normal: Normal, right: Vec, w: float, p: Floats, sx: float, sy: fl
     )
 
 
-@_inner
+@inner
 def solve(normal: Normal, extra: Vec, right: Vec) -> tuple[Vec, Vec]:
     """(12): ẋ and the diagonal of its covariance; `extra` are further weights on the diagonal of Aᵀ W A."""
     w, wx, wy, wpp = normal
@@ -211,27 +205,27 @@ def solve(normal: Normal, extra: Vec, right: Vec) -> tuple[Vec, Vec]:
     return vec.apply(i, right), (i[0], i[3], i[5])
 
 
-@_inner
+@inner
 def at_mouse(motion: Vec, p: Floats) -> tuple[float, float]:
     """(6), (7): the motion of a point of the robot."""
     return motion[0] - motion[2] * p[1], motion[1] + motion[2] * p[0]
 
 
-@_inner
+@inner
 def variance(count: float, motion: Vec, p: Floats, share: float, more: float) -> float:
     """σ_i² of a mouse that moves with `motion`, in the square of its unit and that of a `count`: m or m/s."""
     x, y = at_mouse(motion, p)
     return _ROUNDING * count * count + share * share * (x * x + y * y) + more
 
 
-@_inner
+@inner
 def misfit(motion: Vec, p: Floats, s: Floats) -> float:
     """‖s − A_i x‖²"""
     x, y = at_mouse(motion, p)
     return float((s[0] - x) * (s[0] - x) + (s[1] - y) * (s[1] - y))
 
 
-@_inner
+@inner
 def bias_doubt(learnt_s: float) -> float:
     """Standard deviation (rad/s) of the gyro's bias when mice that agree have told it for so long."""
     return _BIAS_RAD_S / (1.0 + learnt_s) + _BIAS_FLOOR_RAD_S
@@ -244,7 +238,7 @@ def fault_limit(freedom: int) -> float:
     return float(freedom * (1.0 - part + _FAULT_Z * math.sqrt(part)) ** 3)
 
 
-@_inner
+@inner
 def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState) -> bool:
     """(11), (12) for one step: velocity and its standard deviation. False where the mice that are left cannot tell it.
 
@@ -272,7 +266,7 @@ def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MicePa
     return True
 
 
-@_inner
+@inner
 def number(mice: Bools) -> int:
     """How many are True."""
     count = 0
@@ -281,7 +275,7 @@ def number(mice: Bools) -> int:
     return count
 
 
-@_inner
+@inner
 def explain(left_out: int, sums: Floats, reading: Reading, place: Placement, state: MiceState) -> tuple[float, Vec]:
     """χ² of some motion without one mouse (M: with all), and the X that fits it best; `sums` are as the window is.
 
@@ -315,7 +309,7 @@ def explain(left_out: int, sums: Floats, reading: Reading, place: Placement, sta
     return chi2, x
 
 
-@_inner
+@inner
 def find_fault(
     sums: Floats, span: float, noise: float, p: MiceParameters, reading: Reading, place: Placement, state: MiceState
 ) -> tuple[bool, int, bool]:
@@ -346,7 +340,7 @@ def find_fault(
     return True, worst, second - best > _DECISIVE
 
 
-@_inner
+@inner
 def remember(reading: Reading, dt: float, step: float, rate: float, place: Placement, state: MiceState) -> None:
     """Takes the step into the window. A mouse that is away moves there as the others say: it returns in good order."""
     mice = reading.sound.shape[0]
@@ -364,7 +358,7 @@ def remember(reading: Reading, dt: float, step: float, rate: float, place: Place
     state.window[mice, 1] = keep * state.window[mice, 1] + turned * step
 
 
-@_inner
+@inner
 def agree(reading: Reading, step: float, rate: float, place: Placement, state: MiceState) -> None:
     """What follows from mice that agree: the reference, the gyro's bias, and excluded mice that are taken back."""
     mice, count = reading.sound.shape[0], number(reading.trusted)
@@ -388,7 +382,7 @@ def agree(reading: Reading, step: float, rate: float, place: Placement, state: M
         state.distrusted[i] = state.watch[i, 1] < _AGREED_S or state.watch[i, 2] < _AGREED_M
 
 
-@_inner
+@inner
 def leave_out_for_now(
     reading: Reading, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
 ) -> None:
@@ -403,7 +397,7 @@ def leave_out_for_now(
         state.used[worst] = False
 
 
-@_inner
+@inner
 def exclude(reading: Reading, step: float, place: Placement, p: MiceParameters, state: MiceState) -> bool:
     """Takes the trust from a mouse that has been at fault in the window for long enough; whether there is one."""
     mice = reading.sound.shape[0]
@@ -421,7 +415,7 @@ def exclude(reading: Reading, step: float, place: Placement, p: MiceParameters, 
     return True
 
 
-@_inner
+@inner
 def correct(
     reading: Reading, dt: float, step: float, rate: float, place: Placement, p: MiceParameters, state: MiceState
 ) -> bool:
@@ -442,7 +436,7 @@ def correct(
     return True
 
 
-@_inner
+@inner
 def read_mice(counts: Floats, flags: int, place: Placement, reading: Reading) -> None:
     """The motion of each mouse in b. A mouse that is away, or overflowed, has none."""
     for i in range(reading.sound.shape[0]):
@@ -454,7 +448,7 @@ def read_mice(counts: Floats, flags: int, place: Placement, reading: Reading) ->
             reading.moved[i, 0], reading.moved[i, 1] = c * x - s * y, s * x + c * y
 
 
-@_inner
+@inner
 def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
     """The exact arc of a constant velocity in b over `step` (s)."""
     half = 0.5 * velocity[2] * step
@@ -466,7 +460,7 @@ def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
     pose[2] = heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
 
 
-@_inner
+@inner
 def hold(time_s: float, dt: float, state: MiceState) -> None:
     """A reading without a velocity of its own: for a while the last one stands, then nobody knows."""
     if time_s - state.time[2] <= _HOLD_S:
@@ -480,7 +474,7 @@ def hold(time_s: float, dt: float, state: MiceState) -> None:
         state.time[2] = math.nan
 
 
-@_inner
+@inner
 def advance(
     time_s: float, rate: float, reading: Reading, place: Placement, p: MiceParameters, state: MiceState
 ) -> None:
@@ -516,7 +510,7 @@ def advance(
         hold(time_s, dt - 0.5 * missed, state)
 
 
-@_inner
+@inner
 def take(
     time_s: float, counts: Floats, flags: int, rate: float,
     reading: Reading, place: Placement, p: MiceParameters, state: MiceState,
@@ -530,7 +524,7 @@ def take(
     return True
 
 
-@_inner
+@inner
 def show(time_s: float, state: MiceState, out: Floats) -> None:
     """The estimate at a sample: from the last reading on its velocity stands."""
     since = time_s - state.time[0]

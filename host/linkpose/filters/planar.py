@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.filters import mice
 from linkpose.filters._imu import Floats, ImuCalibration, read_gyro
-from linkpose.filters._vector import compiled
 from linkpose.filters.mice import Bools, MiceParameters, MiceState, Placement, Reading
 from linkpose.localization import models
 from linkpose.localization.ekf import ekf_step

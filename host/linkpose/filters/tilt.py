@@ -34,6 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
@@ -44,7 +45,7 @@ from linkpose.filters._imu import (
     read_gyro,
     rotation_variance,
 )
-from linkpose.filters._vector import Sym, Vec, compiled, inlined
+from linkpose.filters._vector import Sym, Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 

@@ -34,6 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
@@ -69,7 +70,7 @@ from linkpose.filters._inertial import (
     take,
     take_three,
 )
-from linkpose.filters._vector import Vec, compiled, inlined
+from linkpose.filters._vector import Vec
 from linkpose.filters.tilt import unknown_accel
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.localization.gate import gate_blocks
 from linkpose.localization.linalg import (
     Floats,
@@ -23,7 +23,7 @@ from linkpose.localization.linalg import (
 from linkpose.localization.models import jacobian, motion_jacobians, predict, propagate
 
 
-@njit(cache=True)
+@compiled
 def ekf_predict(
     motion: int, state: Floats, covariance: Floats, control: Floats, noise_root: Floats, interval: float
 ) -> None:
@@ -42,7 +42,7 @@ def ekf_predict(
     symmetrise(covariance)
 
 
-@njit(cache=True)
+@compiled
 def ekf_step(
     motion: int,
     state: Floats,
@@ -91,7 +91,7 @@ def ekf_step(
     return keep_positive_definite(covariance)
 
 
-@njit(cache=True)
+@compiled
 def _joseph(covariance: Floats, gain: Floats, slopes: Floats, noise: Floats) -> None:
     """P ← (I − KH) P (I − KH)ᵀ + K R Kᵀ, a sum of squares whatever the rounding of K, in place."""
     shrink = product(gain, slopes)

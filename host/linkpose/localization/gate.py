@@ -8,9 +8,9 @@ import functools
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats, lower_cholesky, mahalanobis_squared
 
 
@@ -46,7 +46,7 @@ def _chi_square_cdf(value: float, degrees: int) -> float:
     return min(1.0, total * math.exp(half * math.log(x) - x - math.lgamma(half)))
 
 
-@njit(cache=True)
+@compiled
 def gate_blocks(innovation: Floats, covariance: Floats, block: int, threshold: float, d2: Floats) -> NDArray[np.int64]:
     """Fills `d2` for each block of `block` rows; returns the indices of the rows whose block passes."""
     keep = np.empty(innovation.shape[0], np.int64)

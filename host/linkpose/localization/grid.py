@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
 
@@ -123,7 +123,7 @@ def _number(path: Path, keys: dict[str, Any], key: str, default: float | None) -
     return float(value)
 
 
-@njit(cache=True)
+@compiled
 def cast_ray(blocked: NDArray[np.uint8], geometry: Floats, x: float, y: float, angle: float, max_range: float) -> float:
     """Distance (m) from (x, y) along `angle` (rad) to the face of the first blocked cell, at most `max_range`.
 

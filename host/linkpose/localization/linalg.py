@@ -7,19 +7,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from linkpose.compiling import compiled
 
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True)
+@compiled
 def wrap_angle(angle: float) -> float:
     """The same direction in [-π, π)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True)
+@compiled
 def subtract_from(measured: Floats, expected: Floats, is_angle: NDArray[np.bool_], first: int) -> None:
     """expected ← measured − expected, in place, on the circle where `is_angle` says so, which is read from index
     `first` on.
@@ -30,7 +31,7 @@ def subtract_from(measured: Floats, expected: Floats, is_angle: NDArray[np.bool_
             expected[i] = wrap_angle(expected[i])
 
 
-@njit(cache=True)
+@compiled
 def shift(
     state: Floats, gain: Floats, innovation: Floats, keep: NDArray[np.int64], is_angle: NDArray[np.bool_]
 ) -> None:
@@ -42,7 +43,7 @@ def shift(
             state[i] = wrap_angle(state[i])
 
 
-@njit(cache=True)
+@compiled
 def taken(a: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
     """The rows and columns of a matrix that are named, as a new matrix."""
     out = np.empty((rows.shape[0], columns.shape[0]))
@@ -52,7 +53,7 @@ def taken(a: Floats, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Flo
     return out
 
 
-@njit(cache=True)
+@compiled
 def add_to(a: Floats, b: Floats) -> None:
     """a ← a + b, in place."""
     for i in range(a.shape[0]):
@@ -60,7 +61,7 @@ def add_to(a: Floats, b: Floats) -> None:
             a[i, j] += b[i, j]
 
 
-@njit(cache=True)
+@compiled
 def product(a: Floats, b: Floats) -> Floats:
     """a b."""
     out = np.zeros((a.shape[0], b.shape[1]))
@@ -71,7 +72,7 @@ def product(a: Floats, b: Floats) -> Floats:
     return out
 
 
-@njit(cache=True)
+@compiled
 def product_transposed(a: Floats, b: Floats) -> Floats:
     """a bᵀ."""
     out = np.zeros((a.shape[0], b.shape[0]))
@@ -84,7 +85,7 @@ def product_transposed(a: Floats, b: Floats) -> Floats:
     return out
 
 
-@njit(cache=True)
+@compiled
 def symmetrise(a: Floats) -> None:
     """(a + aᵀ)/2, in place: rounding must not make a covariance lopsided."""
     for i in range(a.shape[0]):
@@ -94,7 +95,7 @@ def symmetrise(a: Floats) -> None:
             a[j, i] = mean
 
 
-@njit(cache=True)
+@compiled
 def lower_cholesky(a: Floats, lower: Floats) -> bool:
     """Fills `lower` with L, L Lᵀ = a. False when a is not positive definite; a column whose variance is 0 is allowed
     and stays 0.
@@ -118,7 +119,7 @@ def lower_cholesky(a: Floats, lower: Floats) -> bool:
     return True
 
 
-@njit(cache=True)
+@compiled
 def keep_positive_definite(a: Floats) -> bool:
     """Symmetrises a covariance and, where rounding has made it indefinite, raises its variances by the least that
     helps, in place.
@@ -139,7 +140,7 @@ def keep_positive_definite(a: Floats) -> bool:
     return True
 
 
-@njit(cache=True)
+@compiled
 def right_divide(t: Floats, lower: Floats) -> Floats:
     """t S⁻¹ for S = L Lᵀ: the Kalman gain from the cross covariance t."""
     n = lower.shape[0]
@@ -158,7 +159,7 @@ def right_divide(t: Floats, lower: Floats) -> Floats:
     return out
 
 
-@njit(cache=True)
+@compiled
 def mahalanobis_squared(v: Floats, lower: Floats) -> float:
     """vᵀ S⁻¹ v for S = L Lᵀ."""
     n = v.shape[0]

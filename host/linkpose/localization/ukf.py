@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.localization.gate import gate_blocks
 from linkpose.localization.linalg import (
     Floats,
@@ -33,7 +33,7 @@ from linkpose.localization.linalg import (
 from linkpose.localization.models import predict, propagate
 
 
-@njit(cache=True)
+@compiled
 def _points(
     motion: int, state: Floats, root: Floats, control: Floats, noise_root: Floats, interval: float, reach: float
 ) -> Floats:
@@ -55,7 +55,7 @@ def _points(
     return points
 
 
-@njit(cache=True)
+@compiled
 def _deviations(values: Floats, weight: float, is_angle: NDArray[np.bool_], first: int, mean: Floats) -> None:
     """(3) and (7): fills the weighted mean of the rows, and turns `values` into their deviations from it.
 
@@ -77,7 +77,7 @@ def _deviations(values: Floats, weight: float, is_angle: NDArray[np.bool_], firs
             values[i, j] = wrap_angle(difference) if angle else difference
 
 
-@njit(cache=True)
+@compiled
 def _moment(a: Floats, b: Floats, centre_weight: float, weight: float) -> Floats:
     """(4), (8), (9): Σ w_i a_i b_iᵀ over the rows."""
     out = np.zeros((a.shape[1], b.shape[1]))
@@ -89,14 +89,14 @@ def _moment(a: Floats, b: Floats, centre_weight: float, weight: float) -> Floats
     return out
 
 
-@njit(cache=True)
+@compiled
 def _assign(target: Floats, source: Floats) -> None:
     for i in range(target.shape[0]):
         for j in range(target.shape[1]):
             target[i, j] = source[i, j]
 
 
-@njit(cache=True)
+@compiled
 def ukf_step(
     motion: int,
     state: Floats,
@@ -161,7 +161,7 @@ def ukf_step(
     return keep_positive_definite(covariance)
 
 
-@njit(cache=True)
+@compiled
 def _rest(points: Floats, images: Floats, gain: Floats) -> Floats:
     """δx − K δz, row by row: what the measurement leaves of each point's deviation."""
     out = product_transposed(images, gain)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from linkpose.compiling import compiled
 
 _WIDEST = 22  # sign, 19 digits, point, separator
 _LARGEST = 9.2e18  # that a 64-bit integer holds
 _COMMA, _NEWLINE, _MINUS, _POINT, _ZERO = 44, 10, 45, 46, 48
 
 
-@njit(cache=True)
+@compiled
 def _format(values: NDArray[np.float64], decimals: NDArray[np.int64], out: NDArray[np.uint8]) -> int:
     """Writes rows of comma-separated numbers into `out`; the length. Missing or huge values are empty fields."""
     at = 0

@@ -51,9 +51,9 @@ def read_table(path: Path, kind: str | None = None) -> Table:
     An incomplete last line of linkpose's own, as a killed program leaves it, is left out. Raises LinkposeError naming
     the file and the line for whatever else is not a number, a row of another length, or a time that runs backwards.
     """
-    data = read_bytes(path)
+    data = read_bytes(path).removeprefix(b"\xef\xbb\xbf")  # as spreadsheets save
     lines_before, offset, comments = _head_lines(data)
-    found = _kind(comments)
+    found = _kind(path, comments)
     if kind is not None and found != kind:
         raise LinkposeError(
             f"{path} is no linkpose {kind}: its first line is {_excerpt(data)!r}, not '# linkpose {kind} 1'"
@@ -94,9 +94,17 @@ def _head_lines(data: bytes) -> tuple[int, int, list[str]]:
     return len(comments), offset, comments
 
 
-def _kind(comments: list[str]) -> str:
+def _kind(path: Path, comments: list[str]) -> str:
+    """What the first line says that the file is; raises LinkposeError for another version of the format."""
     words = comments[0].split() if comments else []
-    return words[1] if len(words) == 3 and words[0] == "linkpose" else ""
+    if len(words) != 3 or words[0] != "linkpose":
+        return ""
+    if words[2] != "1":
+        raise LinkposeError(
+            f"{path} is a linkpose {words[1]} of version {words[2][:20]}, and this program reads version 1: "
+            "read it with the linkpose that wrote it, or a newer one"
+        )
+    return words[1]
 
 
 def _excerpt(data: bytes) -> str:
@@ -120,8 +128,10 @@ def _is_number(text: str) -> bool:
 
 
 def _closing(body: bytes) -> tuple[bytes, dict[str, Any] | None]:
-    """Rows, without the closing line and without an incomplete last line; the closing line's content."""
+    """Rows, without blank lines at the end, the closing line and an incomplete one; the closing line's content."""
     body = body[: body.rfind(b"\n") + 1]
+    rows = body.rstrip()
+    body = body[: body.find(b"\n", len(rows)) + 1] if rows else b""
     start = body.rfind(b"\n", 0, len(body) - 1) + 1
     if body.startswith(b"#", start):
         try:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.wire.frames import Corrupt, OtherProtocol, StreamDecoder
 from linkpose.wire.messages import LAYOUTS, MAX_FRAME, Hello, Message, Sample
 
@@ -43,7 +43,7 @@ def _crc_table() -> NDArray[np.uint16]:
 _CRC = _crc_table()
 
 
-@njit(cache=True)
+@compiled
 def _unstuff(data: NDArray[np.uint8], start: int, end: int, out: NDArray[np.uint8]) -> int:
     """COBS-decodes data[start:end] into `out`; its length, or -1 where a code points past the end."""
     length = 0
@@ -62,7 +62,7 @@ def _unstuff(data: NDArray[np.uint8], start: int, end: int, out: NDArray[np.uint
     return length
 
 
-@njit(cache=True)
+@compiled
 def _decode(
     data: NDArray[np.uint8],
     crc_table: NDArray[np.uint16],

@@ -8,9 +8,9 @@ takes functions as arguments cannot be cached on disk.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 from linkpose.localization.models import (
     beacon_range,
@@ -30,7 +30,7 @@ BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, 
 MOUSE_VELOCITY, RATE_GYRO = mouse_velocity.ID, rate_gyro.ID
 
 
-@njit(cache=True)
+@compiled
 def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """Fills `out` with the state after `interval` seconds."""
     if motion == UNICYCLE:
@@ -43,7 +43,7 @@ def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interv
         planar_twist.propagate(state, control, noise, interval, out)
 
 
-@njit(cache=True)
+@compiled
 def motion_jacobians(
     motion: int, state: Floats, control: Floats, interval: float, by_state: Floats, by_noise: Floats
 ) -> None:
@@ -58,7 +58,7 @@ def motion_jacobians(
         planar_twist.jacobians(state, control, interval, by_state, by_noise)
 
 
-@njit(cache=True)
+@compiled
 def predict(
     model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
 ) -> None:
@@ -77,7 +77,7 @@ def predict(
         rate_gyro.predict(state, parameters, out)
 
 
-@njit(cache=True)
+@compiled
 def jacobian(
     model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
 ) -> None:

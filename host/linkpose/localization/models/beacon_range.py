@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 1
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, out: Floats) -> None:
     """The ranges (m)."""
     for i in range(out.shape[0]):
@@ -29,7 +28,7 @@ def predict(state: Floats, parameters: Floats, out: Floats) -> None:
             out[i] += state[bias]
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
     """Fills ∂h/∂state. On the beacon itself the direction is undefined and the slope is 0."""
     for i in range(out.shape[0]):

@@ -8,9 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from linkpose.compiling import compiled
 from linkpose.localization.grid import cast_ray
 from linkpose.localization.linalg import Floats
 
@@ -23,7 +23,7 @@ TURN_STEP = math.radians(0.5)
 EDGE = 20.0
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
     """The ranges (m) from the pose (x, y, θ) that `state` starts with."""
     c, s = math.cos(state[2]), math.sin(state[2])
@@ -34,7 +34,7 @@ def predict(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geome
         out[i] = cast_ray(blocked, geometry, x, y, angle, parameters[i, 4])
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
     """Fills ∂h/∂state by central differences, since a map has no formula; at an edge by the difference on one side."""
     above, below, centre = np.empty(out.shape[0]), np.empty(out.shape[0]), np.empty(out.shape[0])

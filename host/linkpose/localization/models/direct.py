@@ -6,21 +6,20 @@ Depth below the surface is -z, a compass reads the heading, a pose fix reads thr
 
 from __future__ import annotations
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 3
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, out: Floats) -> None:
     """The readings, in the units of the states."""
     for i in range(out.shape[0]):
         out[i] = parameters[i, 1] * state[int(parameters[i, 0])]
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
     """Fills ∂h/∂state."""
     for i in range(out.shape[0]):

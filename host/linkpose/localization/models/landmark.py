@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats, wrap_angle
 
 ID = 2
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, out: Floats) -> None:
     """Range (m) and bearing (rad), landmark by landmark."""
     for i in range(parameters.shape[0]):
@@ -24,7 +23,7 @@ def predict(state: Floats, parameters: Floats, out: Floats) -> None:
         out[2 * i + 1] = wrap_angle(math.atan2(dy, dx) - state[2])
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
     """Fills ∂h/∂state. On the landmark itself the direction is undefined and the slopes in x and y are 0."""
     for i in range(parameters.shape[0]):

@@ -6,14 +6,13 @@ Source: the velocity equations of the redundant mice, v_ix = v_bx − ω_b p_iy,
 
 from __future__ import annotations
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 4
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, out: Floats) -> None:
     """The velocities (m/s) in the robot's axes, mouse by mouse."""
     for i in range(parameters.shape[0]):
@@ -21,7 +20,7 @@ def predict(state: Floats, parameters: Floats, out: Floats) -> None:
         out[2 * i + 1] = state[4] + state[5] * parameters[i, 0]
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
     """Fills ∂h/∂state."""
     for i in range(parameters.shape[0]):

@@ -9,15 +9,15 @@ the drift ḃ.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 from linkpose.localization.models.se2 import move, slopes
 
 ID = 2
 
 
-@njit(cache=True)
+@compiled
 def propagate(state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """noise (a_x, a_y m/s², α rad/s², ḃ rad/s²); `control` is not used; interval in s."""
     move(state, state[3], state[4], state[5], interval, out)
@@ -25,7 +25,7 @@ def propagate(state: Floats, control: Floats, noise: Floats, interval: float, ou
         out[3 + i] += noise[i] * interval
 
 
-@njit(cache=True)
+@compiled
 def jacobians(state: Floats, control: Floats, interval: float, by_state: Floats, by_noise: Floats) -> None:
     """Fills ∂out/∂state and ∂out/∂noise at zero noise."""
     by_twist = np.empty((3, 3))

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 5
 
 
-@njit(cache=True)
+@compiled
 def predict(state: Floats, parameters: Floats, out: Floats) -> None:
     """The rate (rad/s)."""
     out[0] = state[5] + state[6]
 
 
-@njit(cache=True)
+@compiled
 def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
     """Fills ∂h/∂state."""
     out[0, 5] = 1.0

@@ -8,24 +8,23 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats, wrap_angle
 
 
-@njit(cache=True)
+@compiled
 def sinc(angle: float) -> float:
     """sin(angle)/angle."""
     return math.sin(angle) / angle if abs(angle) > 1e-4 else 1.0 - angle * angle / 6.0
 
 
-@njit(cache=True)
+@compiled
 def sinc_slope(angle: float) -> float:
     """The derivative of `sinc`."""
     return (math.cos(angle) - sinc(angle)) / angle if abs(angle) > 1e-4 else -angle / 3.0
 
 
-@njit(cache=True)
+@compiled
 def move(state: Floats, forward: float, left: float, rate: float, interval: float, out: Floats) -> None:
     """Fills `out` with `state`, its first three elements (x, y, θ) moved by m/s and rad/s over an interval in s."""
     for i in range(state.shape[0]):
@@ -38,7 +37,7 @@ def move(state: Floats, forward: float, left: float, rate: float, interval: floa
     out[2] = wrap_angle(state[2] + turn)
 
 
-@njit(cache=True)
+@compiled
 def slopes(
     heading: float, forward: float, left: float, rate: float, interval: float, by_state: Floats, by_twist: Floats
 ) -> None:

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats, wrap_angle
 
 ID = 1
 
 
-@njit(cache=True)
+@compiled
 def propagate(state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """control (v forward, left, up m/s, roll, pitch rad), noise (three velocities m/s, yaw acceleration rad/s²);
     interval in s.
@@ -40,7 +39,7 @@ def propagate(state: Floats, control: Floats, noise: Floats, interval: float, ou
     out[4] += noise[3] * interval
 
 
-@njit(cache=True)
+@compiled
 def jacobians(state: Floats, control: Floats, interval: float, by_state: Floats, by_noise: Floats) -> None:
     """Fills ∂out/∂state and ∂out/∂noise at zero noise."""
     cr, sr, cp, sp = math.cos(control[3]), math.sin(control[3]), math.cos(control[4]), math.sin(control[4])

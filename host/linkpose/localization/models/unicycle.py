@@ -8,21 +8,21 @@ scale error of a range sensor.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 from linkpose.localization.models.se2 import move, slopes
 
 ID = 0
 
 
-@njit(cache=True)
+@compiled
 def propagate(state: Floats, control: Floats, noise: Floats, interval: float, out: Floats) -> None:
     """control (v m/s, ω rad/s), noise alike; interval in s."""
     move(state, control[0] + noise[0], 0.0, control[1] + noise[1], interval, out)
 
 
-@njit(cache=True)
+@compiled
 def jacobians(state: Floats, control: Floats, interval: float, by_state: Floats, by_noise: Floats) -> None:
     """Fills ∂out/∂state and ∂out/∂noise at zero noise."""
     by_twist = np.empty((3, 3))

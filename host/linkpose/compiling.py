@@ -1,0 +1,131 @@
+"""The compiler of the filters' steps (numba), and where its machine code is kept from run to run.
+
+Numba looks only at the file of a cached function. What that function calls or reads in other files is in its machine
+code too, and would go stale unseen by an edit or an upgrade. So the code is kept in a folder that is named by all
+sources it may come from: other sources, another folder. That is in NUMBA_CACHE_DIR where the user has set it, in the
+user's cache directory, or beside this file, whichever first can be written; nowhere, and each run compiles anew.
+
+Decorators: `compiled` for any function, `inlined` for a long part of a step, which is put into its caller before that
+is compiled (else it stays a call), `inner` for what only compiled code calls.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).parent
+# All that compiled functions are in, call, or take constants from.
+_SOURCES = (
+    "__init__.py",
+    "compiling.py",
+    "errors.py",
+    "filters/**/*.py",
+    "localization/**/*.py",
+    "recording/__init__.py",
+    "recording/fixedpoint.py",
+    "sensors/**/*.py",
+    "wire/**/*.py",
+)
+_config: Any = numba.config  # its attributes are made as it is imported
+_PREFIX = "compiled-"
+_OTHERS_KEPT = 2  # those last used: another version of this package may be at work beside this one
+
+
+def cache_folder(package: Path = _PACKAGE) -> Path | None:
+    """Where the machine code of this package's sources is kept, made if need be; None where nothing can be written."""
+    name = _PREFIX + _fingerprint(package)
+    for root in _roots(package):
+        folder = root / "linkpose" / name
+        with contextlib.suppress(OSError):
+            _make(folder)
+            return folder
+    return None
+
+
+def _fingerprint(package: Path) -> str:
+    digest = hashlib.blake2b(numba.__version__.encode(), digest_size=10)
+    for pattern in _SOURCES:
+        for path in sorted(package.glob(pattern)):
+            digest.update(f"\0{path.relative_to(package)}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _roots(package: Path) -> Iterator[Path]:
+    if _config.CACHE_DIR:
+        yield Path(_config.CACHE_DIR)
+    with contextlib.suppress(RuntimeError):  # nobody's home
+        yield _user_cache()
+    yield package / "__pycache__"
+
+
+def _user_cache() -> Path:
+    """Raises RuntimeError where there is no home directory."""
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    windows = sys.platform == "win32"
+    named = Path(os.environ.get("LOCALAPPDATA" if windows else "XDG_CACHE_HOME", ""))
+    if named.is_absolute():
+        return named
+    return Path.home() / ("AppData/Local" if windows else ".cache")
+
+
+def _make(folder: Path) -> None:
+    """Makes the folder and removes those that are out of use, or marks it as used. Raises OSError."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        os.utime(folder)
+    else:
+        _remove_unused(folder)
+    tempfile.TemporaryFile(dir=folder).close()  # a read-only file system tells it only so
+
+
+def _remove_unused(new: Path) -> None:
+    others = []
+    for other in new.parent.glob(_PREFIX + "*"):
+        with contextlib.suppress(OSError):  # another process may have been faster
+            others.append((other.stat().st_mtime_ns, other))
+    others = sorted(entry for entry in others if entry[1] != new)
+    for _, other in others[: max(0, len(others) - _OTHERS_KEPT)]:
+        shutil.rmtree(other, ignore_errors=True)
+
+
+_the_folder = functools.cache(cache_folder)
+
+
+def _decorator(**options: Any) -> Callable[[Function], Function]:
+    # Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
+    options = {"error_model": "numpy", **options}
+
+    def decorate(function: Function) -> Function:
+        folder = _the_folder()
+        asked = _config.CACHE_DIR
+        _config.CACHE_DIR = str(folder or asked)
+        try:  # the place is asked for here, once: other users of numba keep theirs
+            made: Function = numba.njit(cache=folder is not None, **options)(function)
+        finally:
+            _config.CACHE_DIR = asked
+        return made
+
+    return decorate
+
+
+compiled = _decorator()
+inlined = _decorator(inline="always")
+# Without the wrappers for Python, which take a quarter of the time to compile.
+inner = _decorator(no_cpython_wrapper=True, no_cfunc_wrapper=True)

@@ -1,0 +1,169 @@
+"""Machine code is kept from run to run, and never used with other sources than its own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from linkpose import compiling
+
+HOST = Path(__file__).parents[2] / "host"
+
+# A compiled function whose machine code has in it what it calls in another file, and a class in its signature.
+HEIGHT = """
+import numpy as np
+from linkpose.filters import baro
+state = baro.StartState.fresh()
+state.force[2] = 9.8
+print(baro.start_height(state, (0.0, 0.0, 1.5)), sum(baro.start_height.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def package(tmp_path) -> Path:
+    """A copy of the package, to be edited."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    return Path(shutil.copytree(HOST / "linkpose", tmp_path / "host" / "linkpose", ignore=ignored))
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch) -> Path:
+    """What is kept goes here."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "linkpose"
+
+
+def run(code: str, host: Path, **environment: object) -> str:
+    changed = {"PYTHONPATH": host, "PYTHONDONTWRITEBYTECODE": 1, **environment}
+    everything = {**os.environ, **{name: str(value) for name, value in changed.items()}}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=everything)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def test_an_edit_in_another_file_and_a_renamed_class_are_seen(package, tmp_path):
+    host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
+    assert run(HEIGHT, host, **place) == "1.5 0"
+    assert run(HEIGHT, host, **place) == "1.5 1"
+    edit(package / "filters" / "_vector.py", "return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]", "return 4.0")
+    assert run(HEIGHT, host, **place) == "2.0 0"
+    edit(package / "filters" / "baro.py", "StartState", "Beginning")
+    assert run(HEIGHT.replace("StartState", "Beginning"), host, **place) == "2.0 0"
+
+
+def test_the_compiler_itself_and_each_source_of_machine_code_change_the_folder(package, cache, monkeypatch):
+    folders = {compiling.cache_folder(package)}
+    for name in ("filters/_vector.py", "localization/models/se2.py", "sensors/mpu6050.py", "wire/messages.py"):
+        edit(package / name, "from __future__", "# edited\nfrom __future__")
+        folders.add(compiling.cache_folder(package))
+    monkeypatch.setattr("numba.__version__", "0.0")
+    folders.add(compiling.cache_folder(package))
+    edit(package / "cli" / "plot.py", "from __future__", "# edited\nfrom __future__")
+    folders.add(compiling.cache_folder(package))
+    assert len(folders) == 6
+
+
+def test_all_that_compiled_modules_import_of_this_package_is_among_the_sources():
+    code = (
+        "import importlib, pathlib, sys, linkpose.compiling as c\n"
+        "for path in c._PACKAGE.rglob('*.py'):\n"
+        "    if 'from linkpose.compiling import' in path.read_text('utf-8'):\n"
+        "        importlib.import_module('.'.join(path.relative_to(c._PACKAGE.parent).with_suffix('').parts))\n"
+        "known = {str(path) for pattern in c._SOURCES for path in c._PACKAGE.glob(pattern)}\n"
+        "used = {m.__file__ for name, m in sys.modules.items() if name.split('.')[0] == 'linkpose'}\n"
+        "print(len(used) > 40, sorted(used - known))"
+    )
+    assert run(code, HOST) == "True []"
+
+
+def test_only_one_module_asks_the_compiler():
+    asking = [
+        path.relative_to(HOST).as_posix()
+        for path in HOST.rglob("*.py")
+        if any(line.startswith(("import numba", "from numba")) for line in path.read_text("utf-8").splitlines())
+    ]
+    assert asking == ["linkpose/compiling.py"]
+
+
+def test_folders_out_of_use_are_removed_and_nothing_else(package, cache):
+    def edited(number: int) -> Path:
+        edit(package / "errors.py", "from __future__", f"# {number}\nfrom __future__")
+        folder = compiling.cache_folder(package)
+        assert folder is not None
+        (folder / "filters").mkdir(exist_ok=True)
+        os.utime(folder, (number, number))
+        return folder
+
+    cache.mkdir(parents=True)
+    (cache / "notes").mkdir()
+    folders = [edited(number) for number in range(3)]
+    assert compiling.cache_folder(package) == folders[2]
+    os.utime(folders[0], (10, 10))  # used again
+    newest = edited(20)
+    assert set(cache.iterdir()) == {cache / "notes", folders[0], folders[2], newest}
+
+
+def test_processes_that_start_together_share_the_folder(package, cache):
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: compiling.cache_folder(package), range(40)))
+    assert set(folders) == set(cache.iterdir()) == {folders[0]}
+
+
+def test_where_nothing_can_be_written_the_steps_run_all_the_same(package, tmp_path):
+    (tmp_path / "file").touch()
+    nowhere = tmp_path / "file" / "below"
+    shutil.rmtree(package / "__pycache__", ignore_errors=True)
+    (package / "__pycache__").touch()
+    places = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "LOCALAPPDATA", "USERPROFILE"), nowhere)
+    before = set(tmp_path.rglob("*"))
+    assert run(HEIGHT, package.parent, **places) == "1.5 0"
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_a_home_that_cannot_be_written_leaves_the_place_beside_the_package(package, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    for name in ("XDG_CACHE_HOME", "LOCALAPPDATA", "HOME", "USERPROFILE"):
+        monkeypatch.setenv(name, str(tmp_path / "file" / "below"))
+    folder = compiling.cache_folder(package)
+    assert folder is not None and folder.parent == package / "__pycache__" / "linkpose"
+
+
+@pytest.mark.parametrize(
+    ("platform", "variables", "place"),
+    [
+        ("linux", {}, "home/.cache"),
+        ("linux", {"XDG_CACHE_HOME": "asked"}, "asked"),
+        ("darwin", {"XDG_CACHE_HOME": "asked"}, "home/Library/Caches"),
+        ("win32", {"LOCALAPPDATA": "asked"}, "asked"),
+    ],
+)
+def test_the_code_is_kept_in_the_users_cache(platform, variables, place, package, tmp_path, monkeypatch):
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", lambda: tmp_path / "home")
+    for name, value in variables.items():
+        monkeypatch.setenv(name, str(tmp_path / value))
+    folder = compiling.cache_folder(package)
+    assert folder is not None and folder.parent == tmp_path / place / "linkpose"
+
+
+def test_other_users_of_the_compiler_keep_their_place():
+    code = (
+        "import numba, linkpose.localization.linalg, linkpose.filters.baro\n"
+        "print(repr(numba.config.CACHE_DIR))"
+    )
+    assert run(code, HOST, NUMBA_CACHE_DIR="") == "''"
