@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.signal import butter, lfilter
 
 from linkpose import filters
 from linkpose.calibration.imu import calibrate_imu, with_calibration
@@ -63,6 +64,32 @@ def test_imu_from_six_sides():
     assert found.gyro_noise_rad_s == pytest.approx(0.001, rel=0.1)
     assert found.accel_noise_m_s2 == pytest.approx(0.04, rel=0.1)
     assert found.pressure_noise_Pa == pytest.approx(3.0, rel=0.1)
+
+
+@pytest.mark.parametrize("bandwidth_hz", [None, 44.0, 5.0])
+@pytest.mark.parametrize("seconds", [1.2, 60.0])
+def test_the_noise_is_that_of_a_sample_however_the_low_pass_filter_is_set(bandwidth_hz, seconds):
+    """At 500 Hz neighbours are nearly alike behind the filter; a gyro that warms up by 1 °/s is no noise."""
+    rng, rate = np.random.default_rng(7), 500
+    time = np.arange(int((seconds + 1.0) * rate)) / rate
+    noise = rng.normal(size=(2000 + len(time), 60))
+    if bandwidth_hz:
+        noise = lfilter(*butter(2, bandwidth_hz, fs=rate), noise, axis=0)
+    noise = (noise / noise[1000:].std())[-len(time) :]
+    warming = np.radians(1.0) * np.exp(-time / 100.0)
+    rests = [
+        replace(
+            LinkRun(1, 0, 1.0).measurements()[np.zeros(len(time), int)],
+            time_s=time,
+            gyro_rad_s=warming[:, np.newaxis] + 0.0006 * noise[:, 6 * k : 6 * k + 3],
+            accel_m_s2=np.array([0.0, 0.0, 9.8]) + 0.03 * noise[:, 6 * k + 3 : 6 * k + 6],
+        )
+        for k in range(10)
+    ]
+    found = calibrate_imu([recording(rest) for rest in rests])
+    close = 0.15 if bandwidth_hz == 5.0 and seconds < 2 else 0.05
+    assert found.gyro_noise_rad_s == pytest.approx(0.0006, rel=close)
+    assert found.accel_noise_m_s2 == pytest.approx(0.03, rel=close)
 
 
 def test_from_one_attitude_the_accelerometer_stays_as_it_was():

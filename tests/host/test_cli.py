@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from linkpose.cli import COMMANDS
@@ -120,6 +121,30 @@ def test_j2s_auto_is_estimated_and_told_live_and_over_the_recording(linkpose, re
     assert rows(live) == rows(replay) and closing_line(replay)["j2s_m"] == found["j2s_m"]
     assert "joint needs a J2S that is known" in refused("estimate", recording, "--j2s", "auto", "--filter", "joint")
     assert "add --filter joint-inertial" in refused("estimate", recording, "--j2s", "auto", "--filter", "tilt")
+
+
+def test_a_j2s_that_is_known_to_millimetres_is_refined(linkpose, refused, tmp_path):
+    """A ruler's error of 5 mm goes into the height, unless --j2s-std says that it may be there."""
+    recording, truth, out = tmp_path / "r.csv", tmp_path / "truth.csv", tmp_path / "e.csv"
+    link = ["link", "--j2s", "0.0,-0.05,0.6", "--duration", 30]
+    linkpose("simulate", *link, "-o", recording, "--truth", truth)
+
+    def error_m(*j2s: object) -> float:
+        estimate = ["estimate", recording, *j2s, "--filter", "joint-inertial", "-o", out, "--force"]
+        assert linkpose(*estimate).status == 0
+        difference = read_table(out).columns["joint_inertial_height_m"] - read_table(truth).columns["height_m"]
+        return float(np.sqrt(np.mean(difference[1000:] ** 2)))
+
+    measured = ["--j2s", "0.0,-0.05,0.605"]
+    assert error_m(*measured) == pytest.approx(0.005, rel=0.4)
+    assert error_m(*measured, "--j2s-std", 0.005) < 0.001
+    assert "joint needs a J2S that is known" in refused(
+        "estimate", recording, *measured, "--j2s-std", 0.2, "--filter", "joint"
+    )
+    for wrong in ([*measured, "--j2s-std", 0], [*measured, "--j2s-std", -0.01], [*measured, "--j2s-std", "nan"]):
+        assert linkpose("estimate", recording, *wrong).status == 2
+    for wrong in (["--j2s-std", 0.01], ["--j2s", "auto", "--j2s-std", 0.01]):
+        assert "add --j2s X,Y,Z" in refused("estimate", recording, *wrong)
 
 
 def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):

@@ -172,6 +172,7 @@ def test_odometry_counts_from_where_the_reference_stood_at_its_start(tmp_path):
     for stretch, error in ((1.0, 0.0), (1.01, 0.01 * np.sqrt(np.mean(np.sin(T) ** 2 + T**2)))):
         estimate = {"time_s": T, "mice_x_m": stretch * turned.real, "mice_y_m": stretch * turned.imag}
         path = write(tmp_path / f"{stretch}.csv", estimate | {"mice_heading_rad": heading, "mice_excluded": 0 * T})
+        assert complaints(path, reference) == ""
         found = scores(path, reference)["mice"]
         assert found["position_rmse_m"] == pytest.approx(error, rel=0.01, abs=1e-6)
         assert found["heading_rmse_rad"] == pytest.approx(0, abs=1e-6)

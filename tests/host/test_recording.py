@@ -195,7 +195,7 @@ BAD_FILES = {
     ),
     "an unknown column": (
         lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_x_rad"),
-        "unknown column gyro_x_rad; did you mean gyro_x_rad_s?",
+        "unknown column gyro_x_rad; did you mean gyro_x_rad_s, with values in its unit?",
     ),
     "a column twice": (lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_y_rad_s"), "gyro_y_rad_s stands twice"),
     "no inertial sensor": (
@@ -256,6 +256,31 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
     assert equal(part.measurements, whole[: len(part.measurements)])
     assert len(part.measurements) >= 99 - cut // 80
     assert "has no closing line" in part.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "factor", "says"),
+    [
+        ("accel_x_m_s2", "accel_z_m_s2", 1 / 9.80665, "are they in g? multiply them by 9.80665"),
+        ("accel_x_m_s2", "accel_z_m_s2", 1000 / 9.80665, "thousandths of g? multiply them by 0.00980665"),
+        ("gyro_x_rad_s", "gyro_z_rad_s", 180 / np.pi, "are they in °/s? multiply them by 0.0174533"),
+        ("time_s", "time_s", 1e3, "in steps of 10 s (median): is it in milliseconds? divide it by 1000"),
+        ("time_s", "time_s", 1e6, "is it in microseconds? divide it by 1000000"),
+        ("pressure_Pa", "pressure_Pa", 0.01, "is it in hPa? multiply it by 100"),
+        ("pressure_Pa", "pressure_Pa", 0.001, "is it in kPa? multiply it by 1000"),
+    ],
+)
+def test_values_in_another_unit_are_noticed(recording, first, last, factor, says):
+    def scaled(lines):
+        names = lines[2].strip().split(",")
+        scale = np.ones(len(names))
+        scale[names.index(first) : names.index(last) + 1] = factor
+        rows = np.loadtxt(lines[3:-1], delimiter=",") * scale
+        return [*lines[:3], *(",".join(f"{value:.9f}" for value in row) + "\n" for row in rows), lines[-1]]
+
+    assert load_recording(recording).remarks == []
+    (remark,) = load_recording(edited(recording, scaled)).remarks
+    assert says in remark and str(recording) in remark
 
 
 @pytest.mark.parametrize(

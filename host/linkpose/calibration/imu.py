@@ -22,6 +22,7 @@ FEWEST_ATTITUDES = 6
 _APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
 LARGEST_OFFSET_M_S2, LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
 _WORST_RESIDUAL_M_S2 = 0.1
+_PIECE_S = 2.0  # of a rest: long against the slowest low-pass filter (5 Hz), short against the warming up
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,8 @@ def calibrate_imu(recordings: Sequence[Recording]) -> ImuCalibration:
         len(rests),
         len(attitudes),
         np.asarray(bias),
-        _noise([rest.gyro_rad_s for rest in rests]),
-        _noise([rest.accel_m_s2 for rest in rests]),
+        _noise(rests, [rest.gyro_rad_s for rest in rests]),
+        _noise(rests, [rest.accel_m_s2 for rest in rests]),
         offset,
         scale,
         residual,
@@ -125,10 +126,21 @@ def _distinct(forces: Floats) -> Floats:
     return np.array([np.mean(group, axis=0) for group in groups])
 
 
-def _noise(rests: Sequence[Floats]) -> float:
-    """Standard deviation of one sample, from differences of neighbours, so that a slow drift is not in it."""
-    squares = np.concatenate([np.diff(rest, axis=0).ravel() ** 2 for rest in rests])
-    return max(float(np.sqrt(np.mean(squares) / 2)), 1e-6)
+def _noise(rests: Sequence[Measurements], readings: Sequence[Floats]) -> float:
+    """Standard deviation of one sample about a line through each piece of a rest: a slow drift is not in it.
+
+    Differences of neighbours would miss what the sensor's low-pass filter makes alike in both.
+    """
+    squares, freedom = 0.0, 0
+    for rest, values in zip(rests, readings, strict=True):
+        span = float(rest.time_s[-1] - rest.time_s[0])
+        for piece in np.array_split(np.arange(len(rest)), max(1, round(span / _PIECE_S))):
+            at, apart = rest.time_s[piece], values[piece]
+            at, apart = at - at.mean(), apart - apart.mean(axis=0)
+            left = apart - np.outer(at, at @ apart / (at @ at))
+            squares += float((left**2).sum())
+            freedom += 3 * (len(piece) - 2)
+    return max(float(np.sqrt(squares / freedom)), 1e-6)
 
 
 def _pressure_noise(rests: Sequence[Measurements]) -> float | None:

@@ -66,6 +66,7 @@ def command(
     smooth: bool,
     rig_file: Path | None,
     joint: Joint | None,
+    j2s_std: float | None,
     board: dict[str, int],
     force: bool,
     json_lines: bool,
@@ -86,6 +87,7 @@ def command(
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
     refuse_same_file(recording, output, record, raw)
+    joint = options.joint_from(joint, j2s_std)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
     console = Console(quiet, verbose)
     if recording is not None:

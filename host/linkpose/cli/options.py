@@ -87,12 +87,27 @@ def duration(function: Function) -> Function:
 
 def rig_and_j2s(function: Function) -> Function:
     function = click.option(
+        "--j2s-std",
+        type=FiniteRange(min=0, min_open=True),
+        metavar="METRES",
+        help="How well --j2s is known, each axis: joint-inertial refines it. Default: 0.0001.",
+    )(function)
+    function = click.option(
         "--j2s",
         "joint",
         type=JointType(),
         help="Vector from the joint centre to the sensor, in its axes (m); auto: estimate it.",
     )(function)
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
+
+
+def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
+    """What --j2s and --j2s-std say together."""
+    if j2s_std_m is None:
+        return joint
+    if joint is None or joint is UNKNOWN_JOINT:
+        raise click.UsageError("--j2s-std is of a J2S that is given: add --j2s X,Y,Z")
+    return replace(joint, j2s_std_m=j2s_std_m)
 
 
 def sensor_errors(function: Function) -> Function:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError
 from linkpose.recording import columns
 from linkpose.recording.table import Table, read_bytes, read_table
+from linkpose.recording.units import suspicions
 from linkpose.sensors import bmp180, mpu6050
 from linkpose.sensors.conversion import GAP_BEFORE, MOUSE_VALID, TIME_DECIMALS, Settings
 from linkpose.sensors.measurements import Floats, Measurements
@@ -73,6 +74,7 @@ def _from_csv(path: Path) -> Recording:
         _flags(table),
     )
     remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
+    remarks += suspicions(path, measurements)
     rig = Rig.from_dict(_metadata_object(table, "rig"), f"{path}, line 2") if "rig" in table.metadata else None
     return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
 
@@ -84,7 +86,7 @@ def _check_columns(table: Table) -> int:
     for name in table.columns:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
-            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
             raise LinkposeError(f"{table.path}: unknown column {name}; {hint}")
     ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
     for port in ports:
