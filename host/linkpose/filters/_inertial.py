@@ -22,6 +22,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from linkpose.compiling import compiled, inlined
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration
@@ -49,6 +51,14 @@ class SensorErrors(NamedTuple):
     accel_bias_m_s2: float
     accel_scale: float
     accel_cross: float
+    fade_s: float  # after which e⁻¹ of what was found of them is left
+
+    def variances(self) -> Floats:
+        """Of each state (33,), before anything was measured; 0 for those that are no error of a sensor."""
+        accel = np.where(np.eye(3, dtype=bool), self.accel_scale, self.accel_cross)
+        gyro = np.where(np.eye(3, dtype=bool), self.gyro_scale, self.gyro_cross)
+        biases = 3 * [self.gyro_bias_rad_s] + 3 * [self.accel_bias_m_s2]
+        return np.concatenate([np.zeros(6), biases, accel.ravel(), gyro.ravel(), np.zeros(3)]) ** 2
 
 
 class Since(NamedTuple):
@@ -104,18 +114,6 @@ def others(a: Vec, c: int) -> tuple[float, float]:
 def along(variance: float) -> float:
     """Variance of Z along itself when it is turned by angles of this variance: cosines fall short of 1."""
     return 0.5 * min(max(variance - _SMALL_RAD2, 0.0), 1.0) ** 2
-
-
-@compiled
-def prior(belief: SensorErrors, i: int) -> float:
-    """Variance of state i, one of the sensors' errors, before anything was measured."""
-    if i < BA:
-        return belief.gyro_bias_rad_s**2
-    if i < MA:
-        return belief.accel_bias_m_s2**2
-    if i < MG:
-        return (belief.accel_scale if (i - MA) % 4 == 0 else belief.accel_cross) ** 2
-    return (belief.gyro_scale if (i - MG) % 4 == 0 else belief.gyro_cross) ** 2
 
 
 @compiled
@@ -283,16 +281,16 @@ def add_noise(p: Floats, tilt: Vec, velocity: Vec, rotation: float, gained: floa
 
 
 @compiled
-def fade(x: Floats, p: Floats, passed_s: float, fade_s: float, belief: SensorErrors) -> None:
-    """First-order Gauss-Markov: what was found of the sensors' errors, but for the gyro's bias, returns to nothing."""
+def fade(x: Floats, p: Floats, passed_s: float, fade_s: float, start: Floats, prior: Floats) -> None:
+    """First-order Gauss-Markov: what was found of the sensors' errors, but for b_g, returns to what it started from."""
     kept = math.exp(-passed_s / fade_s)
     for i in range(BA, D):
-        x[i] *= kept
+        x[i] = start[i] + kept * (x[i] - start[i])
         for j in range(SIZE):
             p[i, j] *= kept
         for j in range(SIZE):
             p[j, i] *= kept
-        p[i, i] += (1.0 - kept * kept) * prior(belief, i)
+        p[i, i] += (1.0 - kept * kept) * prior[i]
 
 
 @compiled

@@ -70,7 +70,6 @@ from linkpose.filters._inertial import (
     height,
     others,
     predict,
-    prior,
     put_errors,
     set_upright,
     take,
@@ -94,8 +93,8 @@ _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, wher
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
 
 
-CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005)
-DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012)
+CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005, 200.0)
+DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012, 1000.0)
 _BELIEFS = (CALIBRATED, DATA_SHEET)
 _ODDS = 15.0  # logarithm of those of the first of them, before anything was measured
 _OCCAM = 8.0  # the wider belief can explain what is no error of a sensor: what it finds must lie well within it
@@ -105,19 +104,11 @@ class JointInertialParameters(NamedTuple):
     """What the filter assumes."""
 
     gyro_bias_walk_rad_s: float = 3e-4  # in a second: 1 °/s in the hour of warming up
-    fade_s: float = 200.0  # after which e⁻¹ of what was believed of the sensors' errors is left
     j2s_walk: float = 0.001  # of J2S in a second, as a share of what it was not known to at the start
     least_misfit: float = 0.0013  # of the constraint, as a share of ‖ω×d‖
     first_misfit: float = 0.03  # before it has been measured
     misfit_time_s: float = 4.0  # over which it is measured
     velocity_floor_m_s: float = 0.001  # play of the joint, bend of the link
-
-
-class Lever(NamedTuple):
-    """What is known of J2S beforehand."""
-
-    j2s: Vec  # m
-    variance: float  # each axis (m²)
 
 
 class Now(NamedTuple):
@@ -141,7 +132,10 @@ class State(NamedTuple):
     now: Floats  # (28,) the fields of Now, one after the other
     mean: Floats  # (33,)
     covariance: Floats  # (33, 33)
-    belief: Floats  # (2,) time since it last faded (s); half the χ² of the sensors' errors by it
+    start_mean: Floats  # (33,) to begin with; of tilt and velocity it says nothing
+    start_covariance: Floats  # (33, 33)
+    prior: Floats  # (33,) variances of the sensors' errors, by what is believed of them
+    belief: Floats  # (3,) time since it last faded (s); half the χ² of the errors found by it; how long it lasts (s)
     rest: Floats  # (7,) for how long it has been still (s), first force, sum over time of the rate
     misfit: Floats  # (2,) mean squares of the excess innovation and of ‖ω‖‖d‖ (m/s)²
     work: Floats  # (12, 33) F P; errors of ω and f, within a step
@@ -149,12 +143,18 @@ class State(NamedTuple):
     counts: NDArray[np.int64]  # (2,) rejected samples, restarts
 
     @staticmethod
-    def fresh() -> State:
+    def fresh(belief: SensorErrors, j2s_m: Vec, j2s_std_m: float) -> State:
+        prior = belief.variances()
+        mean = np.concatenate([np.zeros(D), j2s_m])
+        covariance = np.diag(prior + np.repeat([0.0, j2s_std_m**2], [D, 3]))
         return State(
             np.concatenate([[np.nan], np.zeros(27)]),
             np.zeros(SIZE),
             np.zeros((SIZE, SIZE)),
-            np.zeros(2),
+            mean,
+            covariance,
+            prior,
+            np.array([0.0, 0.0, belief.fade_s]),
             np.zeros(7),
             np.zeros(2),
             np.zeros((12, SIZE)),
@@ -178,9 +178,8 @@ class JointInertialFilter:
         """The rig must know J2S, be it as roughly as `j2s_std_m` says."""
         assert rig.joint.j2s_m is not None
         self.parameters = parameters or JointInertialParameters()
-        self.states = tuple(State.fresh() for _ in _BELIEFS)
+        self.states = tuple(State.fresh(belief, rig.joint.j2s_m, rig.joint.j2s_std_m) for belief in _BELIEFS)
         self._imu = ImuCalibration.of(rig.imu)
-        self._lever = Lever(rig.joint.j2s_m, rig.joint.j2s_std_m**2)
 
     @property
     def state(self) -> State:
@@ -201,9 +200,11 @@ class JointInertialFilter:
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
         """J2S as estimated so far, and its covariance: (3,) m, (3, 3) m². Before the first sample, the rig's."""
-        if math.isnan(self.state.now[0]):
-            return np.array(self._lever.j2s), self._lever.variance * np.eye(3)
-        return self.state.mean[D:].copy(), self.state.covariance[D:, D:].copy()
+        state = self.state
+        begun = not math.isnan(state.now[0])
+        mean = state.mean if begun else state.start_mean
+        covariance = state.covariance if begun else state.start_covariance
+        return mean[D:].copy(), covariance[D:, D:].copy()
 
     @property
     def gyro_bias_rad_s(self) -> Floats:
@@ -215,14 +216,25 @@ class JointInertialFilter:
         """(3,) as estimated so far, over the rig's calibration."""
         return self.state.mean[BA:MA].copy()
 
+    def start_from(self, learned: JointInertialFilter, backwards: bool = False) -> None:
+        """Begins with what another filter has found of J2S and of the sensors; `backwards`: with time reversed."""
+        for own, other in zip(self.states, learned.states, strict=True):
+            own.start_mean[BG:] = other.mean[BG:]
+            own.start_covariance[BG:, BG:] = other.covariance[BG:, BG:]
+            own.belief[1] = other.belief[1]
+            if backwards:
+                own.start_mean[BG:BA] *= -1
+                own.start_covariance[BG:BA] *= -1
+                own.start_covariance[:, BG:BA] *= -1
+
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
         n = len(block)
         estimates = [np.empty((n, 6)) for _ in _BELIEFS]
-        for belief, state, estimate in zip(_BELIEFS, self.states, estimates, strict=True):
+        for state, estimate in zip(self.states, estimates, strict=True):
             _process(
                 block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-                self._imu, belief, self.parameters, self._lever, state, estimate,
+                self._imu, self.parameters, state, estimate,
             )  # fmt: skip
         out = np.empty((n, 4))
         _mix(estimates[0], estimates[1], out)
@@ -257,11 +269,11 @@ def _trace(p: Floats, k: int) -> float:
 
 
 @compiled
-def _distance(x: Floats, belief: SensorErrors) -> float:
+def _distance(x: Floats, prior: Floats) -> float:
     """Half the χ² of the errors that were found, by what is believed of the sensors; the gyro's bias may be any."""
     square = 0.0
     for i in range(BA, D):
-        square += x[i] * x[i] / prior(belief, i)
+        square += x[i] * x[i] / prior[i]
     return 0.5 * square
 
 
@@ -271,16 +283,11 @@ def _begin(
     force: Vec,
     rate: Vec,
     imu: ImuCalibration,
-    belief: SensorErrors,
     q: JointInertialParameters,
-    lever: Lever,
 ) -> None:
     """Mean and covariance from one sample and the priors."""
-    state.mean[:] = 0.0
-    state.covariance[:] = 0.0
-    for i in range(BG, SIZE):
-        state.covariance[i, i] = lever.variance if i >= D else prior(belief, i)
-    vec.put(state.mean, D, lever.j2s)
+    state.mean[:] = state.start_mean
+    state.covariance[:] = state.start_covariance
     _set_upright(state.mean, state.covariance, force, rate, imu)
     state.misfit[0], state.misfit[1] = 0.5 * q.first_misfit**2, 0.5
 
@@ -420,31 +427,31 @@ def _same(a: Vec, b: Vec) -> bool:
 @compiled
 def _close(
     state: State, since: Since, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration,
-    belief: SensorErrors, q: JointInertialParameters, lever: Lever,
+    q: JointInertialParameters,
 ) -> bool:  # fmt: skip
     """Brings the covariance up to the mean, and corrects both. False where the correction was refused."""
     x, p, h = state.mean, state.covariance, since.span
     catch_up(x, p, state.work, since, 0.0, 0.0, q.gyro_bias_walk_rad_s**2 * h)
     for i in range(D, SIZE):
-        p[i, i] += q.j2s_walk**2 * lever.variance * h
+        p[i, i] += q.j2s_walk**2 * state.start_covariance[D, D] * h
     state.belief[0] += h
     if state.belief[0] > FADING_PACE_S:
-        fade(x, p, state.belief[0], q.fade_s, belief)
+        fade(x, p, state.belief[0], state.belief[2], state.start_mean, state.prior)
         state.belief[0] = 0.0
     _take_bias_from_rest(x, p, state.rest)
     taken = _correct(state, jumped, before, rate, h, imu, q) if has_rate else True
-    state.belief[1] = _distance(x, belief)
+    state.belief[1] = _distance(x, state.prior)
     return taken
 
 
 @inlined
 def _start(
-    state: State, first: bool, time_s: float, force: Vec, rate: Vec, imu: ImuCalibration, belief: SensorErrors,
-    q: JointInertialParameters, lever: Lever,
+    state: State, first: bool, time_s: float, force: Vec, rate: Vec, imu: ImuCalibration,
+    q: JointInertialParameters,
 ) -> Now:  # fmt: skip
     """From one sample, for the first time or after a gap that leaves nothing of the attitude."""
     if first:
-        _begin(state, force, rate, imu, belief, q, lever)
+        _begin(state, force, rate, imu, q)
     else:
         _set_upright(state.mean, state.covariance, force, rate, imu)
     return Now(time_s, 0.0, time_s, 0.0, force, rate, rate, ZERO, ZERO, AT_ONCE)
@@ -465,7 +472,7 @@ def _turn(now: Now, step: float, has_rate: bool, rate: Vec, jerk: Vec, jumped: b
 @inlined
 def _advance(
     state: State, x: Floats, now: Now, time_s: float, has_force: bool, force: Vec, has_rate: bool, rate: Vec,
-    imu: ImuCalibration, belief: SensorErrors, q: JointInertialParameters, lever: Lever,
+    imu: ImuCalibration, q: JointInertialParameters,
 ) -> tuple[Now, bool]:  # fmt: skip
     """One sample later. False where what it read was refused."""
     before_a, before_w, had_rate = now.force, now.rate, now.held == 0.0
@@ -482,7 +489,7 @@ def _advance(
         change, since = vec.minus(force, before_a), now.since
         jumped = jumped or vec.dot(change, change) > _JUMP_M_S2**2
         if jumped and since.span > 0.0:  # that this reading be judged alone
-            _close(state, since, had_rate, False, before_w, before_w, imu, belief, q, lever)
+            _close(state, since, had_rate, False, before_w, before_w, imu, q)
             now = Now(
                 now.time, now.held, now.turned_at, now.doubt, before_a, before_w, now.newest, now.angle, now.change,
                 AT_ONCE,
@@ -492,7 +499,7 @@ def _advance(
         if has_force and has_rate:
             _watch_rest(state.rest, force, rate, h, imu)
         if jumped or since.span > PACE_S:
-            taken = _close(state, since, has_rate, jumped, before_w, rate, imu, belief, q, lever)
+            taken = _close(state, since, has_rate, jumped, before_w, rate, imu, q)
             since = AT_ONCE
         if not taken:
             # A spike: what it did to this step is in doubt, and the next step goes without it.
@@ -500,7 +507,7 @@ def _advance(
             add_noise(state.covariance, vec.at(x, Z), vec.at(x, V), 0.0, gained)
             rate, force, change = before_w, before_a, ZERO
         if _runs_away(x) or state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2):
-            _begin(state, force, rate, imu, belief, q, lever)
+            _begin(state, force, rate, imu, q)
             state.counts[1] += 1
             since = AT_ONCE
         now = Now(time_s, now.held, now.turned_at, 0.0, force, rate, rate, ZERO, change, since)
@@ -553,9 +560,7 @@ def _process(
     gyro: Floats,
     flags: NDArray[np.uint16],
     imu: ImuCalibration,
-    belief: SensorErrors,
     q: JointInertialParameters,
-    lever: Lever,
     state: State,
     out: Floats,
 ) -> None:
@@ -566,10 +571,10 @@ def _process(
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
         h, good, first = time_s[i] - now.time, has_force and has_rate, math.isnan(now.time)
         if good and (first or max(h, now.held) > _LONGEST_BLIND_S) and math.isfinite(time_s[i]):
-            now = _start(state, first, time_s[i], force, rate, imu, belief, q, lever)
+            now = _start(state, first, time_s[i], force, rate, imu, q)
         elif h > 0.0:
             now, taken = _advance(
-                state, x, now, time_s[i], has_force, force, has_rate, rate, imu, belief, q, lever
+                state, x, now, time_s[i], has_force, force, has_rate, rate, imu, q
             )  # fmt: skip
             good = good and taken
         else:

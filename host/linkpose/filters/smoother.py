@@ -1,14 +1,14 @@
 """`joint-inertial` over a whole recording: each estimate from what came before it and from what came after.
 
 A fixed-interval smoother of two filters. One runs forward; the other runs from the end, where the same equations hold
-with t, ω, b_g and v of the opposite sign and s_A, Z, b_a and d as they are: it is the same filter on the recording
-reversed. At each sample the two are weighted by the inverse of their variances,
+with t, ω, b_g and v of the opposite sign and s_A, Z, b_a, d and the matrices as they are: it is the same filter on the
+recording reversed. Both begin with what a pass ahead has found of J2S and of the sensors' errors, which are constants.
+At each sample the two are weighted by the inverse of their variances,
 
     h = (h_f/σ_f² + h_b/σ_b²) σ²,   1/σ² = 1/σ_f² + 1/σ_b²
 
-and σ is no less than what J2S alone leaves, which both have in common. A J2S that is not known is found by a pass
-ahead, and both filters begin with what it found. What is kept is each filter's estimate, 64 bytes a sample: 23 MB for
-an hour at 100 Hz.
+and σ is no less than what J2S alone leaves, which both have in common. What is kept is each filter's estimate, 64
+bytes a sample: 23 MB for an hour at 100 Hz.
 
 Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE
 Trans. Automatic Control 14(4), 1969.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from linkpose.filters.joint_inertial import LONGEST_HOLD_S, JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import Joint, Rig, Vector
+from linkpose.sensors.rig import Rig, Vector
 
 
 class JointInertialSmoother:
@@ -35,43 +35,36 @@ class JointInertialSmoother:
     def __init__(self, rig: Rig) -> None:
         """The rig must know J2S, be it as roughly as `j2s_std_m` says."""
         self._rig = rig
-        self._forward = JointInertialFilter(rig)
+        self._ahead = JointInertialFilter(rig)
 
     @property
     def rejected(self) -> int:
-        """Samples that the forward filter could not use, or whose innovation its gate refused."""
-        return self._forward.rejected
+        """Samples that the pass ahead could not use, or whose innovation its gate refused."""
+        return self._ahead.rejected
 
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
         """J2S from the whole recording, and its covariance: (3,) m, (3, 3) m²."""
-        return self._forward.j2s_m
+        return self._ahead.j2s_m
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
         The block is the whole recording: it is not added to what came before.
         """
-        rig = self._rig
-        if rig.joint.known_j2s_m is None:
-            ahead = JointInertialFilter(rig)
-            ahead.process(block)
-            rig = replace(rig, joint=_joint(*ahead.j2s_m))
-        self._forward = JointInertialFilter(rig)
-        forward = self._forward.process(block)
-        backward = JointInertialFilter(_reversed_rig(rig)).process(_reversed(block))[::-1]
-        return _combined(forward, backward, self.j2s_m[1])
-
-
-def _joint(mean: Floats, covariance: Floats) -> Joint:
-    x, y, z = mean.tolist()
-    return Joint((x, y, z), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])))
+        self._ahead = JointInertialFilter(self._rig)
+        self._ahead.process(block)
+        forward, backward = JointInertialFilter(self._rig), JointInertialFilter(_reversed_rig(self._rig))
+        forward.start_from(self._ahead)
+        backward.start_from(self._ahead, backwards=True)
+        after = backward.process(_reversed(block))[::-1]
+        return _combined(forward.process(block), after, self.j2s_m[1])
 
 
 def _reversed_rig(rig: Rig) -> Rig:
     x, y, z = rig.imu.gyro_bias_rad_s
     bias: Vector = (-x, -y, -z)
-    return replace(rig, imu=replace(rig.imu, gyro_bias_rad_s=bias))
+    return replace(rig, imu=replace(rig.imu, gyro_bias_rad_s=bias, delay_s=-rig.imu.known_delay_s))
 
 
 def _reversed(block: Measurements) -> Measurements:

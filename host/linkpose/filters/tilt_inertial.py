@@ -65,7 +65,6 @@ from linkpose.filters._inertial import (
     fade,
     height,
     predict,
-    prior,
     set_upright,
     take,
     take_three,
@@ -81,14 +80,13 @@ _LARGEST_RAD_S = 0.5  # gyro bias that can be, half as much again as the data sh
 
 # Without a joint little tells scale and alignment: they are believed to be those of a good part, the bias may be any
 # that a part has at switch-on.
-_BELIEF = SensorErrors(0.17, 0.003, 0.0015, 0.02, 0.0015, 0.0005)
+_BELIEF = SensorErrors(0.17, 0.003, 0.0015, 0.02, 0.0015, 0.0005, 200.0)
 
 
 class TiltInertialParameters(NamedTuple):
     """What the filter assumes."""
 
     bias_walk_rad_s: float = 3e-4  # in a second: 1 °/s in the hour of warming up
-    fade_s: float = 200.0  # after which e⁻¹ of what was believed of the sensors' errors is left
     accel_misfit: float = 0.01  # what the state's scale and alignment leave over, as a share of the force,
     gyro_misfit: float = 0.004  # and of the rate
     first_speed_m_s: float = 0.5  # σ before it has been measured
@@ -120,6 +118,8 @@ class State(NamedTuple):
     now: Floats  # (20,) the fields of Now, one after the other
     mean: Floats  # (33,)
     covariance: Floats  # (33, 33)
+    start_mean: Floats  # (33,) of the sensors' errors, before anything was measured: none
+    prior: Floats  # (33,) their variances then
     speed: Floats  # (4,) velocity that the last second's acceleration adds up to (m/s), σ² (m²/s²)
     calm: Floats  # (7,) means of force and rate over M, mean square of what moved (rad²/s²)
     faded: Floats  # (1,) time since beliefs last faded (s)
@@ -133,6 +133,8 @@ class State(NamedTuple):
             np.concatenate([[np.nan], np.zeros(19)]),
             np.zeros(SIZE),
             np.zeros((SIZE, SIZE)),
+            np.zeros(SIZE),
+            _BELIEF.variances(),
             np.zeros(4),
             np.zeros(7),
             np.zeros(1),
@@ -203,7 +205,7 @@ def _begin(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: TiltIner
     state.mean[:] = 0.0
     state.covariance[:] = 0.0
     for i in range(BG, D):
-        state.covariance[i, i] = prior(_BELIEF, i)
+        state.covariance[i, i] = state.prior[i]
     _set_upright(state, force, rate, imu, q)
 
 
@@ -290,7 +292,7 @@ def _close(state: State, since: Since, good: bool, rate: Vec, imu: ImuCalibratio
     catch_up(x, p, state.work, since, rotation, gained, q.bias_walk_rad_s**2 * h)
     state.faded[0] += h
     if state.faded[0] > FADING_PACE_S:
-        fade(x, p, state.faded[0], q.fade_s, _BELIEF)
+        fade(x, p, state.faded[0], _BELIEF.fade_s, state.start_mean, state.prior)
         state.faded[0] = 0.0
     _correct_by_speed(state, h, q)
     if good:
