@@ -16,8 +16,11 @@ from linkpose.sensors.rig import Joint, Rig
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+LONGEST_LINK_M = 10.0
+
+
 class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
-    """Three numbers, X,Y,Z."""
+    """A J2S: three numbers, X,Y,Z (m)."""
 
     name = "X,Y,Z"
 
@@ -29,6 +32,8 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
             self.fail(f"{value!r} is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)", param, ctx)
         if not all(map(math.isfinite, (x, y, z))):
             self.fail(f"{value!r} is not finite", param, ctx)
+        if math.hypot(x, y, z) > LONGEST_LINK_M:
+            self.fail(f"{value!r} is longer than {LONGEST_LINK_M:.0f} m; J2S is in metres", param, ctx)
         return x, y, z
 
 
