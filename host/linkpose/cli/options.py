@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint, Rig
+
+if TYPE_CHECKING:
+    from linkpose.recording.reader import Recording
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -153,6 +156,16 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     if brought is not None and rig.imu.delay_s is None:
         rig = replace(rig, imu=replace(rig.imu, delay_s=brought.imu.delay_s))
     return replace(rig, joint=joint) if joint else rig
+
+
+def load_recordings(paths: Sequence[Path]) -> list[Recording]:
+    """The recordings, their remarks said on stderr."""
+    from linkpose.recording.reader import load_recording
+
+    loaded = [load_recording(path) for path in paths]
+    for remark in (remark for recording in loaded for remark in recording.remarks):
+        click.echo(remark, err=True)
+    return loaded
 
 
 def save_rig(path: Path, rig: Rig) -> None:
