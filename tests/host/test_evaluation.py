@@ -363,7 +363,7 @@ def test_motive_exports_are_drawn(tmp_path):
 
 def test_an_unlabeled_marker_is_left_out_and_said(tmp_path):
     path = motive(tmp_path / "take.csv", LinkRun(2, 1, 30.0), np.arange(0, 30, 1 / 50))
-    assert "1 unlabeled markers are left out" in complaints(
+    assert "markers left out as unlabeled: 1" in complaints(
         estimate(tmp_path), edited(path, with_an_unlabeled_marker_first)
     )
 

@@ -82,7 +82,7 @@ def _read_take(path: Path) -> _Take:
     if len(starts) < 3:
         cure = "label the plate's three in Motive" if unlabeled else "export Markers as well"
         raise LinkposeError(f"{path} has {len(starts)} labeled markers with X, Y, Z; three are needed: {cure}")
-    remarks = [f"{path}: {unlabeled} unlabeled markers are left out"] if unlabeled else []
+    remarks = [f"{path}: markers left out as unlabeled: {unlabeled}"] if unlabeled else []
     used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
     check_times(path, table[:, 0], first_line)
