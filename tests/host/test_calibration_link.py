@@ -284,7 +284,7 @@ def test_a_residual_is_told_where_there_is_one(tmp_path, sides, says):
 def test_what_a_recording_has_to_say_is_said_before_it_is_calibrated_from(tmp_path):
     path = saved(tmp_path / "r.csv", turned_over(SIX_SIDES).measurements, accel_unit=STANDARD_GRAVITY)
     result = CliRunner().invoke(imu_command.command, [path, "--rig", str(tmp_path / "rig.toml")])
-    assert "are they in g? multiply them by 9.80665" in result.stderr
+    assert "is it in g? multiply it by 9.80665" in result.stderr
 
 
 def test_commands_complete_the_rig_file(tmp_path):
