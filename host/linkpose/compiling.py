@@ -20,9 +20,10 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -105,6 +106,31 @@ def _remove_unused(new: Path) -> None:
         shutil.rmtree(other, ignore_errors=True)
 
 
+class _KeptCode(FunctionCache):  # type: ignore[misc]
+    """The kept code of one function, which is compiled instead where a file is damaged or cannot be written.
+
+    Processes that keep code of the same function at once may overwrite each other's: code of other arguments is not
+    taken.
+    """
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The compiled function for these types of arguments, None where it is not kept."""
+        try:
+            loaded = super().load_overload(sig, target_context)
+            if loaded is None or tuple(loaded.signature.args) == tuple(sig):
+                return loaded
+        except Exception:  # a damaged pickle raises anything
+            pass
+        with contextlib.suppress(OSError):
+            self.flush()
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keeps it, unless the disk is full or the folder has gone."""
+        with contextlib.suppress(OSError):
+            super().save_overload(sig, data)
+
+
 _the_folder = functools.cache(cache_folder)
 
 
@@ -113,16 +139,22 @@ def _decorator(**options: Any) -> Callable[[Function], Function]:
     options = {"error_model": "numpy", **options}
 
     def decorate(function: Function) -> Function:
+        made: Any = numba.njit(**options)(function)
         folder = _the_folder()
-        asked = _config.CACHE_DIR
-        _config.CACHE_DIR = str(folder or asked)
-        try:  # the place is asked for here, once: other users of numba keep theirs
-            made: Function = numba.njit(cache=folder is not None, **options)(function)
-        finally:
-            _config.CACHE_DIR = asked
-        return made
+        if folder is not None:
+            made._cache = _kept(function, folder)
+        return cast(Function, made)
 
     return decorate
+
+
+def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
+    asked = _config.CACHE_DIR
+    _config.CACHE_DIR = str(folder)
+    try:  # the place is asked for here, once: other users of numba keep theirs
+        return _KeptCode(function)
+    finally:
+        _config.CACHE_DIR = asked
 
 
 compiled = _decorator()

@@ -255,6 +255,38 @@ def test_rest_alone_is_refused():
         calibrate_joint([turned_over(SIX_SIDES[:1])], Rig())
 
 
+def saved(path: Path, block: Measurements, accel_unit: float = 1.0) -> str:
+    """A recording of the inertial sensor alone, its accelerations in a unit of so many m/s²."""
+    rows = np.column_stack([block.time_s, block.accel_m_s2 / accel_unit, block.gyro_rad_s])
+    names = ["time_s", *(f"accel_{axis}_m_s2" for axis in "xyz"), *(f"gyro_{axis}_rad_s" for axis in "xyz")]
+    head = "# linkpose recording 1\n# {}\n" + ",".join(names)
+    np.savetxt(path, rows, "%.7f", delimiter=",", header=head, footer="# {}", comments="")
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("sides", "says"),
+    [
+        (SIX_SIDES[:1], "1 rest in 1 attitude\n"),
+        (SIX_SIDES, "no residual from 6 attitudes, which always fit"),
+        (np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]), "residual 0.00"),
+    ],
+)
+def test_a_residual_is_told_where_there_is_one(tmp_path, sides, says):
+    path = saved(tmp_path / "r.csv", turned_over(sides).measurements)
+    result = CliRunner().invoke(
+        imu_command.command, [path, "--rig", str(tmp_path / "rig.toml")], catch_exceptions=False
+    )
+    assert says in result.stdout
+    assert ("residual" in result.stdout) == (len(sides) >= 6)
+
+
+def test_what_a_recording_has_to_say_is_said_before_it_is_calibrated_from(tmp_path):
+    path = saved(tmp_path / "r.csv", turned_over(SIX_SIDES).measurements, accel_unit=STANDARD_GRAVITY)
+    result = CliRunner().invoke(imu_command.command, [path, "--rig", str(tmp_path / "rig.toml")])
+    assert "is it in g? multiply it by 9.80665" in result.stderr
+
+
 def test_commands_complete_the_rig_file(tmp_path):
     """From the recording of a link to a rig file with J2S that keeps its other tables."""
     rec, truth, rig_file = tmp_path / "rec.csv", tmp_path / "truth.csv", tmp_path / "rig.toml"

@@ -101,6 +101,23 @@ def test_the_rig_files_j2s_is_used_and_a_wrong_key_is_named(linkpose, refused, t
         assert sentence in said and "rig.toml" in said
 
 
+def test_estimates_do_not_replace_their_recording(linkpose, refused, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("record", recording, "--port", SIM, "--duration", 0.2)
+    before = recording.read_bytes()
+    said = refused("estimate", recording, "-o", recording, "--force")
+    assert "is the recording that is read; name another file for the estimates" in said
+    assert recording.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("j2s", "says"),
+    [("1e9,0,0", "longer than 10 m"), ("0,900,40", "is in metres"), ("0,0,inf", "not finite"), ("1,2", "not three")],
+)
+def test_a_j2s_that_no_link_has_is_refused(refused, tmp_path, j2s, says):
+    assert says in refused("estimate", tmp_path / "r.csv", "--j2s", j2s)
+
+
 def closing_line(path: Path) -> dict:
     return json.loads(path.read_text().splitlines()[-1].removeprefix("# "))
 

@@ -161,6 +161,45 @@ def test_the_code_is_kept_in_the_users_cache(platform, variables, place, package
     assert folder is not None and folder.parent == tmp_path / place / "linkpose"
 
 
+@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+def test_a_damaged_file_is_compiled_and_kept_anew(ending, package, tmp_path):
+    host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
+    run(HEIGHT, host, **place)
+    for path in (tmp_path / "cache").rglob(f"*{ending}"):
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+    assert run(HEIGHT, host, **place) == "1.5 0"
+    assert run(HEIGHT, host, **place) == "1.5 1"
+
+
+def test_code_of_other_arguments_is_not_taken(tmp_path):
+    """As processes leave it that keep code of one function at once: each names its file by what it has found."""
+    code = (
+        "from linkpose.filters import _vector as vec\n"
+        "print(vec.dot((1.5, 2.0, 0.0), (2.0, 2.0, 0.0)), vec.dot((1, 2, 0), (2, 2, 0)), vec.dot.stats.cache_hits)"
+    )
+    assert run(code, HOST, NUMBA_CACHE_DIR=tmp_path).startswith("7.0 6 Counter()")
+    floats, integers = sorted(tmp_path.rglob("*.nbc"))
+    kept = floats.read_bytes()
+    floats.write_bytes(integers.read_bytes())
+    integers.write_bytes(kept)
+    for hits in (0, 2):
+        said = run(code, HOST, NUMBA_CACHE_DIR=tmp_path)
+        assert said.startswith("7.0 6 Counter(") and said.count(": 1") == hits
+
+
+def test_a_full_disk_costs_no_more_than_the_compiling(tmp_path):
+    full = (
+        "import builtins, errno\n"
+        "real = open\n"
+        "def fake(path, mode='r', *more, **others):\n"
+        "    if '.nb' in str(path) and 'w' in mode:\n"
+        "        raise OSError(errno.ENOSPC, 'No space left on device')\n"
+        "    return real(path, mode, *more, **others)\n"
+        "builtins.open = fake\n"
+    )
+    assert run(full + HEIGHT, HOST, NUMBA_CACHE_DIR=tmp_path) == "1.5 0"
+
+
 def test_other_users_of_the_compiler_keep_their_place():
     code = (
         "import numba, linkpose.localization.linalg, linkpose.filters.baro\n"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -320,6 +321,11 @@ def with_time_code(lines):
     return [",".join(row) for row in cells]
 
 
+def with_a_word(word, lines):
+    cells = lines[11].split(",")
+    return [*lines[:11], ",".join([*cells[:4], word, *cells[5:]]), *lines[12:]]
+
+
 def with_an_old_header(lines):
     return [line.replace("Time (Seconds)", "Time") for line in lines]
 
@@ -357,7 +363,7 @@ def test_motive_exports_are_drawn(tmp_path):
 
 def test_an_unlabeled_marker_is_left_out_and_said(tmp_path):
     path = motive(tmp_path / "take.csv", LinkRun(2, 1, 30.0), np.arange(0, 30, 1 / 50))
-    assert "1 unlabeled markers are left out" in complaints(
+    assert "markers left out as unlabeled: 1" in complaints(
         estimate(tmp_path), edited(path, with_an_unlabeled_marker_first)
     )
 
@@ -369,6 +375,11 @@ def test_motive_exports_that_do_not_do(tmp_path):
         scores(path, motive(tmp_path / "two.csv", run, t, markers=2))
     with pytest.raises(LinkposeError, match="has a header but no frame"):
         scores(path, edited(motive(tmp_path / "none.csv", run, t), lambda lines: lines[:6]))
+    with pytest.raises(LinkposeError, match="is damaged"):
+        scores(path, edited(motive(tmp_path / "damaged.csv", run, t), lambda lines: [*lines, "3,0.1\r5"]))
+    for word in ("x.y", "inf", "1e300"):
+        with pytest.raises(LinkposeError, match=f"line 12: '{word}' is not a number"):
+            scores(path, edited(motive(tmp_path / "word.csv", run, t), partial(with_a_word, word)))
     hidden = edited(
         motive(tmp_path / "hidden.csv", run, t),
         lambda lines: lines[:6] + [",".join([*line.split(",")[:8], "", "", ""]) for line in lines[6:]],

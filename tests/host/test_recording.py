@@ -261,9 +261,9 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
 @pytest.mark.parametrize(
     ("first", "last", "factor", "says"),
     [
-        ("accel_x_m_s2", "accel_z_m_s2", 1 / 9.80665, "are they in g? multiply them by 9.80665"),
-        ("accel_x_m_s2", "accel_z_m_s2", 1000 / 9.80665, "thousandths of g? multiply them by 0.00980665"),
-        ("gyro_x_rad_s", "gyro_z_rad_s", 180 / np.pi, "are they in °/s? multiply them by 0.0174533"),
+        ("accel_x_m_s2", "accel_z_m_s2", 1 / 9.80665, "is it in g? multiply it by 9.80665"),
+        ("accel_x_m_s2", "accel_z_m_s2", 1000 / 9.80665, "thousandths of g? multiply it by 0.00980665"),
+        ("gyro_x_rad_s", "gyro_z_rad_s", 180 / np.pi, "is it in °/s? multiply it by 0.0174533"),
         ("time_s", "time_s", 1e3, "in steps of 10 s (median): is it in milliseconds? divide it by 1000"),
         ("time_s", "time_s", 1e6, "is it in microseconds? divide it by 1000000"),
         ("pressure_Pa", "pressure_Pa", 0.01, "is it in hPa? multiply it by 100"),

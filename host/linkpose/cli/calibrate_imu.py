@@ -25,9 +25,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> N
     attitudes the gyro's bias and the noises are found all the same.
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
-    from linkpose.recording.reader import load_recording
 
-    loaded = [load_recording(path) for path in recordings]
+    loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_imu(loaded)
     options.save_rig(rig_file, with_calibration(rig, found))
@@ -37,11 +36,15 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> N
         _show(found)
     if found.accel_scale is None:
         click.echo(
-            f"offset and scale of the accelerometer stay as they were: {found.attitudes} attitudes, "
+            f"offset and scale of the accelerometer stay as they were: {_count(found.attitudes, 'attitude')}, "
             f"{FEWEST_ATTITUDES} are needed",
             err=True,
         )
     click.echo(f"written to {rig_file}", err=True)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def _object(found: ImuCalibration) -> dict[str, Any]:
@@ -50,13 +53,18 @@ def _object(found: ImuCalibration) -> dict[str, Any]:
 
 
 def _show(found: ImuCalibration) -> None:
+    from linkpose.calibration.imu import FEWEST_ATTITUDES
+
     x, y, z = found.gyro_bias_rad_s
-    click.echo(f"{found.rests} rests in {found.attitudes} attitudes")
+    click.echo(f"{_count(found.rests, 'rest')} in {_count(found.attitudes, 'attitude')}")
     click.echo(f"gyro: bias {x:.5f}, {y:.5f}, {z:.5f} rad/s, noise {found.gyro_noise_rad_s:.5f} rad/s")
     click.echo(f"accelerometer: noise {found.accel_noise_m_s2:.4f} m/s²")
     if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
         (ox, oy, oz), (kx, ky, kz) = found.accel_offset_m_s2, found.accel_scale
         click.echo(f"accelerometer: offset {ox:.4f}, {oy:.4f}, {oz:.4f} m/s², scale {kx:.5f}, {ky:.5f}, {kz:.5f}")
-        click.echo(f"accelerometer: residual {found.accel_residual_m_s2:.4f} m/s²")
+        if found.attitudes > FEWEST_ATTITUDES:
+            click.echo(f"accelerometer: residual {found.accel_residual_m_s2:.4f} m/s²")
+        else:  # as many equations as unknowns: what is left says nothing
+            click.echo(f"accelerometer: no residual from {FEWEST_ATTITUDES} attitudes, which always fit; more tell it")
     if found.pressure_noise_Pa is not None:
         click.echo(f"barometer: noise {found.pressure_noise_Pa:.2f} Pa")

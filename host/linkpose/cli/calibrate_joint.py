@@ -24,9 +24,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
     the inertial sensor is applied, and what is left of its errors is estimated with J2S; --imu keeps that as well.
     """
     from linkpose.calibration.joint import LARGE_RESIDUAL_M_S2, calibrate_joint, is_calibrated, with_calibration
-    from linkpose.recording.reader import load_recording
 
-    loaded = [load_recording(path) for path in recordings]
+    loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_joint(loaded, rig)
     options.save_rig(rig_file, with_calibration(rig, found, with_imu))

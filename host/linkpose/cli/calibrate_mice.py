@@ -32,9 +32,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     recordings, are better), each with a second of rest before it. The gyro tells which recording is which.
     """
     from linkpose.calibration.mice import calibrate_mice, with_calibration
-    from linkpose.recording.reader import load_recording
 
-    loaded = [load_recording(path) for path in recordings]
+    loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_mice(loaded, rig, length)
     options.save_rig(rig_file, with_calibration(rig, found))

@@ -86,7 +86,7 @@ def command(
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
-    refuse_same_file(recording, output, record, raw)
+    refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
     console = Console(quiet, verbose)

@@ -166,9 +166,11 @@ def health_line(health: Health) -> str:
     return text
 
 
-def refuse_same_file(*paths: Path | None) -> None:
-    """Raises LinkposeError when two outputs are one file."""
-    named = [path.absolute() for path in paths if path is not None]
+def refuse_same_file(*outputs: Path | None, source: Path | None = None) -> None:
+    """Raises LinkposeError when two outputs are one file, or one of them is the file that is read."""
+    named = [path.absolute() for path in outputs if path is not None]
     for path in named:
         if named.count(path) > 1:
             raise LinkposeError(f"{path} is named for two outputs; name two files")
+        if source is not None and path == source.absolute():
+            raise LinkposeError(f"{path} is the recording that is read; name another file for the estimates")

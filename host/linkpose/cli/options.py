@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint, Rig
 
+if TYPE_CHECKING:
+    from linkpose.recording.reader import Recording
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+LONGEST_LINK_M = 10.0
+
+
 class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
-    """Three numbers, X,Y,Z."""
+    """A J2S: three numbers, X,Y,Z (m)."""
 
     name = "X,Y,Z"
 
@@ -29,6 +35,8 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
             self.fail(f"{value!r} is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)", param, ctx)
         if not all(map(math.isfinite, (x, y, z))):
             self.fail(f"{value!r} is not finite", param, ctx)
+        if math.hypot(x, y, z) > LONGEST_LINK_M:
+            self.fail(f"{value!r} is longer than {LONGEST_LINK_M:.0f} m; J2S is in metres", param, ctx)
         return x, y, z
 
 
@@ -148,6 +156,16 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     if brought is not None and rig.imu.delay_s is None:
         rig = replace(rig, imu=replace(rig.imu, delay_s=brought.imu.delay_s))
     return replace(rig, joint=joint) if joint else rig
+
+
+def load_recordings(paths: Sequence[Path]) -> list[Recording]:
+    """The recordings, their remarks said on stderr."""
+    from linkpose.recording.reader import load_recording
+
+    loaded = [load_recording(path) for path in paths]
+    for remark in (remark for recording in loaded for remark in recording.remarks):
+        click.echo(remark, err=True)
+    return loaded
 
 
 def save_rig(path: Path, rig: Rig) -> None:

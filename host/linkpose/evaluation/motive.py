@@ -25,6 +25,7 @@ _WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be judged are bett
 _LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
 _STILL = 10.0  # times its noise: noise alone also lies about a sphere, of some two and a half times its deviation
 _CLEARLY_WIDER_DEG = 15.0
+_FARTHEST = 1e9  # in any unit
 _LONGEST_LINK_M = 10.0
 _MOST_STEPS = 50
 
@@ -67,7 +68,10 @@ class _Take:
 
 
 def _read_take(path: Path) -> _Take:
-    rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
+    try:
+        rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
+    except csv.Error as error:
+        raise LinkposeError(f"{path} is damaged: {error}; export the take as CSV again") from error
     header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
     if header is None:
         raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
@@ -78,7 +82,7 @@ def _read_take(path: Path) -> _Take:
     if len(starts) < 3:
         cure = "label the plate's three in Motive" if unlabeled else "export Markers as well"
         raise LinkposeError(f"{path} has {len(starts)} labeled markers with X, Y, Z; three are needed: {cure}")
-    remarks = [f"{path}: {unlabeled} unlabeled markers are left out"] if unlabeled else []
+    remarks = [f"{path}: markers left out as unlabeled: {unlabeled}"] if unlabeled else []
     used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
     check_times(path, table[:, 0], first_line)
@@ -125,9 +129,12 @@ def _number(path: Path, row: list[str], column: int, line: int) -> float:
     if not text:
         return float("nan")
     try:
-        return float(text)
+        value = float(text)
     except ValueError:
-        raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number") from None
+        value = float("nan")
+    if not abs(value) < _FARTHEST:
+        raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number that a camera system gives")
+    return value
 
 
 def _order_remarks(path: Path, markers: Floats) -> list[str]:
