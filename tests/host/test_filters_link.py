@@ -270,17 +270,19 @@ def test_a_turn_at_a_constant_rate_is_no_bias():
     assert np.abs(f.gyro_bias_rad_s).max() < 1e-6
 
 
+@pytest.mark.parametrize("name", ["tilt", "joint", "joint-inertial", OURS])
 @pytest.mark.parametrize("delay_s", [0.0, 0.0049, 0.02])
-def test_readings_that_are_delayed_give_the_tilt_of_now(delay_s):
+def test_readings_that_are_delayed_give_the_tilt_of_now(delay_s, name):
     """What a low-pass filter lets through is that of `delay_s` ago; the sensor rolls to and fro at up to 1.9 rad/s."""
     t = np.arange(3000) / 100
     angle, rate = 0.6 * np.sin(np.pi * (t - delay_s)), 0.6 * np.pi * np.cos(np.pi * (t - delay_s))
     force = STANDARD_GRAVITY * np.column_stack([0 * t, np.sin(angle), np.cos(angle)])
     block = measurements(t, force, np.column_stack([rate, 0 * t, 0 * t]))
-    roll = filters.create(OURS, Rig(imu=Imu(delay_s=delay_s))).process(block)[:, 2]
+    joint = Joint((0.0, 0.0, 0.0))  # it turns about itself
+    roll = filters.create(name, Rig(joint, Imu(delay_s=delay_s))).process(block)[:, 2]
     error = np.abs(roll - np.degrees(0.6 * np.sin(np.pi * t)))[1000:].max()
     assert error < 0.25
-    late = filters.create(OURS, Rig(imu=Imu(delay_s=0.0))).process(block)[:, 2]
+    late = filters.create(name, Rig(joint, Imu(delay_s=0.0))).process(block)[:, 2]
     assert np.abs(late - np.degrees(0.6 * np.sin(np.pi * t)))[1000:].max() >= np.degrees(0.6 * np.pi) * delay_s * 0.9
 
 

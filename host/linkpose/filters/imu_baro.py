@@ -215,7 +215,7 @@ def _process(
         if math.isnan(now.time):
             out[i, 2] = out[i, 3] = np.nan
         else:
-            _, _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+            _, out[i, 2], out[i, 3] = describe(now, imu.delay, j2s)
     keep(tilt_state, now, rejected)
     for j in range(3):
         vertical.mean[j], vertical.lasting[j] = mean[j], lasting[j]

@@ -192,7 +192,7 @@ def _process(
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, d)
+            out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, d)
             out[i, 1] = height_std(now, d, d_std)
     keep(state, now, rejected)
     history.time[0], history.time[1] = t1, t2

@@ -236,14 +236,16 @@ def step_between(now: float, last: float) -> tuple[bool, float]:
 
 
 @inlined
-def describe(tilt: Vec, covariance: Sym, j2s: Vec) -> tuple[float, float, float, float]:
-    """Height Zᵀd (15) and its standard deviation (m), roll and pitch (°)."""
-    return (
-        vec.dot(tilt, j2s),
-        math.sqrt(max(vec.quadratic(covariance, j2s), 0.0)),
-        math.degrees(math.atan2(tilt[1], tilt[2])),
-        math.degrees(math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))),
-    )
+def describe(now: Now, delay_s: float, j2s: Vec) -> Vec:
+    """Height Zᵀd (15) (m), roll and pitch (°), at the time of the stamp.
+
+    Readings that are `delay_s` late tell the tilt of then: it is turned on by the last rate.
+    """
+    tilt = now.tilt
+    if delay_s > 0.0:
+        tilt = vec.turn_back(vec.plus((0.0, 0.0, 0.0), delay_s, now.rate), tilt)
+    roll, pitch = vec.roll_pitch(tilt)
+    return vec.dot(tilt, j2s), roll, pitch
 
 
 @inlined
@@ -323,6 +325,6 @@ def _process(
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
-            out[i, 0], _, out[i, 2], out[i, 3] = describe(now.tilt, now.covariance, j2s)
+            out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, j2s)
             out[i, 1] = height_std(now, j2s, j2s_std)
     keep(state, now, rejected)
