@@ -80,6 +80,25 @@ def test_scale_and_alignment_of_the_sensors_are_found():
     assert np.abs(found - true).mean() < np.abs(true).mean() / 3
 
 
+@pytest.mark.parametrize("rest_s", [60, 300])
+def test_noise_at_rest_tells_nothing_of_scale_and_alignment(rest_s):
+    """A reading's noise is in what it is compared with, too: a matrix that makes nothing of it would explain it."""
+    block, truth = recorded(2, 0, "datasheet")
+    n, rng = 100 * rest_s, np.random.default_rng(7)
+
+    def rested(values, noise):
+        return np.concatenate([values[:100].mean(axis=0) + noise * rng.standard_normal((n, 3)), values])
+
+    longer = replace(
+        block, time_s=np.arange(n + len(block)) / 100, accel_m_s2=rested(block.accel_m_s2, 0.04),
+        gyro_rad_s=rested(block.gyro_rad_s, 0.0009), flags=np.ones(n + len(block), np.uint16),
+    )  # fmt: skip
+    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    f.process(longer[:n])
+    assert all(np.abs(state.mean[MA:D]).max() < 0.03 for state in f.states)
+    assert rmse_cm(f.process(longer[n:]), truth.height_m) < 0.5
+
+
 def test_a_steady_turn_is_no_rest():
     """A link that leans by 0.3 rad goes round the vertical at 1.5 rad/s: force and rate stay the same."""
     n, d = 3000, np.array([0.0, 0.0, 0.6])

@@ -12,7 +12,8 @@ it must be the one that the angular rate gives the sensor. The state, all in the
 
 with the measurement  0 = v − ω × d + n_G × d + e.  The errors are constants, but for a slow walk of b_g, and what is
 believed of them fades, so that an error of the model does not stay. Nothing is differentiated, no rest is needed, and
-motion tells the errors and d apart; a rest, where there is one, tells b_g outright. The height is Zᵀd.
+motion tells the errors and d apart; a rest, where there is one, tells b_g outright. Readings that may be noise alone
+tell nothing of M_a, M_g and d: that noise is in v and ω too, and would be read as a motion. The height is Zᵀd.
 
 The mean is brought forward at each sample: over a step the frame turns by the exact exponential of the mean rate, v is
 integrated by the trapezoid, and ‖Z‖ = 1 is kept. Covariance and measurement follow 25 times in a second: a faster pace
@@ -79,7 +80,8 @@ from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-_CLEAR = 30.0  # ‖ω‖² over its noise's, from which on it tells d; noise that is read as a rotation would, too
+_CLEAR = 30.0  # square of a reading over its noise's, from which on it tells what multiplies it: noise would, too
+_STEADY_SIGMAS = 5.0  # of a force that may be the same as before
 _GATE = 25.0  # χ² with 3 degrees of freedom: one sound sample in 65 000
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: no motion of a link, but a spike
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0  # angular acceleration that the first sample may hold, and to a rate of 1 rad/s
@@ -137,6 +139,7 @@ class State(NamedTuple):
     prior: Floats  # (33,) variances of the sensors' errors, by what is believed of them
     belief: Floats  # (3,) time since it last faded (s); half the χ² of the errors found by it; how long it lasts (s)
     rest: Floats  # (7,) for how long it has been still (s), first force, sum over time of the rate
+    steady: Floats  # (3,) force that the accelerometer's matrix is judged by (m/s²)
     misfit: Floats  # (2,) mean squares of the excess innovation and of ‖ω‖‖d‖ (m/s)²
     work: Floats  # (12, 33) F P; errors of ω and f, within a step
     cross: Floats  # (3, 33) H P, within a step
@@ -156,6 +159,7 @@ class State(NamedTuple):
             prior,
             np.array([0.0, 0.0, belief.fade_s]),
             np.zeros(7),
+            np.zeros(3),
             np.zeros(2),
             np.zeros((12, SIZE)),
             np.zeros((3, SIZE)),
@@ -316,13 +320,14 @@ def _correct(
     reading = vec.minus(rate, vec.at(x, BG))
     w = corrected(x, MG, reading)
     y = vec.minus(vec.cross(w, d), velocity)
-    put_errors(p, BG, MG, reading, work, 6)
+    clear = _clear(reading, imu.gyro_variance)
+    put_errors(p, BG, MG, clear, work, 6)
     for c in range(3):
         (a, b), (ad, bd), (aw, bw) = OTHERS[c], others(d, c), others(w, c)
         for j in range(SIZE):
             by_lever = aw * p[D + b, j] - bw * p[D + a, j]
             cross[c, j] = p[V + c, j] + ad * work[6 + b, j] - bd * work[6 + a, j] - by_lever
-    s = _innovation_covariance(cross, d, w, reading)
+    s = _innovation_covariance(cross, d, w, clear)
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
     product = 0.5 * _trace(p, BG) * _trace(p, D)
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
@@ -340,7 +345,7 @@ def _correct(
         if jumped:
             return False
         inverse = vec.scaled(_GATE / distance, inverse)  # it is the state that is doubted, but with care
-    told = min(max(vec.dot(w, w) / (_CLEAR * 3.0 * imu.gyro_variance) - 1.0, 0.0), 1.0)
+    told = _share_told(vec.dot(w, w), 3.0 * imu.gyro_variance)
     if told == 1.0:
         take_three(x, p, cross, y, inverse)
     else:
@@ -352,6 +357,35 @@ def _correct(
                 own = cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j]
                 p[i, j] += (1.0 - told) * (1.0 - told) * own
     return True
+
+
+@inlined
+def _clear(reading: Vec, variance: float) -> Vec:
+    """The components that stand out of the noise. The same noise is in the innovation: times a scale of −1 it is 0."""
+    return (
+        reading[0] * _share_told(reading[0] * reading[0], variance),
+        reading[1] * _share_told(reading[1] * reading[1], variance),
+        reading[2] * _share_told(reading[2] * reading[2], variance),
+    )
+
+
+@inlined
+def _share_told(square: float, variance: float) -> float:
+    """From 0 for a reading that may be noise alone to 1 for one that is clear of it."""
+    return min(max(square / (_CLEAR * variance) - 1.0, 0.0), 1.0)
+
+
+@inlined
+def _follow(steady: Floats, force: Vec, slack: float) -> Vec:
+    """The force, as far as it has moved by more than noise does; the rest of the way is slack.
+
+    At rest a force that kept its noise would tell the accelerometer's matrix by that: the same noise is in v.
+    """
+    ahead = vec.minus(force, vec.at(steady, 0))
+    distance = math.sqrt(vec.dot(ahead, ahead))
+    if distance > slack:
+        vec.put(steady, 0, vec.plus(vec.at(steady, 0), 1.0 - slack / distance, ahead))
+    return vec.at(steady, 0)
 
 
 @inlined
@@ -431,6 +465,9 @@ def _close(
 ) -> bool:  # fmt: skip
     """Brings the covariance up to the mean, and corrects both. False where the correction was refused."""
     x, p, h = state.mean, state.covariance, since.span
+    slack = _STEADY_SIGMAS * math.sqrt(imu.accel_variance)
+    force = _follow(state.steady, vec.plus(ZERO, 1.0 / h, since.impulse), slack)
+    since = Since(h, since.turned, vec.plus(ZERO, h, force), since.rotation, since.velocity)
     catch_up(x, p, state.work, since, 0.0, 0.0, q.gyro_bias_walk_rad_s**2 * h)
     for i in range(D, SIZE):
         p[i, i] += q.j2s_walk**2 * state.start_covariance[D, D] * h
