@@ -11,6 +11,7 @@ from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.filters.smoother import JointInertialSmoother
 from linkpose.sensors.rig import Imu, Joint, Rig
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun
+from linkpose.wire.messages import SampleFlags
 
 KNOWN = Rig().with_j2s(PAPER_J2S_M)
 UNKNOWN = Rig(joint=Joint((0.0, 0.0, 0.0), 1.0))
@@ -80,6 +81,20 @@ def test_held_readings_belong_to_the_first_of_their_samples_in_both_directions()
     held = replace(block, accel_m_s2=block.accel_m_s2[at // 4 * 4], gyro_rad_s=block.gyro_rad_s[at // 4 * 4])
     error = JointInertialSmoother(KNOWN).process(held)[::4, 0] - truth.height_m[::4]
     assert 100 * np.sqrt(np.mean(error**2)) < 0.2
+
+
+def test_what_a_saturated_reading_says_is_not_read_in_either_direction():
+    """The accelerometer's 25 Hz in a log of 100 Hz: backwards a reading is held over other samples, with its flag."""
+    block = LinkRun(3, 0, 30.0).measurements()
+    force = block.accel_m_s2[np.arange(len(block)) // 4 * 4]
+    lost = (np.abs(force) > 14.7).any(axis=1)
+    assert lost.sum() > 100
+    flags = block.flags | np.where(lost, np.uint16(SampleFlags.ACCEL_SATURATED), np.uint16(0))
+    estimates = [
+        JointInertialSmoother(KNOWN).process(replace(block, accel_m_s2=force + off * lost[:, None], flags=flags))
+        for off in (0.0, 5.0)
+    ]
+    assert np.array_equal(*estimates)
 
 
 def test_an_unusable_beginning_is_told_by_what_follows():

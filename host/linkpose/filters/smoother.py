@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from linkpose.filters.joint_inertial import LONGEST_HOLD_S, JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig, Vector
+from linkpose.wire.messages import SampleFlags
 
 
 class JointInertialSmoother:
@@ -69,14 +70,16 @@ def _reversed_rig(rig: Rig) -> Rig:
 
 def _reversed(block: Measurements) -> Measurements:
     """The recording as it would have been, had time run backwards; only what the filter reads is turned."""
-    accel = block.accel_m_s2[_next_reading(block.time_s, block.accel_m_s2)]
-    gyro = block.gyro_rad_s[_next_reading(block.time_s, block.gyro_rad_s)]
+    at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
+    accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
+    accel_bit, gyro_bit = np.uint16(SampleFlags.ACCEL_SATURATED), np.uint16(SampleFlags.GYRO_SATURATED)
+    flags = block.flags & ~(accel_bit | gyro_bit) | block.flags[at_accel] & accel_bit | block.flags[at_gyro] & gyro_bit
     return replace(
         block,
         time_s=np.ascontiguousarray(-block.time_s[::-1]),
         accel_m_s2=np.ascontiguousarray(accel[::-1]),
         gyro_rad_s=np.ascontiguousarray(-gyro[::-1]),
-        flags=np.ascontiguousarray(block.flags[::-1]),
+        flags=np.ascontiguousarray(flags[::-1]),
     )
 
 
