@@ -168,6 +168,14 @@ def test_other_rates(rate_hz):
     assert rmse_cm(JointInertialFilter(run.rig).process(run.measurements()), run.truth().height_m) < 0.2
 
 
+def test_a_slow_rate_of_samples_does_not_shorten_the_link():
+    """A force of 1 Hz that is sampled at 50 Hz: the trapezoid's sum is 0.13 % short, and so would J2S be in the end."""
+    run = LinkRun(2, 0, 200.0, 50, errors="none")
+    f = JointInertialFilter(run.rig)
+    f.process(run.measurements())
+    assert f.j2s_m[0] == pytest.approx(PAPER_J2S_M, abs=1e-4)
+
+
 def test_lost_samples_and_a_hole_of_seconds():
     block, truth = recorded(1, 0)
     kept = np.random.default_rng(2).random(len(block)) > 0.1
@@ -273,3 +281,27 @@ def test_garbage_is_survived_and_forgotten():
     )
     assert np.isfinite(estimate).all()
     assert 100 * np.abs(estimate[-300:, 0] - truth.height_m[-300:]).max() < 2
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e100, 1e300])
+@pytest.mark.parametrize("sensor", ["accel_m_s2", "gyro_rad_s"])
+def test_garbage_of_one_sensor_overflows_nothing(sensor, scale):
+    block, truth = recorded(1, 0)
+    values = getattr(block, sensor).copy()
+    values[1000:2000] = scale * np.random.default_rng(5).standard_normal((1000, 3))
+    estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(replace(block, **{sensor: values}))
+    assert np.isfinite(estimate).all()
+    assert rmse_cm(estimate[-1000:], truth.height_m[-1000:]) < 0.1
+
+
+@pytest.mark.parametrize("rest_s", [0, 4000])
+def test_a_link_of_no_length_has_a_misfit_of_nothing(rest_s):
+    """‖ω × d‖ is 0, and so is its mean square: no share of it is left over."""
+    n = 100 * (rest_s + 10)
+    block = replace(
+        recorded(1, 0)[0][:0], time_s=np.arange(n) / 100, accel_m_s2=np.tile([0.0, 0.0, GRAVITY], (n, 1)),
+        gyro_rad_s=np.zeros((n, 3)), flags=np.ones(n, np.uint16),
+    )  # fmt: skip
+    f = JointInertialFilter(Rig().with_j2s((0.0, 0.0, 0.0)))
+    assert np.isfinite(f.process(block)).all()
+    assert f.restarts == 0

@@ -363,6 +363,44 @@ def test_repeated_and_backward_stamps_bring_nothing_new(name):
     assert np.array_equal(estimate[-1], plain[-1])
 
 
+@pytest.mark.parametrize("stamp", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["joint-inertial", OURS])
+def test_a_stamp_that_is_no_time_is_passed_by(name, stamp):
+    run, block = recorded(1, 0, 20.0)
+    time_s = block.time_s.copy()
+    time_s[1000] = stamp
+    f = filters.create(name, run.rig)
+    estimate = f.process(replace(block, time_s=time_s))
+    assert f.rejected == 1
+    assert np.isfinite(estimate).all()
+    assert np.abs(estimate[:, 0] - run.truth().height_m).max() < 0.05
+
+
+@pytest.mark.parametrize("gap_s", [5.0, 1e6])
+@pytest.mark.parametrize("lost", ["accel_m_s2", "gyro_rad_s"])
+@pytest.mark.parametrize("name", ["joint-inertial", OURS])
+def test_half_a_sample_does_not_end_a_gap(name, lost, gap_s):
+    """After it one sensor is half a second late; the rate that comes does not tell where the sensor has turned to."""
+    run, block = recorded(1, 0)
+    values, time_s = getattr(block, lost).copy(), block.time_s.copy()
+    values[3000:3050] = np.nan
+    time_s[3000:] += gap_s
+    estimate = filters.create(name, run.rig).process(replace(block, time_s=time_s, **{lost: values}))
+    error = estimate[4500:, 0] - run.truth().height_m[4500:]
+    assert np.isfinite(estimate).all()
+    assert np.sqrt(np.mean(error**2)) < {"joint-inertial": 0.001, OURS: 0.01}[name]
+
+
+def test_a_dead_accelerometer_is_forgotten():
+    """It reads nothing for 50 minutes, and then the link's motion."""
+    run, block = recorded(1, 0, 30.0)
+    n = 50 * 3000
+    dead = measurements(np.arange(n) / 50 - n / 50, np.zeros((n, 3)), np.zeros((n, 3)))
+    f = filters.create(OURS, run.rig)
+    assert f.process(dead)[:, 1].max() < 1e4
+    assert np.abs(f.process(block)[-1000:, 0] - run.truth().height_m[-1000:]).max() < 0.03
+
+
 @pytest.mark.parametrize("name", [*PAPER, OURS])
 def test_garbage_leaves_no_trace_of_infinity(name):
     rng = np.random.default_rng(3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,10 @@ LONGEST_GAP_S = 2.0  # beyond this nothing of the attitude is left to remember
 _JERK_RAD_S3 = 50.0  # of a hand's motion: between two known rates Ts apart the angle is wrong by Ts³/12 of it
 _ACCEL_RAD_S2 = 5.0  # a rate that is held grows wrong by this
 _GUESS_RAD_S = 1.0  # the most that a rate is thought to be wrong
+
+# Beyond what any sensor reads: garbage, the square of which could overflow.
+_MOST_M_S2 = 1e4
+_MOST_RAD_S = 1e4
 
 _ACCEL_SATURATED = int(SampleFlags.ACCEL_SATURATED)
 _GYRO_SATURATED = int(SampleFlags.GYRO_SATURATED)
@@ -60,11 +63,23 @@ def rotation_variance(step_s: float, held_s: float, imu: ImuCalibration) -> floa
 
 
 @compiled
+def blind_for(held_s: float, step_s: float, has_rate: bool, longest_s: float) -> float:
+    """For how long the gyro has been of no use (s). Beyond the longest, a rate alone does not end it: Z is lost."""
+    return 0.0 if has_rate and max(held_s, step_s) <= longest_s else held_s + step_s
+
+
+@compiled
+def _below(reading: Vec, most: float) -> bool:
+    """Whether all components are less than `most`, and none is NaN."""
+    return abs(reading[0]) < most and abs(reading[1]) < most and abs(reading[2]) < most
+
+
+@compiled
 def read_accel(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
     """Whether a sample's specific force can be used, and the calibrated force (m/s²)."""
     o, k = imu.accel_offset, imu.accel_gain
     force = ((raw[0] - o[0]) * k[0], (raw[1] - o[1]) * k[1], (raw[2] - o[2]) * k[2])
-    return math.isfinite(force[0] + force[1] + force[2]) and not flags & _ACCEL_SATURATED, force
+    return _below(force, _MOST_M_S2) and not flags & _ACCEL_SATURATED, force
 
 
 @compiled
@@ -72,4 +87,4 @@ def read_gyro(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
     """Whether a sample's angular rate can be used, and the rate less its bias (rad/s)."""
     b = imu.gyro_bias
     rate = (raw[0] - b[0], raw[1] - b[1], raw[2] - b[2])
-    return math.isfinite(rate[0] + rate[1] + rate[2]) and not flags & _GYRO_SATURATED, rate
+    return _below(rate, _MOST_RAD_S) and not flags & _GYRO_SATURATED, rate

@@ -13,8 +13,8 @@ The errors are constants, but for a slow walk of b_g, and what is believed of th
 model does not stay.
 
 The mean is brought forward at each sample: over a step the frame turns by the exact exponential of the mean rate, v is
-integrated by the trapezoid, and ‖Z‖ = 1 is kept. Covariance and corrections follow 25 times in a second: a faster pace
-brings no more, since what a model leaves over is no white noise.
+integrated by the trapezoid with its ends corrected, and ‖Z‖ = 1 is kept. Covariance and corrections follow 25 times in
+a second: a faster pace brings no more, since what a model leaves over is no white noise.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ SIZE = 33
 PACE_S = 0.035  # between two corrections, at least
 FADING_PACE_S = 0.5  # between two times that beliefs fade
 GAP_ACCEL_M_S2 = 200.0  # where the accelerometer did not see, or beyond its range: a blow
-_BEND = 1.0 / 12.0  # of the force's second difference: what a trapezoid leaves of a parabola
+_BEND = 1.0 / 12.0  # of the force's second difference: how far a trapezoid is off a parabola,
+_BENT = 1.0 / 24.0  # and of the third, of the size of a second, how far that is off a cubic
 _SMALL_RAD2 = 0.01  # variance of a tilt up to which its error lies across it,
 _NONE_RAD2 = 1e-6  # and has no more than this along it
 OTHERS = ((1, 2), (2, 0), (0, 1))  # components that a cross product's takes
@@ -110,8 +111,14 @@ def others(a: Vec, c: int) -> tuple[float, float]:
     return (a[1], a[2]) if c == 0 else (a[2], a[0]) if c == 1 else (a[0], a[1])
 
 
+@inlined
+def trace(p: Floats, k: int) -> float:
+    """The sum of the variances of three states from k on."""
+    return float(p[k, k] + p[k + 1, k + 1] + p[k + 2, k + 2])
+
+
 @compiled
-def along(variance: float) -> float:
+def _along(variance: float) -> float:
     """Variance of Z along itself when it is turned by angles of this variance: cosines fall short of 1."""
     return 0.5 * min(max(variance - _SMALL_RAD2, 0.0), 1.0) ** 2
 
@@ -138,7 +145,7 @@ def set_upright(x: Floats, p: Floats, reading: Vec, accel: float, velocity: Vec,
     for j in range(3):
         vec.put(p[:, j], Z, vec.apply(tangent, error(p, BA, MA, reading, j)))
     variance = min(accel / GRAVITY**2, 1.0)
-    s, k = vec.add(vec.cross_square(tilt, variance), along(variance), vec.outer(tilt)), 0
+    s, k = vec.add(vec.cross_square(tilt, variance), _along(variance), vec.outer(tilt)), 0
     for i in range(3):
         p[V + i, V + i] = speed
         for j in range(i, 3):
@@ -147,10 +154,11 @@ def set_upright(x: Floats, p: Floats, reading: Vec, accel: float, velocity: Vec,
 
 
 @inlined
-def predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, h: float) -> None:
+def predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, bend: Vec, h: float) -> None:
     """Tilt and velocity after a step `h` that turns the frame by `turn` (rad), with f (m/s²) at both its ends.
 
-    The rotation is exact, the velocity by the trapezoid.
+    The rotation is exact, the velocity by the trapezoid with Euler and Maclaurin's correction of its ends: `bend` is
+    the second difference of f, and what it adds up to over many steps is the first difference at either end.
     """
     tilt, v, half = vec.at(x, Z), vec.at(x, V), 0.5 * h
     v = (
@@ -160,15 +168,15 @@ def predict_mean(x: Floats, turn: Vec, before: Vec, force: Vec, h: float) -> Non
     )
     tilt, v = vec.unit(vec.turn_back(turn, tilt)), vec.turn_back(turn, v)
     vec.put(x, Z, tilt)
-    x[V] = v[0] + half * (force[0] - GRAVITY * tilt[0])
-    x[V + 1] = v[1] + half * (force[1] - GRAVITY * tilt[1])
-    x[V + 2] = v[2] + half * (force[2] - GRAVITY * tilt[2])
+    x[V] = v[0] + half * (force[0] - GRAVITY * tilt[0]) - _BEND * h * bend[0]
+    x[V + 1] = v[1] + half * (force[1] - GRAVITY * tilt[1]) - _BEND * h * bend[1]
+    x[V + 2] = v[2] + half * (force[2] - GRAVITY * tilt[2]) - _BEND * h * bend[2]
 
 
 @inlined
 def _velocity_variance(bend: Vec, has_force: bool, h: float, imu: ImuCalibration) -> float:
-    """Variance (m²/s²) of the velocity gained over a step: noise, and what a trapezoid leaves of the force."""
-    bent = _BEND * math.sqrt(vec.dot(bend, bend)) if has_force else GAP_ACCEL_M_S2
+    """Variance (m²/s²) of the velocity gained over a step: noise, and a bend that may be another than before."""
+    bent = _BENT * math.sqrt(vec.dot(bend, bend)) if has_force else GAP_ACCEL_M_S2
     return (imu.accel_variance + min(bent, GAP_ACCEL_M_S2) ** 2) * h * h
 
 
@@ -184,7 +192,7 @@ def predict(
     """
     turn = corrected(x, MG, vec.plus(angle, -h, vec.at(x, BG)))
     begin = vec.minus(corrected(x, MA, before), vec.at(x, BA))
-    predict_mean(x, turn, begin, vec.minus(corrected(x, MA, force), vec.at(x, BA)), h)
+    predict_mean(x, turn, begin, vec.minus(corrected(x, MA, force), vec.at(x, BA)), bend if has_force else ZERO, h)
     return Since(
         since.span + h,
         vec.plus(since.turned, 1.0, turn),

@@ -16,10 +16,11 @@ motion tells the errors and d apart; a rest, where there is one, tells b_g outri
 tell nothing of M_a, M_g and d: that noise is in v and ω too, and would be read as a motion. The height is Zᵀd.
 
 The mean is brought forward at each sample: over a step the frame turns by the exact exponential of the mean rate, v is
-integrated by the trapezoid, and ‖Z‖ = 1 is kept. Covariance and measurement follow 25 times in a second: a faster pace
-brings no more, since what the constraint leaves over (e) is no white noise. e is measured: the share of ω×d that was
-left over in the last seconds. A reading that repeats the last one to the last bit is an old one, read again by a logger
-that is faster than the sensor: the step waits for the next new force, with the angle summed over the rates that came.
+integrated by the trapezoid with its ends corrected, and ‖Z‖ = 1 is kept. Covariance and measurement follow 25 times in
+a second: a faster pace brings no more, since what the constraint leaves over (e) is no white noise. e is measured: the
+share of ω×d that was left over in the last seconds. A reading that repeats the last one to the last bit is an old one,
+read again by a logger that is faster than the sensor: the step waits for the next new force, with the angle summed over
+the rates that came.
 
 Whether the sensors were calibrated is not known, and the two beliefs differ in what they make of a first second. So two
 filters run, one with the errors that a calibration leaves (`CALIBRATED`) and one with the data sheet's (`DATA_SHEET`).
@@ -43,6 +44,7 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     Floats,
     ImuCalibration,
+    blind_for,
     read_accel,
     read_gyro,
     rotation_variance,
@@ -75,6 +77,7 @@ from linkpose.filters._inertial import (
     set_upright,
     take,
     take_three,
+    trace,
 )
 from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
@@ -225,7 +228,6 @@ class JointInertialFilter:
         for own, other in zip(self.states, learned.states, strict=True):
             own.start_mean[BG:] = other.mean[BG:]
             own.start_covariance[BG:, BG:] = other.covariance[BG:, BG:]
-            own.belief[1] = other.belief[1]
             if backwards:
                 own.start_mean[BG:BA] *= -1
                 own.start_covariance[BG:BA] *= -1
@@ -266,12 +268,6 @@ def _mix(first: Floats, second: Floats, out: Floats) -> None:
         out[i, 2], out[i, 3] = vec.roll_pitch((x, y, z))
 
 
-@inlined
-def _trace(p: Floats, k: int) -> float:
-    """The sum of the variances of three states from k on."""
-    return float(p[k, k] + p[k + 1, k + 1] + p[k + 2, k + 2])
-
-
 @compiled
 def _distance(x: Floats, prior: Floats) -> float:
     """Half the χ² of the errors that were found, by what is believed of the sensors; the gyro's bias may be any."""
@@ -292,6 +288,7 @@ def _begin(
     """Mean and covariance from one sample and the priors."""
     state.mean[:] = state.start_mean
     state.covariance[:] = state.start_covariance
+    state.belief[1] = _distance(state.mean, state.prior)
     _set_upright(state.mean, state.covariance, force, rate, imu)
     state.misfit[0], state.misfit[1] = 0.5 * q.first_misfit**2, 0.5
 
@@ -301,7 +298,7 @@ def _set_upright(x: Floats, p: Floats, force: Vec, rate: Vec, imu: ImuCalibratio
     """Tilt from the force, velocity from the constraint, as if nothing had been known of them."""
     w, d = corrected(x, MG, vec.minus(rate, vec.at(x, BG))), vec.at(x, D)
     # The acceleration that there may be: of a link that starts to turn, that swings, that whirls.
-    reach, speed = vec.dot(d, d) + _trace(p, D), vec.dot(w, w) + _trace(p, BG)
+    reach, speed = vec.dot(d, d) + trace(p, D), vec.dot(w, w) + trace(p, BG)
     accel = imu.accel_variance + reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
     set_upright(x, p, force, accel, vec.cross(w, d), speed * reach + 1e-4)
 
@@ -329,7 +326,7 @@ def _correct(
             cross[c, j] = p[V + c, j] + ad * work[6 + b, j] - bd * work[6 + a, j] - by_lever
     s = _innovation_covariance(cross, d, w, clear)
     # Beyond first order: the product of two unknowns, δb_g × δd, while both are wide.
-    product = 0.5 * _trace(p, BG) * _trace(p, D)
+    product = 0.5 * trace(p, BG) * trace(p, D)
     s = vec.add(vec.plus_diagonal(s, product + q.velocity_floor_m_s**2), imu.gyro_variance, vec.cross_square(d, 1.0))
     moved = vec.minus(before, vec.at(x, BG)) if jumped else w  # a spike must not excuse itself
     reach = vec.dot(moved, moved) * vec.dot(d, d)
@@ -433,7 +430,7 @@ def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibrati
 def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
     """The gyro's bias is its mean since the rest began, where that says more than is known and can be."""
     variance = _REST_STD_RAD_S**2
-    if rest[0] <= _REST_S or _trace(p, BG) <= 6.0 * variance:
+    if rest[0] <= _REST_S or trace(p, BG) <= 6.0 * variance:
         return
     for c in range(BG, BA):
         innovation = rest[4 + c - BG] / rest[0] - x[c]
@@ -444,13 +441,13 @@ def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
 
 
 @inlined
-def _runs_away(x: Floats) -> bool:
-    """Whether the state is beyond what can be; NaN is."""
+def _runs_away(x: Floats, p: Floats, found: float) -> bool:
+    """Whether mean, covariance or the χ² of the errors found is beyond what can be; NaN is."""
     bg, ba, d = vec.at(x, BG), vec.at(x, BA), vec.at(x, D)
     can_be = (
         vec.dot(bg, bg) < _LARGEST[0] ** 2 and vec.dot(ba, ba) < _LARGEST[1] ** 2 and vec.dot(d, d) < _LARGEST[2] ** 2
     )
-    return not (can_be and math.isfinite(x[0] + x[3] + x[4] + x[5]))
+    return not (can_be and math.isfinite(x[0] + x[3] + x[4] + x[5] + trace(p, Z) + trace(p, V) + trace(p, D) + found))
 
 
 @inlined
@@ -497,7 +494,7 @@ def _start(
 @inlined
 def _turn(now: Now, step: float, has_rate: bool, rate: Vec, jerk: Vec, jumped: bool, imu: ImuCalibration) -> Now:
     """Adds to the angle, the gyro's bias in it, what the frame turned by up to a new rate, and to its variance."""
-    held = 0.0 if has_rate else now.held + step
+    held = blind_for(now.held, step, has_rate, _LONGEST_BLIND_S)
     angle = vec.plus(now.angle, 0.5 * step, now.newest)
     angle = vec.plus(angle, 0.5 * step, now.newest if jumped else rate)
     doubt = now.doubt + rotation_variance(step, held, imu)
@@ -543,7 +540,8 @@ def _advance(
             gained = 0.25 * h * h * vec.dot(change, change)
             add_noise(state.covariance, vec.at(x, Z), vec.at(x, V), 0.0, gained)
             rate, force, change = before_w, before_a, ZERO
-        if _runs_away(x) or state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2):
+        lost = state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2)
+        if lost or _runs_away(x, state.covariance, state.belief[1]):
             _begin(state, force, rate, imu, q)
             state.counts[1] += 1
             since = AT_ONCE
@@ -556,7 +554,7 @@ def _report(x: Floats, p: Floats, now: Now, found: float, time_s: float, delay_s
     """Row i: height and its standard deviation (m), Z at the time of the stamp, how far off the sensors are found."""
     bias = vec.at(x, BG)
     ahead = vec.plus(ZERO, delay_s, vec.minus(now.newest, bias))
-    if time_s > now.time:  # while the step waits
+    if now.time < time_s < math.inf:  # while the step waits
         ahead = vec.plus(vec.plus(ahead, 1.0, now.angle), time_s - now.turned_at, now.newest)
         ahead = vec.plus(ahead, now.time - time_s, bias)
     ahead = corrected(x, MG, ahead)
@@ -609,7 +607,7 @@ def _process(
         h, good, first = time_s[i] - now.time, has_force and has_rate, math.isnan(now.time)
         if good and (first or max(h, now.held) > _LONGEST_BLIND_S) and math.isfinite(time_s[i]):
             now = _start(state, first, time_s[i], force, rate, imu, q)
-        elif h > 0.0:
+        elif 0.0 < h < math.inf:
             now, taken = _advance(
                 state, x, now, time_s[i], has_force, force, has_rate, rate, imu, q
             )  # fmt: skip

@@ -41,6 +41,7 @@ from linkpose.filters._imu import (
     LONGEST_GAP_S,
     Floats,
     ImuCalibration,
+    blind_for,
     read_accel,
     read_gyro,
     rotation_variance,
@@ -68,6 +69,7 @@ from linkpose.filters._inertial import (
     set_upright,
     take,
     take_three,
+    trace,
 )
 from linkpose.filters._vector import Vec
 from linkpose.filters.tilt import unknown_accel
@@ -75,6 +77,7 @@ from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
 _DOUBT = 6.0  # times its mean square that a velocity may be before the covariance is doubted
+_LARGEST_VARIANCE = 1e6  # of a tilt: of one that may be any it is 1
 _GATE = 25.0  # χ² of a rate at rest, with one degree of freedom: five standard deviations
 _LARGEST_RAD_S = 0.5  # gyro bias that can be, half as much again as the data sheet's ±20 °/s: else begin anew
 
@@ -220,7 +223,7 @@ def _measure_speed(
     accel = vec.plus(f, -GRAVITY, vec.at(x, Z))
     u = vec.plus(vec.plus(u, -keep, u), h, accel)
     vec.put(swing, 0, u)
-    own = (p[0, 0] + p[1, 1] + p[2, 2]) * (GRAVITY * q.swing_time_s) ** 2
+    own = trace(p, Z) * (GRAVITY * q.swing_time_s) ** 2
     square = max(vec.dot(u, u) - own, 0.0) / 3.0
     swing[3] += min(h / q.speed_memory_s, 1.0) * (square - swing[3])
     swing[3] = min(max(swing[3], q.least_speed_m_s**2), q.most_speed_m_s**2)
@@ -276,10 +279,11 @@ def _correct_by_calm(
 
 
 @inlined
-def _runs_away(x: Floats) -> bool:
-    """Whether the state is beyond what can be; NaN is."""
+def _runs_away(x: Floats, p: Floats) -> bool:
+    """Whether mean or covariance is beyond what can be; NaN is."""
     b = vec.at(x, BG)
-    return not (vec.dot(b, b) < _LARGEST_RAD_S**2 and math.isfinite(x[0] + x[3] + x[4] + x[5]))
+    can_be = vec.dot(b, b) < _LARGEST_RAD_S**2 and trace(p, Z) < _LARGEST_VARIANCE
+    return not (can_be and math.isfinite(x[0] + x[3] + x[4] + x[5]))
 
 
 @compiled
@@ -307,7 +311,7 @@ def _advance(
     """One sample later."""
     h, good = time_s - now.time, has_force and has_rate
     force = force if has_force else now.force
-    held = 0.0 if has_rate else now.held + h
+    held = blind_for(now.held, h, has_rate, LONGEST_GAP_S)
     rate = rate if has_rate else now.rate
     angle = vec.plus(vec.plus(ZERO, 0.5 * h, now.rate), 0.5 * h, rate)
     change, doubt = vec.minus(force, now.force), rotation_variance(h, held, imu)
@@ -319,7 +323,7 @@ def _advance(
     if since.span > PACE_S:
         _close(state, since, good, rate, imu, q)
         since = AT_ONCE
-    if _runs_away(x):
+    if _runs_away(x, p):
         _begin(state, force, rate, imu, q)
         state.counts[1] += 1
         since = AT_ONCE
@@ -363,13 +367,13 @@ def _process(
         has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
         has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
         h, good, first = time_s[i] - now.time, has_force and has_rate, math.isnan(now.time)
-        if good and (first or h > LONGEST_GAP_S) and math.isfinite(time_s[i]):
+        if good and (first or max(h, now.held) > LONGEST_GAP_S) and math.isfinite(time_s[i]):
             if first:
                 _begin(state, force, rate, imu, q)
             else:
                 _set_upright(state, force, rate, imu, q)
             now = Now(time_s[i], 0.0, force, rate, ZERO, AT_ONCE)
-        elif h > 0.0:
+        elif 0.0 < h < math.inf:
             now = _advance(state, x, p, now, time_s[i], has_force, force, has_rate, rate, imu, q)
         else:
             good = False
