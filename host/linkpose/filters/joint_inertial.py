@@ -441,13 +441,13 @@ def _take_bias_from_rest(x: Floats, p: Floats, rest: Floats) -> None:
 
 
 @inlined
-def _runs_away(x: Floats, p: Floats, found: float) -> bool:
-    """Whether mean, covariance or the χ² of the errors found is beyond what can be; NaN is."""
+def _runs_away(x: Floats, found: float) -> bool:
+    """Whether the mean or the χ² of the errors found is beyond what can be; NaN is."""
     bg, ba, d = vec.at(x, BG), vec.at(x, BA), vec.at(x, D)
     can_be = (
         vec.dot(bg, bg) < _LARGEST[0] ** 2 and vec.dot(ba, ba) < _LARGEST[1] ** 2 and vec.dot(d, d) < _LARGEST[2] ** 2
     )
-    return not (can_be and math.isfinite(x[0] + x[3] + x[4] + x[5] + trace(p, Z) + trace(p, V) + trace(p, D) + found))
+    return not (can_be and math.isfinite(x[0] + x[3] + x[4] + x[5] + found))
 
 
 @inlined
@@ -474,7 +474,8 @@ def _close(
         state.belief[0] = 0.0
     _take_bias_from_rest(x, p, state.rest)
     taken = _correct(state, jumped, before, rate, h, imu, q) if has_rate else True
-    state.belief[1] = _distance(x, state.prior)
+    sound = math.isfinite(trace(p, Z) + trace(p, V) + trace(p, D))
+    state.belief[1] = _distance(x, state.prior) if sound else math.inf  # which is to begin anew
     return taken
 
 
@@ -541,7 +542,7 @@ def _advance(
             add_noise(state.covariance, vec.at(x, Z), vec.at(x, V), 0.0, gained)
             rate, force, change = before_w, before_a, ZERO
         lost = state.misfit[0] > _LOST * max(state.misfit[1], _LOST_M2_S2)
-        if lost or _runs_away(x, state.covariance, state.belief[1]):
+        if lost or _runs_away(x, state.belief[1]):
             _begin(state, force, rate, imu, q)
             state.counts[1] += 1
             since = AT_ONCE
