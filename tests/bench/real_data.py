@@ -31,7 +31,7 @@ from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig
 
 PENDULUM_J2S = Joint((-0.15, 0.0, 0.0), 0.03)  # by a ruler
-BROAD_DELAY_S, ENCODER_DELAY_S = 0.0038, 0.011
+PENDULUM_DELAY_S, BROAD_DELAY_S, ENCODER_DELAY_S = 0.0057, 0.0038, 0.011
 
 
 class Case(NamedTuple):
@@ -56,7 +56,8 @@ def pendulum(folder: Path) -> Iterator[Case]:
         rotation = _matrices(rows[:, 1:5])
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
-        yield Case(path.stem[9:22], time_s, accel, gyro, _against(tilt, np.ones(len(tilt), bool)), PENDULUM_J2S)
+        error_deg = _against(tilt, np.ones(len(tilt), bool))
+        yield Case(path.stem[9:22], time_s, accel, gyro, error_deg, PENDULUM_J2S, PENDULUM_DELAY_S)
 
 
 def broad(folder: Path) -> Iterator[Case]:

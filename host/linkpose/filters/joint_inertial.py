@@ -98,7 +98,7 @@ _LOST, _LOST_M2_S2 = 0.5, 0.01  # share of (ω×d)² left over for seconds, wher
 _LARGEST = (1.0, 5.0, 10.0)  # gyro bias (rad/s), accelerometer bias (m/s²), J2S (m) that can be: else begin anew
 
 
-CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.02, 0.0015, 0.0005, 200.0)
+CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.016, 0.0015, 0.0005, 200.0)
 DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012, 1000.0)
 _BELIEFS = (CALIBRATED, DATA_SHEET)
 _ODDS = 15.0  # logarithm of those of the first of them, before anything was measured

@@ -91,7 +91,7 @@ class TiltInertialParameters(NamedTuple):
 
     bias_walk_rad_s: float = 3e-4  # in a second: 1 °/s in the hour of warming up
     accel_misfit: float = 0.01  # what the state's scale and alignment leave over, as a share of the force,
-    gyro_misfit: float = 0.004  # and of the rate
+    gyro_misfit: float = 0.005  # and of the rate
     first_speed_m_s: float = 0.5  # σ before it has been measured
     least_speed_m_s: float = 0.01  # σ at rest
     most_speed_m_s: float = 2.0  # σ of an arm that throws
