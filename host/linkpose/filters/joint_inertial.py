@@ -224,10 +224,14 @@ class JointInertialFilter:
         return self.state.mean[BA:MA].copy()
 
     def start_from(self, learned: JointInertialFilter, backwards: bool = False) -> None:
-        """Begins with what another filter has found of J2S and of the sensors; `backwards`: with time reversed."""
+        """Begins with what another filter has found of J2S and of the sensors; `backwards`: with time reversed.
+
+        The gyro's bias drifts: what was found of it is of the end, where only the reversed time begins.
+        """
+        first = BG if backwards else BA
         for own, other in zip(self.states, learned.states, strict=True):
-            own.start_mean[BG:] = other.mean[BG:]
-            own.start_covariance[BG:, BG:] = other.covariance[BG:, BG:]
+            own.start_mean[first:] = other.mean[first:]
+            own.start_covariance[first:, first:] = other.covariance[first:, first:]
             if backwards:
                 own.start_mean[BG:BA] *= -1
                 own.start_covariance[BG:BA] *= -1
