@@ -32,7 +32,7 @@ from linkpose.filters._vector import Vec
 Z, V, BG, BA, MA, MG, D = 0, 3, 6, 9, 12, 21, 30  # where each begins in the state
 SIZE = 33
 PACE_S = 0.035  # between two corrections, at least
-FADING_PACE_S = 0.5  # between two times that beliefs fade
+_FADING_PACE_S = 0.5  # between two times that beliefs fade
 GAP_ACCEL_M_S2 = 200.0  # where the accelerometer did not see, or beyond its range: a blow
 _BEND = 1.0 / 12.0  # of the force's second difference: how far a trapezoid is off a parabola,
 _BENT = 1.0 / 24.0  # and of the third, of the size of a second, how far that is off a cubic
@@ -73,6 +73,20 @@ class Since(NamedTuple):
 
 
 AT_ONCE = Since(0.0, ZERO, ZERO, 0.0, 0.0)
+
+
+@inlined
+def recall_since(a: Floats, k: int) -> Since:
+    """As it was left in nine numbers of an array, from element k on."""
+    return Since(a[k], vec.at(a, k + 1), vec.at(a, k + 4), a[k + 7], a[k + 8])
+
+
+@inlined
+def keep_since(a: Floats, k: int, since: Since) -> None:
+    """For the next block: into nine numbers of an array, from element k on."""
+    a[k], a[k + 7], a[k + 8] = since.span, since.rotation, since.velocity
+    vec.put(a, k + 1, since.turned)
+    vec.put(a, k + 4, since.impulse)
 
 
 @inlined
@@ -289,9 +303,16 @@ def add_noise(p: Floats, tilt: Vec, velocity: Vec, rotation: float, gained: floa
 
 
 @compiled
-def fade(x: Floats, p: Floats, passed_s: float, fade_s: float, start: Floats, prior: Floats) -> None:
-    """First-order Gauss-Markov: what was found of the sensors' errors, but for b_g, returns to what it started from."""
-    kept = math.exp(-passed_s / fade_s)
+def fade(x: Floats, p: Floats, since: Floats, h: float, fade_s: float, start: Floats, prior: Floats) -> None:
+    """First-order Gauss-Markov: what was found of the sensors' errors, but for b_g, returns to what it started from.
+
+    `since[0]` holds the time since that was last done (s), `h` goes by: often is no better than now and then.
+    """
+    since[0] += h
+    if since[0] <= _FADING_PACE_S:
+        return
+    kept = math.exp(-since[0] / fade_s)
+    since[0] = 0.0
     for i in range(BA, D):
         x[i] = start[i] + kept * (x[i] - start[i])
         for j in range(SIZE):

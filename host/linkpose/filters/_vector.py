@@ -118,12 +118,6 @@ def quadratic(s: Sym, v: Vec) -> float:
 
 
 @compiled
-def load(a: Floats) -> Vec:
-    """The vector that an array of three holds."""
-    return (a[0], a[1], a[2])
-
-
-@compiled
 def at(a: Floats, k: int) -> Vec:
     """The vector that an array holds from element k on."""
     return (a[k], a[k + 1], a[k + 2])

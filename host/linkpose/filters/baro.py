@@ -108,7 +108,7 @@ def listen(
                 state.force[j] += force[j]
             state.unsteady[0] += vec.dot(force, force)
             state.unsteady[1] += 1.0
-            state.unsteady[2] = tilt_variance(vec.load(state.force), state.unsteady[0], state.unsteady[1])
+            state.unsteady[2] = tilt_variance(vec.at(state.force, 0), state.unsteady[0], state.unsteady[1])
     elif state.pressure[1] > 0.0:
         return good
     if good:
@@ -120,7 +120,7 @@ def listen(
 @inlined
 def start_height(state: StartState, j2s: Vec) -> float:
     """Height (m) of the sensor over the joint's centre at the start, 0 where no tilt is known."""
-    force = vec.load(state.force)
+    force = vec.at(state.force, 0)
     length = math.sqrt(vec.dot(force, force))
     return float(vec.dot(force, j2s) / length) if length > 0.0 else 0.0
 

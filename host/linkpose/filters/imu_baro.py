@@ -177,8 +177,8 @@ def _process(
     out: Floats,
 ) -> None:
     now = recall(tilt_state)
-    mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
-    lasting = vec.load(vertical.lasting)
+    mean, covariance = vec.at(vertical.mean, 0), vec.load_sym(vertical.covariance)
+    lasting = vec.at(vertical.lasting, 0)
     rejected = 0
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])

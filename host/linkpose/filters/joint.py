@@ -170,7 +170,7 @@ def _process(
 ) -> None:
     now = recall(state)
     t1, t2 = history.time[0], history.time[1]
-    w1, w2 = vec.load(history.rate[0]), vec.load(history.rate[1])
+    w1, w2 = vec.at(history.rate[0], 0), vec.at(history.rate[1], 0)
     rejected = 0
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])

@@ -53,7 +53,6 @@ from linkpose.filters._inertial import (
     AT_ONCE,
     BA,
     BG,
-    FADING_PACE_S,
     MA,
     MG,
     OTHERS,
@@ -71,9 +70,11 @@ from linkpose.filters._inertial import (
     error,
     fade,
     height,
+    keep_since,
     others,
     predict,
     put_errors,
+    recall_since,
     set_upright,
     take,
     take_three,
@@ -282,13 +283,7 @@ def _distance(x: Floats, prior: Floats) -> float:
 
 
 @compiled
-def _begin(
-    state: State,
-    force: Vec,
-    rate: Vec,
-    imu: ImuCalibration,
-    q: JointInertialParameters,
-) -> None:
+def _begin(state: State, force: Vec, rate: Vec, imu: ImuCalibration, q: JointInertialParameters) -> None:
     """Mean and covariance from one sample and the priors."""
     state.mean[:] = state.start_mean
     state.covariance[:] = state.start_covariance
@@ -313,8 +308,7 @@ def _correct(
 ) -> bool:
     """The constraint 0 = v − ω×d as a measurement. False where the gate refused it, for a reading that jumped.
 
-    d is corrected in the part that the rotation stands out of the gyro's noise: K's rows of d are scaled by it, and P
-    follows as P − KHP − PHᵀKᵀ + KSKᵀ.
+    d is corrected in the part that the rotation stands out of the gyro's noise.
     """
     x, p, work, cross, misfit = state.mean, state.covariance, state.work, state.cross, state.misfit
     d, velocity = vec.at(x, D), vec.at(x, V)
@@ -346,18 +340,25 @@ def _correct(
         if jumped:
             return False
         inverse = vec.scaled(_GATE / distance, inverse)  # it is the state that is doubted, but with care
-    told = _share_told(vec.dot(w, w), 3.0 * imu.gyro_variance)
-    if told == 1.0:
-        take_three(x, p, cross, y, inverse)
-    else:
-        before = vec.at(x, D)
-        take_three(x, p, cross, y, inverse)
-        vec.put(x, D, vec.plus(vec.plus(ZERO, 1.0 - told, before), told, vec.at(x, D)))
-        for i in range(D, SIZE):
-            for j in range(D, SIZE):
-                own = cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j]
-                p[i, j] += (1.0 - told) * (1.0 - told) * own
+    _take_constraint(x, p, cross, y, inverse, _share_told(vec.dot(w, w), 3.0 * imu.gyro_variance))
     return True
+
+
+@compiled
+def _take_constraint(x: Floats, p: Floats, cross: Floats, y: Vec, inverse: vec.Sym, told: float) -> None:
+    """The Kalman correction by the innovation y, with H P in `cross`: d is corrected in the part that is `told`.
+
+    K's rows of d are scaled by it, and P follows as P − KHP − PHᵀKᵀ + KSKᵀ.
+    """
+    before = vec.at(x, D)
+    take_three(x, p, cross, y, inverse)
+    if told == 1.0:
+        return
+    vec.put(x, D, vec.plus(vec.plus(ZERO, 1.0 - told, before), told, vec.at(x, D)))
+    for i in range(D, SIZE):
+        for j in range(D, SIZE):
+            own = cross[0, i] * cross[0, j] + cross[1, i] * cross[1, j] + cross[2, i] * cross[2, j]
+            p[i, j] += (1.0 - told) * (1.0 - told) * own
 
 
 @inlined
@@ -424,7 +425,7 @@ def _watch_rest(rest: Floats, force: Vec, rate: Vec, h: float, imu: ImuCalibrati
         return
     if still == 0.0:
         vec.put(rest, 1, force)
-        vec.put(rest, 4, (0.0, 0.0, 0.0))
+        vec.put(rest, 4, ZERO)
     rest[0] = still + h
     for j in range(3):
         rest[4 + j] += rate[j] * h
@@ -472,10 +473,7 @@ def _close(
     catch_up(x, p, state.work, since, 0.0, 0.0, q.gyro_bias_walk_rad_s**2 * h)
     for i in range(D, SIZE):
         p[i, i] += q.j2s_walk**2 * state.start_covariance[D, D] * h
-    state.belief[0] += h
-    if state.belief[0] > FADING_PACE_S:
-        fade(x, p, state.belief[0], state.belief[2], state.start_mean, state.prior)
-        state.belief[0] = 0.0
+    fade(x, p, state.belief, h, state.belief[2], state.start_mean, state.prior)
     _take_bias_from_rest(x, p, state.rest)
     taken = _correct(state, jumped, before, rate, h, imu, q) if has_rate else True
     sound = math.isfinite(trace(p, Z) + trace(p, V) + trace(p, D))
@@ -485,9 +483,8 @@ def _close(
 
 @inlined
 def _start(
-    state: State, first: bool, time_s: float, force: Vec, rate: Vec, imu: ImuCalibration,
-    q: JointInertialParameters,
-) -> Now:  # fmt: skip
+    state: State, first: bool, time_s: float, force: Vec, rate: Vec, imu: ImuCalibration, q: JointInertialParameters
+) -> Now:
     """From one sample, for the first time or after a gap that leaves nothing of the attitude."""
     if first:
         _begin(state, force, rate, imu, q)
@@ -572,9 +569,9 @@ def _report(x: Floats, p: Floats, now: Now, found: float, time_s: float, delay_s
 @inlined
 def _recall(a: Floats) -> Now:
     """The registers as they were left."""
-    since = Since(a[19], vec.at(a, 20), vec.at(a, 23), a[26], a[27])
     return Now(
-        a[0], a[1], a[2], a[3], vec.at(a, 4), vec.at(a, 7), vec.at(a, 10), vec.at(a, 13), vec.at(a, 16), since
+        a[0], a[1], a[2], a[3], vec.at(a, 4), vec.at(a, 7), vec.at(a, 10), vec.at(a, 13), vec.at(a, 16),
+        recall_since(a, 19),
     )  # fmt: skip
 
 
@@ -587,10 +584,7 @@ def _keep(a: Floats, now: Now) -> None:
     vec.put(a, 10, now.newest)
     vec.put(a, 13, now.angle)
     vec.put(a, 16, now.change)
-    a[19] = now.since.span
-    vec.put(a, 20, now.since.turned)
-    vec.put(a, 23, now.since.impulse)
-    a[26], a[27] = now.since.rotation, now.since.velocity
+    keep_since(a, 19, now.since)
 
 
 @compiled
@@ -613,9 +607,7 @@ def _process(
         if good and (first or max(h, now.held) > _LONGEST_BLIND_S) and math.isfinite(time_s[i]):
             now = _start(state, first, time_s[i], force, rate, imu, q)
         elif 0.0 < h < math.inf:
-            now, taken = _advance(
-                state, x, now, time_s[i], has_force, force, has_rate, rate, imu, q
-            )  # fmt: skip
+            now, taken = _advance(state, x, now, time_s[i], has_force, force, has_rate, rate, imu, q)
             good = good and taken
         else:
             good = False

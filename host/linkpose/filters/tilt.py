@@ -253,12 +253,12 @@ def recall(state: TiltState) -> Now:
     """The state in registers."""
     return Now(
         state.time[0],
-        vec.load(state.rate),
+        vec.at(state.rate, 0),
         state.time[1],
-        vec.load(state.tilt),
+        vec.at(state.tilt, 0),
         vec.load_sym(state.covariance),
-        vec.load(state.accel),
-        Lasting(vec.load(state.lasting), state.lasting[3], 0.0),
+        vec.at(state.accel, 0),
+        Lasting(vec.at(state.lasting, 0), state.lasting[3], 0.0),
     )
 
 

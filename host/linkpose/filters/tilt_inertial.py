@@ -50,7 +50,6 @@ from linkpose.filters._inertial import (
     AT_ONCE,
     BA,
     BG,
-    FADING_PACE_S,
     MA,
     MG,
     PACE_S,
@@ -65,7 +64,9 @@ from linkpose.filters._inertial import (
     corrected,
     fade,
     height,
+    keep_since,
     predict,
+    recall_since,
     set_upright,
     take,
     take_three,
@@ -294,10 +295,7 @@ def _close(state: State, since: Since, good: bool, rate: Vec, imu: ImuCalibratio
     rotation = lasting * q.gyro_misfit**2 * vec.dot(since.turned, since.turned)
     gained = lasting * q.accel_misfit**2 * vec.dot(since.impulse, since.impulse)
     catch_up(x, p, state.work, since, rotation, gained, q.bias_walk_rad_s**2 * h)
-    state.faded[0] += h
-    if state.faded[0] > FADING_PACE_S:
-        fade(x, p, state.faded[0], _BELIEF.fade_s, state.start_mean, state.prior)
-        state.faded[0] = 0.0
+    fade(x, p, state.faded, h, _BELIEF.fade_s, state.start_mean, state.prior)
     _correct_by_speed(state, h, q)
     if good:
         _correct_by_calm(x, p, state.calm, rate, h, imu, q)
@@ -333,20 +331,17 @@ def _advance(
 @inlined
 def _recall(a: Floats) -> Now:
     """The registers as they were left."""
-    since = Since(a[11], vec.at(a, 12), vec.at(a, 15), a[18], a[19])
-    return Now(a[0], a[1], vec.at(a, 2), vec.at(a, 5), vec.at(a, 8), since)
+    return Now(a[0], a[1], vec.at(a, 2), vec.at(a, 5), vec.at(a, 8), recall_since(a, 11))
 
 
 @inlined
 def _keep(a: Floats, now: Now) -> None:
     """The registers for the next block."""
-    a[0], a[1], a[11] = now.time, now.held, now.since.span
+    a[0], a[1] = now.time, now.held
     vec.put(a, 2, now.force)
     vec.put(a, 5, now.rate)
     vec.put(a, 8, now.change)
-    vec.put(a, 12, now.since.turned)
-    vec.put(a, 15, now.since.impulse)
-    a[18], a[19] = now.since.rotation, now.since.velocity
+    keep_since(a, 11, now.since)
 
 
 @compiled
