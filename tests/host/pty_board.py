@@ -31,9 +31,7 @@ def link_run(settings: Configure) -> LinkRun:
 class PtyBoard:
     """Serves a board at the symlink `path`. `spoil` may change what the board sends; `chatter` is said all the time."""
 
-    def __init__(
-        self, path: Path, spoil: Callable[[bytes], bytes] = lambda data: data, chatter: bytes = b""
-    ) -> None:
+    def __init__(self, path: Path, spoil: Callable[[bytes], bytes] = lambda data: data, chatter: bytes = b"") -> None:
         self.path = path
         self.spoil = spoil
         self.chatter = chatter

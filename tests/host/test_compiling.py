@@ -201,8 +201,5 @@ def test_a_full_disk_costs_no_more_than_the_compiling(tmp_path):
 
 
 def test_other_users_of_the_compiler_keep_their_place():
-    code = (
-        "import numba, linkpose.localization.linalg, linkpose.filters.baro\n"
-        "print(repr(numba.config.CACHE_DIR))"
-    )
+    code = "import numba, linkpose.localization.linalg, linkpose.filters.baro\nprint(repr(numba.config.CACHE_DIR))"
     assert run(code, HOST, NUMBA_CACHE_DIR="") == "''"

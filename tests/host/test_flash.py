@@ -176,9 +176,7 @@ def test_without_avrdude_the_package_is_named(
     assert "avrdude is not installed; type `sudo apt install avrdude`" in said
 
 
-def test_platformio_s_own_avrdude_serves_too(
-    program: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_platformio_s_own_avrdude_serves_too(program: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     folder = tmp_path / "packages" / "tool-avrdude"
     (folder / "bin").mkdir(parents=True)
     shutil.copy("/bin/true", folder / "bin" / "avrdude")
@@ -248,7 +246,7 @@ def test_how_far_an_upload_has_come(port: str, said: str, stage: Stage, percent:
 @pytest.mark.parametrize(
     ("said", "sentence"),
     [
-        ("avrdude: ser_open(): can't open device \"{port}\": Permission denied", "sudo usermod -aG dialout"),
+        ('avrdude: ser_open(): can\'t open device "{port}": Permission denied', "sudo usermod -aG dialout"),
         ('avrdude: ser_open(): can\'t open device "{port}": Device or resource busy', "{port} cannot be opened"),
         ("avrdude: stk500_recv(): programmer is not responding", "no UNO bootloader answers at {port}"),
         ("avrdude: stk500_getsync() attempt 10 of 10: not in sync: resp=0x4c", "no UNO bootloader answers at {port}"),
@@ -265,9 +263,7 @@ def test_what_each_complaint_means(port: str, said: str, sentence: str) -> None:
     assert sentence.format(port=port) in upload.why_failed()
 
 
-def test_a_board_that_falls_silent_while_it_is_written_is_given_up(
-    port: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_board_that_falls_silent_while_it_is_written_is_given_up(port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr("linkpose.flashing.upload.time.monotonic", lambda: now[0])
     upload = Upload(port)

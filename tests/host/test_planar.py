@@ -18,9 +18,7 @@ BOTH = pytest.mark.parametrize("name", ["planar-ekf", "planar-ukf"])
 
 
 @lru_cache(maxsize=10)
-def recorded(
-    seed: int = 1, faults: tuple[Fault, ...] = (), rate_hz: float = 100.0
-) -> tuple[MiceRun, Measurements]:
+def recorded(seed: int = 1, faults: tuple[Fault, ...] = (), rate_hz: float = 100.0) -> tuple[MiceRun, Measurements]:
     run = MiceRun(seed, 30.0, rate_hz, faults=faults)
     return run, run.measurements()
 

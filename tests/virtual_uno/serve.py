@@ -53,14 +53,17 @@ def main() -> int:
         return 1
     try:
         disturbed = {"disturbancePa": options.disturbance}
-        with _program(options) as (program, boot_address), VirtualUno(
-            program,
-            seed=options.seed,
-            bmp180=disturbed,
-            mice=MICE[: options.mice],
-            bootloader_s=options.bootloader,
-            boot_address=boot_address,
-        ) as uno:
+        with (
+            _program(options) as (program, boot_address),
+            VirtualUno(
+                program,
+                seed=options.seed,
+                bmp180=disturbed,
+                mice=MICE[: options.mice],
+                bootloader_s=options.bootloader,
+                boot_address=boot_address,
+            ) as uno,
+        ):
             statistics = _serve(uno, options)
     except (VirtualUnoError, LinkposeError) as error:
         print(error, file=sys.stderr)

@@ -107,9 +107,7 @@ class Sensor:
         rows = np.atleast_2d(np.asarray(values, dtype="<f8"))
         if rows.shape != (len(times), self._columns) or np.any(np.diff(times) <= 0):
             raise ValueError(f"{self._name} needs rising times (N,) and values (N, {self._columns}), not {rows.shape}")
-        self._uno.request(
-            "feed", sensor=self._name, times=_text(times), values=_text(rows), interpolated=interpolated
-        )
+        self._uno.request("feed", sensor=self._name, times=_text(times), values=_text(rows), interpolated=interpolated)
 
     def unplug(self) -> None:
         """Takes its power away: it no longer answers."""

@@ -94,5 +94,3 @@ def burst_starts(events: NDArray[Any]) -> NDArray[np.float64]:
 
 def us(cycles: Any) -> Any:
     return np.asarray(cycles) * 1e6 / CLOCK_HZ
-
-

@@ -57,9 +57,7 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "gyro_range_deg_s": hello.gyro_range_deg_s,
         "dlpf": hello.dlpf,
         "baro_oversampling": hello.baro_oversampling,
-        "mice": [
-            {"port": at, **mouse._asdict()} for at, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF
-        ],
+        "mice": [{"port": at, **mouse._asdict()} for at, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF],
         "samples": health.samples,
         "samples_lost": health.lost,
         "frames_corrupt": health.corrupt.total,

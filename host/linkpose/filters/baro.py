@@ -159,8 +159,14 @@ def metres_per_pascal(state: StartState) -> float:
 
 @inlined
 def measure(
-    pressure: float, time_s: float, raw_gyro: Vec, flags: int,
-    imu: ImuCalibration, j2s: Vec, noise_Pa: float, state: StartState,
+    pressure: float,
+    time_s: float,
+    raw_gyro: Vec,
+    flags: int,
+    imu: ImuCalibration,
+    j2s: Vec,
+    noise_Pa: float,
+    state: StartState,
 ) -> tuple[float, float, float]:
     """Height (m) by a fresh pressure, and its variance by the sensor's noise and by all else (m²)."""
     began, scale = start_height(state, j2s), metres_per_pascal(state)

@@ -102,9 +102,7 @@ class ImuBaroFilter:
 
 
 @inlined
-def propagate(
-    mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: VerticalParameters
-) -> tuple[Vec, Sym]:
+def propagate(mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: VerticalParameters) -> tuple[Vec, Sym]:
     """One step of the model; `accel` is Zᵀs_A − g (m/s²), of no use where not `seen`."""
     h, v, b = mean
     t = step_s

@@ -144,9 +144,7 @@ def find_avrdude() -> list[str]:
     return [own, "-C", str(settings)] if settings.is_file() else [own]
 
 
-def _run(
-    command: list[str], environment: dict[str, str] | None, port: str, listen: Callable[[Upload], None]
-) -> None:
+def _run(command: list[str], environment: dict[str, str] | None, port: str, listen: Callable[[Upload], None]) -> None:
     upload = Upload(port)
 
     def go_on(said: str) -> bool:

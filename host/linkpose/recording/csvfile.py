@@ -1,10 +1,10 @@
 """A CSV file that survives: metadata ahead, rows handed over as they come, whole rows only, a closing line.
 
-    # linkpose <kind> 1
-    # {"...": "metadata, JSON"}
-    time_s,...
-    0.000000,...
-    # {"...": "closing metadata, JSON"}
+# linkpose <kind> 1
+# {"...": "metadata, JSON"}
+time_s,...
+0.000000,...
+# {"...": "closing metadata, JSON"}
 """
 
 from __future__ import annotations

@@ -32,9 +32,7 @@ class Table:
         """Raises LinkposeError unless the table has all these columns."""
         missing = [name for name in names if name not in self.columns]
         if missing:
-            raise LinkposeError(
-                f"{self.path} has no column {', '.join(missing)}; it has {', '.join(self.columns)}"
-            )
+            raise LinkposeError(f"{self.path} has no column {', '.join(missing)}; it has {', '.join(self.columns)}")
 
 
 def read_bytes(path: Path) -> bytes:
