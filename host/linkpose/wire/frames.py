@@ -137,7 +137,8 @@ def _sample_unpacker(shape: SampleShape) -> tuple[int, Unpack]:
     The values of a body become a message by at most two insertions of zeros: four sections leave no more gaps.
     """
     unpack_from = Struct("<" + shape.code).unpack_from
-    cuts, fills = [], []  # where in the values zeros are missing, and the zeros
+    cuts: list[int] = []  # where in the values zeros are missing
+    fills: list[tuple[int, ...]] = []  # the zeros
     at = len(_SAMPLE.fields)
     for group, count in zip(_SAMPLE.groups[:-1], shape.counts, strict=False):
         if count:
@@ -209,6 +210,32 @@ def _sample_values(sample: Sample) -> tuple[list[int], str]:
     if (sample.sections & mice.mask) // (mice.mask & -mice.mask) != count:
         raise ValueError(f"sections {sample.sections:#x} do not declare {count} mice")
     return values + list(sample.mice), code + mice.code * count
+
+
+def sample(
+    seq: int,
+    t_us: int,
+    flags: int,
+    imu: tuple[int, ...] = (),
+    imu2: tuple[int, ...] = (),
+    baro: tuple[int, ...] = (),
+    mag: tuple[int, ...] = (),
+    mice: tuple[int, ...] = (),
+) -> Sample:
+    """A SAMPLE with the sections whose values are given; the others are absent.
+
+    imu, imu2: accel x y z, temperature, gyro x y z; baro: ut, up, count; mag: x y z, count; mice: dx, dy of each.
+    """
+    values: list[Any] = [seq, t_us, flags, 0]
+    sections = 0
+    for group, given in zip(_SAMPLE.groups, (imu, imu2, baro, mag), strict=False):
+        values += given or (0,) * len(group.code)
+        sections |= group.mask * bool(given)
+    counted = _SAMPLE.groups[-1]
+    sections |= len(mice) // len(counted.code) * (counted.mask & -counted.mask)
+    values[3] = sections
+    message: Sample = _new(Sample, (*values, mice))
+    return message
 
 
 class StreamDecoder:

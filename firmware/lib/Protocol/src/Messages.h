@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kProtocolMajor = 2;
 constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0x9cbd2277;
+constexpr uint32_t kSchemaCrc = 0x171967ae;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -220,11 +220,11 @@ struct __attribute__((packed)) Sample {
   static_assert(sizeof(Imu2) == 14, "no padding");
   // The barometer.
   struct __attribute__((packed)) Baro {
-    uint32_t baro_ut;  // uncompensated temperature: 16 bits of a BMP180, 20 bits of a BMP280
+    uint16_t baro_ut;  // uncompensated temperature, 16 bits: UT of a BMP180, adc_T / 16 of a BMP280
     uint32_t baro_up;  // uncompensated pressure: 16 + oversampling bits of a BMP180, 20 bits of a BMP280
     uint8_t baro_count;  // increases by one with each new baro_up; wraps
   };
-  static_assert(sizeof(Baro) == 9, "no padding");
+  static_assert(sizeof(Baro) == 7, "no padding");
   // The magnetometer, in its own axes.
   struct __attribute__((packed)) Mag {
     int16_t mag_x;  // the scale depends on the family
@@ -245,7 +245,7 @@ struct __attribute__((packed)) Sample {
   uint32_t t_us;  // s; clock of the board, latched at the tick; wraps after 71.6 minutes
   uint32_t flags;
   uint8_t sections;  // sections that follow
-  static constexpr uint8_t kSize = 71;  // with all groups
+  static constexpr uint8_t kSize = 69;  // with all groups
 };
 static_assert(sizeof(Sample) == 11, "no padding");
 
