@@ -184,9 +184,12 @@ def _live(
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
-    """Names the filters that cannot run. Raises LinkposeError when J2S is to be found and nobody looks for it."""
+    """Names the filters that cannot run. Raises LinkposeError when J2S is to be estimated and no filter does it."""
+    from linkpose import filters
+
     if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
-        raise LinkposeError("--j2s auto is found by joint-inertial, which does not run; add --filter joint-inertial")
+        name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
+        raise LinkposeError(f"--j2s auto is estimated by {name}, which does not run; add --filter {name}")
     for reason in dict.fromkeys(estimator.left_out.values()):
         names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
         console.say(f"without {names}: {reason}")

@@ -55,7 +55,12 @@ def find_ports() -> list[PortInfo]:
 
 
 def choose_port(simulated_will_do: bool = True) -> str:
-    """The only UNO there is. Raises LinkposeError that lists what there is when it is none or several."""
+    """The port that the environment variable LINKPOSE_PORT names, otherwise the only UNO connected.
+
+    Raises LinkposeError, which lists the ports, when no UNO or several are connected.
+    """
+    if named := os.environ.get("LINKPOSE_PORT"):
+        return named
     ports = find_ports()
     unos = [port for port in ports if port.is_uno]
     if len(unos) == 1:
