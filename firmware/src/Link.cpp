@@ -37,6 +37,15 @@ const Identity kIdentity PROGMEM = {
     LINKPOSE_SOURCE_REVISION,
 };
 
+wire::DeviceState state_of(Ps2Mouse::Presence presence) {
+  switch (presence) {
+    case Ps2Mouse::Presence::kStarting: return wire::DeviceState::kStarting;
+    case Ps2Mouse::Presence::kRunning: return wire::DeviceState::kOk;
+    case Ps2Mouse::Presence::kLost: return wire::DeviceState::kFailed;
+    default: return wire::DeviceState::kAbsent;
+  }
+}
+
 }  // namespace
 
 void Link::note_pass(uint32_t us) {
@@ -51,7 +60,7 @@ void Link::run() {
 
 void Link::configure(const wire::Configure& settings) {
   sampler_.configure(settings);
-  mice_.configure(settings.sample_rate_hz, settings.mouse_counts_per_mm);
+  mice_.configure(settings.mouse_counts_per_mm);
 }
 
 void Link::receive() {
@@ -68,7 +77,7 @@ void Link::receive() {
 }
 
 void Link::greet() {
-  if (greeted_ || !((sampler_.sensors_settled() && mice_.settled()) || clock::now_us() > kGreetUs)) return;
+  if (greeted_ || !((sampler_.sensors_settled() && mice_.probed()) || clock::now_us() > kGreetUs)) return;
   greeted_ = true;
   send_hello();
 }
@@ -93,9 +102,8 @@ void Link::send_hello() {
   memcpy(hello.baro_words, sampler_.baro().calibration(), 2 * Bmp180::kCalibrationWords);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    const bool found = mouse.id() != Ps2Mouse::kNoId;
-    const wire::DeviceState state = found ? wire::DeviceState::kOk : wire::DeviceState::kAbsent;
-    hello.mice[i] = {static_cast<uint8_t>(state), mouse.id(), 0, mouse.counts_per_mm(), mouse.report_rate_hz(), 0};
+    hello.mice[i] = {static_cast<uint8_t>(state_of(mouse.presence())), mouse.id(), mouse.status(),
+                     mouse.counts_per_mm(), mouse.report_rate_hz(), mouse.lacks()};
   }
   uart::put(wire::Hello::kType, &hello, wire::Hello::size(Mice::kPorts));
 }
@@ -126,7 +134,7 @@ void Link::send_status() {
   sampler_.count(status.devices);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets(), 0};
+    status.mice[i] = {mouse.parity_errors(), mouse.resyncs(), mouse.resets(), mice_.take_poll_us(i)};
   }
   uart::put(wire::Status::kType, &status, wire::Status::size(Mice::kPorts));
 }

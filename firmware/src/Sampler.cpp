@@ -185,7 +185,7 @@ void Sampler::send_sample() {
     if (baro_.valid()) head.flags |= flag::kBaroValid;
   }
   // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
-  const bool mice_read = tick_.serves_mice;
+  const bool mice_read = tick_.has_mice;
   head.flags |= mice_.flags(mice_read);
   const uint8_t count = head.sections / kOneMouse;
   for (uint8_t i = 0; i < count; i++) {

@@ -185,13 +185,14 @@ class VirtualUno:
         hex_path: Path | str,
         *,
         seed: int = 0,
+        adc: dict[str, Any] | None = None,
         mpu6050: dict[str, Any] | None = None,
         bmp180: dict[str, Any] | None = None,
         mice: Sequence[dict[str, Any]] = (),
         bootloader_s: float = 0.0,
         boot_address: int = 0,
     ) -> None:
-        """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
+        """`adc`, `mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
         these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
         `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
@@ -202,7 +203,7 @@ class VirtualUno:
         self.imu = Sensor(self, "mpu6050", 7)
         self.baro = Sensor(self, "bmp180", 2)
         self.mice = [Mouse(self, index) for index in range(len(mice))]
-        options = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
+        options = {"seed": seed, "adc": adc or {}, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
         options |= {"bootloaderS": bootloader_s, "bootAddress": boot_address}
         try:
             self._kinds = np.array(self.request("create", hex=str(Path(hex_path).resolve()), options=options)["kinds"])
@@ -254,9 +255,14 @@ class VirtualUno:
         """The reset line, as DTR pulls it when a host opens the port."""
         self.request("reset")
 
-    def hang(self) -> None:
-        """The program gets stuck, with interrupts off."""
-        self.request("hang")
+    def hang(self, *, interrupts: bool = False) -> int:
+        """Stops the program in an endless loop and returns the byte address of the loop."""
+        at: int = self.request("hang", interrupts=interrupts)["at"]
+        return at
+
+    def supply(self, volts: float) -> None:
+        """Sets the supply voltage of the ATmega328P."""
+        self.request("supply", volts=volts)
 
     # --- the serial line ---
 

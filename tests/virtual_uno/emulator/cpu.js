@@ -5,6 +5,7 @@ const { CPU, avrInstruction } = require("avr8js");
 
 const CLOCK_HZ = 16_000_000;
 const SRAM_BYTES = 2048;
+const FIRST_IO = 0x20;
 const FIRST_SRAM = 0x100;
 const SREG = 0x5f;
 const SMCR = 0x53;
@@ -85,11 +86,11 @@ class Cpu extends CPU {
     peripheral.reset();
   }
 
-  /** A reset: registers to their initial values, SRAM kept, the core still for the start-up time.
+  /** A reset: I/O registers take their initial values, r0 to r31 and SRAM keep theirs, the core waits the start-up time.
    *  @param {boolean} causeKept whether MCUSR still tells when the program starts */
   restart(cause, startUpCycles, causeKept) {
     const flags = this.data[MCUSR];
-    this.data.fill(0, 0, FIRST_SRAM);
+    this.data.fill(0, FIRST_IO, FIRST_SRAM);
     if (causeKept) this.data[MCUSR] = cause === RESET_CAUSE.powerOn ? cause : flags | cause;
     this.pendingInterrupts.fill(null);
     this.nextInterrupt = -1;

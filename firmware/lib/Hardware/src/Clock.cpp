@@ -20,7 +20,7 @@ constexpr uint8_t kBurstDelaySteps = 24;
 volatile uint32_t tick_number;
 volatile uint32_t tick_us;
 volatile uint8_t tick_half_us;  // 0 or 1 step on top of tick_us
-volatile bool tick_serves_mice;
+volatile bool tick_has_mice;
 volatile uint16_t period_steps;
 volatile uint16_t next_period_steps;
 
@@ -49,7 +49,7 @@ Tick tick() {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     latest.number = tick_number;
     latest.t_us = tick_us;
-    latest.serves_mice = tick_serves_mice;
+    latest.has_mice = tick_has_mice;
   }
   return latest;
 }
@@ -87,7 +87,7 @@ ISR(TIMER1_COMPA_vect) {
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
   twi::start_burst();
-  clock::tick_serves_mice = ps2::start_prepared();
+  clock::tick_has_mice = ps2::start_armed();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
   clock::tick_us += (clock::period_steps >> 1) + (halves >> 1);
