@@ -110,14 +110,14 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
 
 def record_through(port: Path, out: Path, duration: float, *happenings) -> tuple[list[str], Session]:
     """Records for a time of the board; each happening (after s, what) is done on the way."""
-    from linkpose.cli.live import Recorder
+    from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
     said: list[str] = []
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
         waiting = list(happenings)
         for placements in session.stream(duration):
-            recorder.take(placements)
+            recorder.convert(placements)
             if waiting and session.timeline.duration_s >= waiting[0][0]:
                 waiting.pop(0)[1]()
         recorder.close("duration")

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from pty_board import PtyBoard
 
-from linkpose.cli.live import Recorder
 from linkpose.device import session as session_module
-from linkpose.device.session import Session, WrongBoard
+from linkpose.device.session import Session
+from linkpose.errors import BoardError
+from linkpose.recorder import Recorder
 from linkpose.recording.reader import load_recording
 from linkpose.sensors.rig import Rig
 from linkpose.simulation import board as simulated
@@ -119,11 +120,11 @@ def test_another_firmware_in_the_middle_of_a_recording_ends_it(
     with (
         PtyBoard(port, spoil=firmware) as board,
         Session(str(port), lambda _: None) as session,
-        pytest.raises(WrongBoard, match=named),
+        pytest.raises(BoardError, match=named),
         Recorder(session, out, Rig(), False) as recorder,
     ):
         for placements in session.stream(5.0):
-            recorder.take(placements)
+            recorder.convert(placements)
             if session.timeline.samples >= 20 and not firmware.begun:
                 firmware.begin()
                 exchange(board)

@@ -64,7 +64,7 @@ def _usable_port(named: str | None) -> str:
 
     if named is not None and "://" in named:
         raise LinkposeError(f"{named} is no board that can be flashed; name a device such as /dev/ttyACM0 or COM3")
-    port = named or choose_port(simulated_will_do=False)
+    port = named or choose_port()
     open_port(port).close()
     return port
 

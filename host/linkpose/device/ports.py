@@ -11,7 +11,15 @@ from typing import Any
 import serial
 from serial.tools import list_ports
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import (
+    NoBoardFound,
+    NotASerialPort,
+    PermissionDenied,
+    PortBusy,
+    PortError,
+    PortNotFound,
+    SeveralBoardsFound,
+)
 from linkpose.wire.messages import BAUD
 
 # USB ids of the UNO: Arduino's own, and the CH340 that nearly all its copies carry.
@@ -54,10 +62,10 @@ def find_ports() -> list[PortInfo]:
     return found
 
 
-def choose_port(simulated_will_do: bool = True) -> str:
+def choose_port() -> str:
     """The port that the environment variable LINKPOSE_PORT names, otherwise the only UNO connected.
 
-    Raises LinkposeError, which lists the ports, when no UNO or several are connected.
+    Raises NoBoardFound or SeveralBoardsFound, which list the ports.
     """
     if named := os.environ.get("LINKPOSE_PORT"):
         return named
@@ -65,53 +73,51 @@ def choose_port(simulated_will_do: bool = True) -> str:
     unos = [port for port in ports if port.is_uno]
     if len(unos) == 1:
         return unos[0].port
-    listed = ", ".join(f"{p.port} ({p.description or 'no description'})" for p in (unos or ports))
-    if unos:
-        raise LinkposeError(f"{len(unos)} boards are connected: {listed}; choose one with --port")
-    if ports:
-        raise LinkposeError(f"no UNO is connected; the ports there are: {listed}; connect it or choose with --port")
-    hint = ", or try --port sim://link" if simulated_will_do else ""
-    raise LinkposeError(f"no serial port is connected; plug the board in{hint}")
+    raise SeveralBoardsFound(unos) if unos else NoBoardFound(ports)
+
+
+def register_scheme(package: str) -> None:
+    """Lets `open_port` open URLs of another scheme: `package` holds a module protocol_SCHEME, as pyserial asks."""
+    if package not in serial.protocol_handler_packages:
+        serial.protocol_handler_packages.append(package)
 
 
 def open_port(name: str) -> serial.Serial:
-    """Opens a device, a pyserial URL or a simulated board (`sim://...`).
+    """Opens a device, a pyserial URL, or a URL of a registered scheme.
 
-    Raises LinkposeError with its own sentence for a port that is absent, busy, forbidden or none.
+    Raises PortNotFound, PortBusy, PermissionDenied, NotASerialPort or another PortError.
     """
-    if "linkpose.simulation" not in serial.protocol_handler_packages:
-        serial.protocol_handler_packages.append("linkpose.simulation")
     options: dict[str, Any] = {"baudrate": BAUD, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
         user = holder(name)
         if user:
-            raise LinkposeError(f"{name} is in use by {user}; close it and try again")
+            raise PortBusy(name, user)
         if os.name == "posix":
             options["exclusive"] = True
     try:
         port = serial.serial_for_url(name, **options)
     except (serial.SerialException, OSError, ValueError) as error:
-        raise LinkposeError(_why_not(name, error)) from error
+        raise _why_not(name, error) from error
     return port
 
 
-def _why_not(name: str, error: Exception) -> str:
+def _why_not(name: str, error: Exception) -> PortError:
+    """The error that says why a port cannot be opened, from what the system or pyserial raised."""
     code = getattr(error, "errno", None)
     text = str(error).lower()
     if code == errno.ENOENT or "filenotfound" in text or "could not find" in text:
-        return f"there is no port {name}; `linkpose ports` lists those there are"
+        return PortNotFound(name)
     if code in (errno.EACCES, errno.EPERM) or "permissionerror(13" in text or "access is denied" in text:
-        if os.name == "nt":
-            return f"{name} is in use by another program; close it and try again"
-        join = f"sudo usermod -aG {_group(name)} $USER"
-        return f"no permission to open {name}; join the group that owns it with `{join}` and log in again"
+        return PortBusy(name) if os.name == "nt" else PermissionDenied(name, _group(name))
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{name} is in use by another program; close it and try again"
+        return PortBusy(name)
     if "no handler" in text or "invalid url" in text:
-        return f"{name} is no port that can be opened; name a device such as /dev/ttyACM0 or COM3, or sim://link"
+        return PortError(
+            name, f"{name} is no port that can be opened; name a device such as /dev/ttyACM0 or COM3, or sim://link"
+        )
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
-        return f"{name} is not a serial port; `linkpose ports` lists those there are"
-    return f"cannot open {name}: {error}"
+        return NotASerialPort(name)
+    return PortError(name, f"cannot open {name}: {error}")
 
 
 def _group(name: str) -> str:

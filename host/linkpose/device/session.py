@@ -12,7 +12,7 @@ from typing import BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
-from linkpose.errors import LinkposeError
+from linkpose.errors import BoardError, LinkposeError, NoFirmware, WrongFirmware
 from linkpose.sensors.conversion import Settings
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Placed, Timeline
@@ -52,15 +52,12 @@ PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
 RETRY_INTERVAL_S = 0.25
 
-FLASH = "type `linkpose flash`"
-UPGRADE = "type `pip install --upgrade linkpose`"
-
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
-class WrongBoard(LinkposeError):
-    """A board that cannot be gone on with, however long it is waited for."""
+class AnotherBoard(BoardError):
+    """Another board answers at the port than the one that the recording began with."""
 
 
 class Placement(NamedTuple):
@@ -146,22 +143,22 @@ class Session:
             heard += arrival.data[: 512 - len(heard)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
-                    raise WrongBoard(_other_protocol(message))
+                    raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
                     connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
-        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), connection.decoder.corrupt)}")
+        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
 
     def _check_versions(self, hello: Hello) -> None:
-        """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
+        """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise WrongBoard(_other_schema(hello))
+            raise _other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
-            older, cure = ("board", FLASH) if hello.protocol_minor < PROTOCOL_MINOR else ("linkpose", UPGRADE)
+            older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
             self._notify(
-                f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
-                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
+                f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
 
     # ---- commands ----
@@ -316,7 +313,7 @@ class Session:
         elif isinstance(message, Status):
             self._status = message
         elif isinstance(message, OtherProtocol):
-            raise WrongBoard(_other_protocol(message))
+            raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
             self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
@@ -327,13 +324,15 @@ class Session:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
         if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
-            raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
+            raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
         self._begin()
 
     def _reconnect(self) -> Iterator[None]:
-        """Waits until the board can be opened again and streams; yields while it waits. Raises WrongBoard."""
+        """Waits until the board can be opened again and streams; yields while it waits.
+
+        Raises WrongFirmware or AnotherBoard."""
         self._connection.close()
         for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
@@ -346,7 +345,7 @@ class Session:
                 continue
             try:
                 self._resume(self._handshake())
-            except WrongBoard:
+            except (WrongFirmware, AnotherBoard):
                 raise
             except (Disconnected, LinkposeError):
                 self._connection.close()
@@ -406,33 +405,35 @@ def _reason(code: int) -> str:
         return f"reason {code}"
 
 
-def _other_protocol(other: OtherProtocol) -> str:
+def _other_protocol(other: OtherProtocol) -> WrongFirmware:
     theirs = f"{other.protocol_major}.{other.protocol_minor}"
     ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
     if other.protocol_major < PROTOCOL_MAJOR:
-        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; {FLASH}"
-    return f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; {UPGRADE}"
+        return WrongFirmware(f"the board's firmware is old: it uses protocol {theirs}, this linkpose {ours}", True)
+    return WrongFirmware(f"this linkpose is old: it uses protocol {ours}, the board's firmware {theirs}", False)
 
 
-def _other_schema(hello: Hello) -> str:
+def _other_schema(hello: Hello) -> WrongFirmware:
     theirs = firmware_version(hello)
     release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
     if release > tuple(map(int, VERSION.split("."))):
-        return f"this linkpose {VERSION} is older than the board's firmware {theirs}, their schemas differ; {UPGRADE}"
-    return f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas; {FLASH}"
+        text = f"this linkpose {VERSION} is older than the board's firmware {theirs}, and their schemas differ"
+        return WrongFirmware(text, False)
+    text = f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas"
+    return WrongFirmware(text, True)
 
 
 def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
     """What came instead of a HELLO, and what to do about it."""
     if not heard:
-        return "the board is silent; type `linkpose flash` if it never had this firmware, or choose another --port"
+        return "the board is silent; it may never have had this firmware, or another port is the board's"
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
     if printable > 0.8 * len(heard):
         text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
-        return f"another firmware answers: {text!r}; type `linkpose flash` to put linkpose's on the board"
+        return f"another firmware answers: {text!r}"
     if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
         return "the board answers only in part; check the cable and try again"
     return (
-        "only noise came, and no frame; the device runs at another baud rate or is no linkpose board: check the port, "
-        "or type `linkpose flash`"
+        "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "
+        "the port"
     )
