@@ -15,7 +15,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from linkpose.errors import LinkposeError
-from linkpose.wire.messages import VERSION as __version__
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from linkpose.recording.reader import load_recording as load
     from linkpose.sensors.measurements import Measurements
     from linkpose.sensors.rig import Rig
+    from linkpose.wire.messages import VERSION as __version__
 
 __all__ = [
     "Board", "Estimates", "LinkposeError", "Measurements", "Recording", "Rig", "__version__", "create_filter", "errors",
@@ -43,6 +43,7 @@ _HOMES = {
     "load": ("linkpose.recording.reader", "load_recording"),
     "Measurements": ("linkpose.sensors.measurements", "Measurements"),
     "Rig": ("linkpose.sensors.rig", "Rig"),
+    "__version__": ("linkpose.wire.messages", "VERSION"),
 }
 
 

@@ -8,25 +8,28 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
 
 from linkpose.device import ports
 from linkpose.device.session import Health, Session
-from linkpose.recorder import Recorder, raw_capture
-from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Joint, Rig, as_rig
 from linkpose.wire.messages import Configure, Hello
+
+if TYPE_CHECKING:  # NumPy: commands that only talk to the board start without it
+    from linkpose.recorder import Recorder
+    from linkpose.sensors.measurements import Measurements
 
 _log = logging.getLogger("linkpose")
 
 
-def open_session(port: str | None, notify: Callable[[str], None], capture: object = None) -> Session:
+def open_session(port: str | None, notify: Callable[[str], None], capture: BinaryIO | None = None) -> Session:
     """Connects to the board at `port`: a device, a pyserial URL or `sim://...`; None: the only UNO connected.
 
     `notify` receives a line for the user when something happens that is not a failure; `capture`, a binary file,
     receives every byte. Raises PortError, NoBoardFound, SeveralBoardsFound, NoFirmware or WrongFirmware.
     """
     ports.register_scheme("linkpose.simulation")
-    return Session(port or ports.choose_port(), notify, capture)  # type: ignore[arg-type]
+    return Session(port or ports.choose_port(), notify, capture)
 
 
 class Board:
@@ -67,6 +70,8 @@ class Board:
             LinkposeError: its kinds PortError, NoBoardFound, SeveralBoardsFound, NoFirmware, WrongFirmware, BoardError
                 (the board refuses a setting), FileExists, CannotWrite.
         """
+        from linkpose.recorder import Recorder, raw_capture
+
         self._exit = contextlib.ExitStack()
         with self._exit:
             capture = self._exit.enter_context(raw_capture(Path(raw) if raw else None, force))
@@ -77,7 +82,7 @@ class Board:
             rig = as_rig(rig, session.rig)
             self.rig = replace(rig, joint=joint) if joint else rig
             session.wait_for_mice(len(self.rig.mouse))
-            self._recorder = Recorder(session, None, self.rig)
+            self._recorder: Recorder = Recorder(session, None, self.rig)
             if record:
                 self.record(record, force=force)
             self._exit = self._exit.pop_all()
@@ -104,6 +109,8 @@ class Board:
 
     def record(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Writes what `stream` yields to a recording (CSV) too. Raises FileExists (unless `force`) and CannotWrite."""
+        from linkpose.recorder import Recorder
+
         self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force))
 
     def stream(

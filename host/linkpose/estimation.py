@@ -16,9 +16,9 @@ from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, load_recording
 from linkpose.sensors.conversion import TIME_DECIMALS, Settings
+from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
-from linkpose.wire.messages import Sensors
 
 if TYPE_CHECKING:
     import pandas
@@ -81,8 +81,8 @@ class Estimator:
     def for_board(names: Sequence[str], board: Board) -> Estimator:
         """An estimator for a connected board's stream. Raises as the constructor does."""
         settings = Settings.of(board.hello)
-        sensors = Sensors(board.hello.sensors)
-        return Estimator(names, board.rig.with_delay_of(settings.dlpf), sensors, settings.mouse_ports)
+        rig = board.rig.with_delay_of(settings.dlpf)
+        return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
     def for_measurements(names: Sequence[str], rig: Rig, measurements: Measurements) -> Estimator:

@@ -6,9 +6,9 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
-from linkpose.device.session import Health, Placement, Session
+from linkpose.device.session import Placement, Session
 from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, metadata
@@ -72,16 +72,3 @@ def raw_capture(path: Path | None, force: bool = False) -> Iterator[BinaryIO | N
         return
     with os.fdopen(create(path, force), "wb", buffering=0) as file:
         yield file
-
-
-def summary(health: Health) -> dict[str, Any]:
-    """The closing summary of a session, as `record --json` prints it."""
-    return {
-        "event": "summary",
-        "samples": health.samples,
-        "lost": health.lost,
-        "corrupt": health.corrupt.total,
-        "gaps": len(health.gaps),
-        "duration_s": round(health.duration_s, 6),
-        "rate_hz": round(health.rate_hz, 3),
-    }

@@ -170,7 +170,7 @@ def _live(
                 sink.write(estimates)
                 view.show(estimates[-1], connected.session.health)
 
-        ended = live.run(connected, duration, handle)
+        ended = live.run_board(connected, duration, handle)
         view.close()
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})

@@ -7,17 +7,21 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.board import Board
-from linkpose.device.session import Health
+from linkpose.device.session import Health, summary
 from linkpose.errors import LinkposeError
-from linkpose.recorder import summary
-from linkpose.sensors.measurements import Measurements
+
+if TYPE_CHECKING:
+    from linkpose.board import Board
+    from linkpose.sensors.measurements import Measurements
+
+Block = TypeVar("Block")
 
 PROGRESS_INTERVAL_S = 0.2
 
@@ -57,20 +61,25 @@ class Console:
             self._width = 0
 
 
-def run(board: Board, duration_s: float | None, handle: Callable[[Measurements], None]) -> str:
-    """Passes the stream's blocks to `handle`, empty ones too, until the time is over or the user ends it.
+def run(stream: Generator[Block, None, None], handle: Callable[[Block], object]) -> str:
+    """Passes the blocks of a stream to `handle` until the stream or the user ends it.
 
     Returns which of the two it was: "duration" or "interrupted".
     """
-    stream = board.stream(duration_s, yield_idle=True)
     with ending_well(), contextlib.closing(stream):
         try:
             for block in stream:
                 handle(block)
         except KeyboardInterrupt:
-            board.finish("interrupted")
             return "interrupted"
     return "duration"
+
+
+def run_board(board: Board, duration_s: float | None, handle: Callable[[Measurements], object]) -> str:
+    """Passes the board's blocks to `handle`, empty ones too, and ends the recording as the user ended the run."""
+    ended = run(board.stream(duration_s, yield_idle=True), handle)
+    board.finish(ended)
+    return ended
 
 
 @contextlib.contextmanager

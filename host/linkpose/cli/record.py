@@ -49,5 +49,5 @@ def command(
         def handle(_: Measurements) -> None:
             console.progress(lambda: live.health_line(connected.health))
 
-        live.run(connected, duration, handle)
+        live.run_board(connected, duration, handle)
         live.show_summary(console, connected.health, json_lines, f": {path}")

@@ -82,12 +82,12 @@ def register_scheme(package: str) -> None:
         serial.protocol_handler_packages.append(package)
 
 
-def open_port(name: str) -> serial.Serial:
-    """Opens a device, a pyserial URL, or a URL of a registered scheme.
+def open_port(name: str, baud: int = BAUD) -> serial.Serial:
+    """Opens a device, a pyserial URL, or a URL of a registered scheme, at a bit rate.
 
     Raises PortNotFound, PortBusy, PermissionDenied, NotASerialPort or another PortError.
     """
-    options: dict[str, Any] = {"baudrate": BAUD, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
+    options: dict[str, Any] = {"baudrate": baud, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
         user = holder(name)
         if user:

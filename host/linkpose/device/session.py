@@ -6,14 +6,15 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, WrongFirmware
 from linkpose.sensors.conversion import Settings
+from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Placed, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
@@ -160,6 +161,7 @@ class Session:
                 f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
                 f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
+        check_hello(hello)
 
     # ---- commands ----
 
@@ -179,9 +181,9 @@ class Session:
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
-    def self_test(self) -> SelfTestResult:
-        """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""
-        with_ack = self._command(SelfTest(), Command.SELF_TEST)
+    def self_test(self, device: int = 0) -> SelfTestResult:
+        """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
+        with_ack = self._command(SelfTest(device), Command.SELF_TEST)
         return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
 
     def _command(self, message: Message, command: Command) -> Arrival:
@@ -250,7 +252,7 @@ class Session:
 
     # ---- streaming ----
 
-    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
+    def stream(self, duration_s: float | None = None) -> Generator[list[Placement], None, None]:
         """Samples as they arrive, in lists of those that came together, for `duration_s` of the board's time.
 
         A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
@@ -323,7 +325,7 @@ class Session:
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
+        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
@@ -373,6 +375,19 @@ class Session:
         )
 
 
+def summary(health: Health) -> dict[str, Any]:
+    """The closing summary of a session, as `record --json` prints it."""
+    return {
+        "event": "summary",
+        "samples": health.samples,
+        "lost": health.lost,
+        "corrupt": health.corrupt.total,
+        "gaps": len(health.gaps),
+        "duration_s": round(health.duration_s, 6),
+        "rate_hz": round(health.rate_hz, 3),
+    }
+
+
 def firmware_version(hello: Hello) -> str:
     return f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}"
 
@@ -387,15 +402,7 @@ def reset_causes(hello: Hello) -> str:
 
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
-    resolutions = [mouse.counts_per_mm for mouse in hello.mice if mouse.counts_per_mm]
-    return Configure(
-        hello.sample_rate_hz,
-        hello.accel_range_g,
-        hello.gyro_range_deg_s,
-        hello.dlpf,
-        hello.baro_oversampling,
-        max(resolutions, default=8),
-    )
+    return Configure(*(getattr(hello, name) for name in Configure._fields))
 
 
 def _reason(code: int) -> str:
