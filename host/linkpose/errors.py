@@ -99,10 +99,13 @@ class PermissionDenied(PortError):
 
 
 class NoBoardFound(LinkposeError):
-    """No port was named, and none of the ports of this machine is an UNO. `ports` lists them."""
+    """No port was named, and none of the ports of this machine is an UNO. `ports` lists them.
 
-    def __init__(self, ports: Sequence[Any]) -> None:
-        self.ports = tuple(ports)
+    `simulated_will_do` says whether a simulated board would serve the purpose.
+    """
+
+    def __init__(self, ports: Sequence[Any], simulated_will_do: bool = True) -> None:
+        self.ports, self.simulated_will_do = tuple(ports), simulated_will_do
         listed = describe_ports(self.ports)
         super().__init__(
             f"no UNO is connected; the ports there are: {listed}" if ports else "no serial port is connected"

@@ -50,10 +50,10 @@ def framed(payload: bytes) -> bytes:
     [
         (b"", "the board is silent"),
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
-        (random.Random(3).randbytes(60), "only noise came"),
-        (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 2.0"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 2.0, the board's firmware 3.0"),
+        (random.Random(3).randbytes(60), "only noise was received"),
+        (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -101,7 +101,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     with PtyBoard(tmp_path / "port"):
         first = Session(str(tmp_path / "port"), print)
         next(iter(first.stream()))
-        first._link.close()  # as a killed program leaves it: no STOP
+        first._connection.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
             seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]

@@ -16,7 +16,8 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.PortNotFound: lambda e: "`linkpose ports` lists those there are",
     errors.NotASerialPort: lambda e: "`linkpose ports` lists those there are",
     errors.NoBoardFound: lambda e: (
-        "connect it or choose with --port" if e.ports else "plug the board in, or try --port sim://link"
+        ("connect it or choose with --port" if e.ports else "plug the board in")
+        + (", or try --port sim://link" if e.simulated_will_do else "")
     ),
     errors.SeveralBoardsFound: lambda e: "choose one with --port",
     errors.NoFirmware: lambda e: f"{FLASH} to put linkpose's firmware on the board, or choose another port with --port",

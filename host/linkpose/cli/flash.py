@@ -67,7 +67,7 @@ def _usable_port(named: str | None) -> str:
 
     if named is not None and "://" in named:
         raise LinkposeError(f"{named} is not a board that can be flashed. Pass a device such as /dev/ttyACM0 or COM3")
-    port = named or choose_port()
+    port = named or choose_port(simulated_will_do=False)
     open_port(port).close()
     return port
 

@@ -62,7 +62,7 @@ def find_ports() -> list[PortInfo]:
     return found
 
 
-def choose_port() -> str:
+def choose_port(simulated_will_do: bool = True) -> str:
     """The port that the environment variable LINKPOSE_PORT names, otherwise the only UNO connected.
 
     Raises NoBoardFound or SeveralBoardsFound, which list the ports.
@@ -73,7 +73,7 @@ def choose_port() -> str:
     unos = [port for port in ports if port.is_uno]
     if len(unos) == 1:
         return unos[0].port
-    raise SeveralBoardsFound(unos) if unos else NoBoardFound(ports)
+    raise SeveralBoardsFound(unos) if unos else NoBoardFound(ports, simulated_will_do)
 
 
 def register_scheme(package: str) -> None:
