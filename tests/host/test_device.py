@@ -6,6 +6,7 @@ import json
 import random
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -282,16 +283,15 @@ def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
 def test_a_suspended_program_does_not_report_a_silent_board(tmp_path):
     """After SIGSTOP the clock has run on, but nothing was waited for."""
     said: list[str] = []
-    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), said.append) as session:
-        jump = [0.0]
-        monkeyed = time.perf_counter
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(session_module.time, "perf_counter", lambda: monkeyed() + jump[0])
-            for _ in session.stream():
-                if session.timeline.samples > 10:
-                    jump[0] += 10.0
-                if session.timeline.samples > 40:
-                    break
+    ahead_s = 0.0
+    clock = types.SimpleNamespace(perf_counter=lambda: time.perf_counter() + ahead_s, sleep=time.sleep)
+    port = tmp_path / "port"
+    with PtyBoard(port), Session(str(port), said.append) as session, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_module, "time", clock)
+        for _ in session.stream():
+            ahead_s += 10.0
+            if session.timeline.samples > 40:
+                break
     assert not said
 
 
