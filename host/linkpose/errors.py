@@ -6,6 +6,7 @@ Python program has no flags.
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Sequence
 from typing import Any
 
@@ -218,3 +219,21 @@ class InvalidValue(LinkposeError, ValueError):
     def __init__(self, name: str, text: str) -> None:
         super().__init__(f"{name} {text}")
         self.name = name
+
+
+# ---- text ----
+
+
+def printable(text: object, most: int | None = None) -> str:
+    """Text from a file or a device, safe for a terminal: control characters as escapes, and at most `most` characters.
+
+    Escape sequences in a column name, a rig key or a USB description would otherwise move the cursor, retitle the
+    window or, in some terminals, type a command. Line ends and tabs stay.
+    """
+    shown = "".join(
+        c
+        if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Co")
+        else c.encode("unicode_escape").decode()
+        for c in str(text)
+    )
+    return shown if most is None or len(shown) <= most else shown[: most - 1] + "…"

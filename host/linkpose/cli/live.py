@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from linkpose.device.session import Health, summary
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, printable
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -38,7 +38,7 @@ class Console:
     def say(self, text: str) -> None:
         self.clear()
         if not self._quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text), err=True)
 
     def detail(self, text: str) -> None:
         if self._verbose:
@@ -46,7 +46,7 @@ class Console:
 
     def progress(self, make_text: Callable[[], str]) -> None:
         """Shows a line that replaces the one before, a few times a second."""
-        now = time.monotonic()
+        now = time.perf_counter()
         if self.shows_progress and now - self._shown_at >= PROGRESS_INTERVAL_S:
             self._shown_at = now
             text = make_text()
