@@ -316,6 +316,11 @@ def test_the_only_uno_is_chosen_and_none_or_several_are_listed(monkeypatch, refu
     assert sentence in refused("info")
 
 
+def test_the_environment_may_name_the_port(monkeypatch, linkpose):
+    monkeypatch.setenv("LINKPOSE_PORT", "sim://link?seed=3")
+    assert json.loads(linkpose("info", "--json").out)["protocol"]
+
+
 def test_ports_json(monkeypatch, linkpose):
     monkeypatch.setattr(ports, "find_ports", lambda: [UNO, OTHER])
     listed = [json.loads(line) for line in linkpose("ports", "--json").out.splitlines()]

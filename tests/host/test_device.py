@@ -34,7 +34,7 @@ def stranger(path: Path, chatter: bytes) -> PtyBoard:
 
 
 OLD_HELLO = bytes.fromhex("01") + bytes([0, 9]) + b"\x11\x22\x33\x44" + b"whatever followed then"
-NEW_HELLO = bytes.fromhex("01") + bytes([2, 0]) + b"\x11\x22\x33\x44" + bytes(60)
+NEW_HELLO = bytes.fromhex("01") + bytes([3, 0]) + b"\x11\x22\x33\x44" + bytes(60)
 
 
 def framed(payload: bytes) -> bytes:
@@ -52,8 +52,8 @@ def framed(payload: bytes) -> bytes:
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
         (random.Random(3).randbytes(60), "only noise came"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.1"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.1, the board's firmware 2.0"),
+        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -87,7 +87,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
 
 def test_settings_are_put_in_force_or_refused_with_the_reason():
     with Session("sim://link", print) as session:
-        settings = Configure(200, 4, 500, 2, 0, 8)
+        settings = Configure(200, 4, 500, 2, 0, 8, 400)
         hello = session.configure(settings)
         assert (hello.sample_rate_hz, hello.accel_range_g, hello.gyro_range_deg_s) == (200, 4, 500)
         with pytest.raises(session_module.LinkposeError, match="gyro range out of range"):

@@ -145,8 +145,8 @@ def _live(
     from linkpose.device.ports import choose_port
     from linkpose.device.session import Session
     from linkpose.sensors.conversion import Settings
+    from linkpose.sensors.devices import found
     from linkpose.sensors.measurements import Measurements
-    from linkpose.wire.messages import Sensors
 
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(live.raw_capture(raw, request.force))
@@ -157,7 +157,7 @@ def _live(
         with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            settings, sensors = Settings.of(session.hello), Sensors(session.hello.sensors)
+            settings, sensors = Settings.of(session.hello), found(session.hello)
             used = rig.with_delay_of(settings.dlpf)
             estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
             _check(estimator, request, console)

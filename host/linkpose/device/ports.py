@@ -55,7 +55,12 @@ def find_ports() -> list[PortInfo]:
 
 
 def choose_port(simulated_will_do: bool = True) -> str:
-    """The only UNO there is. Raises LinkposeError that lists what there is when it is none or several."""
+    """The port that the environment variable LINKPOSE_PORT names, otherwise the only UNO connected.
+
+    Raises LinkposeError, which lists the ports, when no UNO or several are connected.
+    """
+    if named := os.environ.get("LINKPOSE_PORT"):
+        return named
     ports = find_ports()
     unos = [port for port in ports if port.is_uno]
     if len(unos) == 1:
@@ -69,14 +74,15 @@ def choose_port(simulated_will_do: bool = True) -> str:
     raise LinkposeError(f"no serial port is connected; plug the board in{hint}")
 
 
-def open_port(name: str) -> serial.Serial:
-    """Opens a device, a pyserial URL or a simulated board (`sim://...`).
+def open_port(name: str, baud: int = BAUD) -> serial.Serial:
+    """Open a device, a pyserial URL or a simulated board (`sim://...`) at a bit rate.
 
-    Raises LinkposeError with its own sentence for a port that is absent, busy, forbidden or none.
+    Raises LinkposeError with a sentence of its own for a port that is absent, busy or forbidden, and for a file that is
+    not a port.
     """
     if "linkpose.simulation" not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append("linkpose.simulation")
-    options: dict[str, Any] = {"baudrate": BAUD, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
+    options: dict[str, Any] = {"baudrate": baud, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
         user = holder(name)
         if user:

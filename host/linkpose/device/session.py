@@ -14,6 +14,7 @@ from linkpose.device.clock import DeviceClock
 from linkpose.device.link import Arrival, Disconnected, Link
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import Settings
+from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Placed, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
@@ -163,6 +164,7 @@ class Session:
                 f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
                 f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
             )
+        check_hello(hello)
 
     # ---- commands ----
 
@@ -182,9 +184,9 @@ class Session:
             self._link.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
-    def self_test(self) -> SelfTestResult:
-        """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""
-        with_ack = self._command(SelfTest(), Command.SELF_TEST)
+    def self_test(self, device: int = 0) -> SelfTestResult:
+        """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
+        with_ack = self._command(SelfTest(device), Command.SELF_TEST)
         return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
 
     def _command(self, message: Message, command: Command) -> Arrival:
@@ -326,7 +328,7 @@ class Session:
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
+        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
             raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
@@ -388,15 +390,7 @@ def reset_causes(hello: Hello) -> str:
 
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
-    resolutions = [mouse.counts_per_mm for mouse in hello.mice if mouse.counts_per_mm]
-    return Configure(
-        hello.sample_rate_hz,
-        hello.accel_range_g,
-        hello.gyro_range_deg_s,
-        hello.dlpf,
-        hello.baro_oversampling,
-        max(resolutions, default=8),
-    )
+    return Configure(*(getattr(hello, name) for name in Configure._fields))
 
 
 def _reason(code: int) -> str:
