@@ -108,9 +108,7 @@ class NoBoardFound(LinkposeError):
     def __init__(self, ports: Sequence[Any], simulated_will_do: bool = True) -> None:
         self.ports, self.simulated_will_do = tuple(ports), simulated_will_do
         listed = describe_ports(self.ports)
-        super().__init__(
-            f"no UNO is connected; the ports are: {listed}" if ports else "no serial port is connected"
-        )
+        super().__init__(f"no UNO is connected; the ports are: {listed}" if ports else "no serial port is connected")
 
 
 class SeveralBoardsFound(LinkposeError):
