@@ -13,7 +13,6 @@ namespace {
 // HELLO goes out at boot when all sensors are set up or found absent, and after this time at the latest.
 constexpr uint32_t kGreetUs = 300000;
 constexpr uint32_t kStatusUs = 1000000;
-constexpr uint16_t kNotHung = 0xFFFF;
 
 // Which firmware this is. It stands in the flash as it goes out in HELLO, behind a mark that `linkpose flash` looks for in
 // a .hex before it writes it. The members are the first of wire::Hello.
@@ -87,7 +86,7 @@ void Link::send_hello() {
   wire::Hello hello;
   memcpy_P(&hello, &kIdentity.protocol_major, kIdentityInHello);
   hello.reset_cause = board::reset_cause();
-  hello.hung_at = kNotHung;
+  hello.hung_at = board::hung_at();
   hello.streaming = sampler_.streaming();
   hello.sections = sampler_.sections();
   hello.sample_rate_hz = settings.sample_rate_hz;
@@ -98,8 +97,8 @@ void Link::send_hello() {
   hello.mouse_counts_per_mm = settings.mouse_counts_per_mm;
   hello.i2c_khz = settings.i2c_khz;
   sampler_.describe(hello.devices);
-  memset(hello.baro_words, 0, sizeof hello.baro_words);
-  memcpy(hello.baro_words, sampler_.baro().calibration(), 2 * Bmp180::kCalibrationWords);
+  static_assert(sizeof hello.baro_words == 2 * Barometer::kWords, "all words");
+  memcpy(hello.baro_words, sampler_.baro().calibration(), sizeof hello.baro_words);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
     hello.mice[i] = {static_cast<uint8_t>(state_of(mouse.presence())), mouse.id(), mouse.status(),
@@ -130,7 +129,7 @@ void Link::send_status() {
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
   status.cpu_load = static_cast<uint16_t>(awake_us / (elapsed_us / 1000));
-  status.vcc_mv = 0;
+  status.vcc_mv = board::supply_mv();
   sampler_.count(status.devices);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);

@@ -22,10 +22,10 @@ Ps2Mouse::Ending ending_of(Ps2Bits::Outcome outcome) {
 }  // namespace
 
 Mice::Mice(uint8_t counts_per_mm)
-    : ports_{{Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0, 0},
-             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0, 0}} {}
+    : ports_{{Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0},
+             {Ps2Mouse(counts_per_mm), false, false, 0, 0, 0, 0, 0, 0}} {}
 
 void Mice::configure(uint8_t counts_per_mm) {
   for (Port& port : ports_) port.mouse.configure(counts_per_mm);
@@ -39,13 +39,14 @@ void Mice::reset(uint8_t ports) {
 
 void Mice::run() {
   const uint32_t now = clock::now_us();
-  for (uint8_t port = 0; port < kPorts; port++) advance(port, now);
   if (armed_ && !ps2::round_waiting()) {
     armed_ = false;
+    round_us_ = clock::tick().t_us;
     for (uint8_t i = 0; ps2::published() && i < kPorts; i++) {
       if (finished_ & 1 << i) ports_[i].mouse.complete_round();
     }
   }
+  for (uint8_t port = 0; port < kPorts; port++) advance(port, now);
   if (!armed_ && round_ended()) begin_round();
 }
 
@@ -67,7 +68,6 @@ bool Mice::transaction_ended(uint8_t number, uint32_t now_us) {
     port.waits = ps2::waiting(number);
     port.since_us = now_us;
     if (port.waits) return false;
-    if (port.mouse.polls()) port.begun_us = clock::tick().t_us;
   }
   const Ps2Bits& bits = ps2::bits(number);
   if (bits.outcome() != Ps2Bits::Outcome::kRunning) return true;
@@ -75,9 +75,9 @@ bool Mice::transaction_ended(uint8_t number, uint32_t now_us) {
   if (received != port.received) {
     port.received = received;
     port.since_us = now_us;
-    port.limit_us = port.next_limit_us;
+    port.limit_ms = port.next_limit_ms;
   }
-  return now_us - port.since_us >= port.limit_us;
+  return now_us - port.since_us >= uint32_t{1000} * port.limit_ms;
 }
 
 void Mice::finish_transaction(uint8_t number, uint32_t now_us) {
@@ -91,7 +91,7 @@ void Mice::finish_transaction(uint8_t number, uint32_t now_us) {
   const bool polled = port.mouse.running();
   port.mouse.finish({ending_of(bits.outcome()), bits.received(), bits.bytes()});
   if (!polled || !port.mouse.answered()) return;
-  const uint32_t took_us = now_us - port.begun_us;
+  const uint32_t took_us = now_us - round_us_;
   if (took_us > port.poll_us) port.poll_us = took_us < UINT16_MAX ? static_cast<uint16_t>(took_us) : UINT16_MAX;
 }
 
@@ -100,8 +100,8 @@ void Mice::prepare(uint8_t number, const Ps2Mouse::Request& request) {
   port.busy = true;
   port.waits = true;
   port.received = 0;
-  port.limit_us = request.first_us;
-  port.next_limit_us = request.next_us;
+  port.limit_ms = request.first_ms;
+  port.next_limit_ms = request.next_ms;
   if (request.sends) {
     ps2::send(number, request.byte, request.answers, request.acknowledged);
   } else {

@@ -45,10 +45,9 @@ class Mice {
     uint8_t received;
     uint8_t resyncs;
     uint16_t poll_us;
-    uint32_t limit_us;       // from `since_us`
-    uint32_t next_limit_us;  // of each further byte
+    uint16_t limit_ms;       // from `since_us`
+    uint16_t next_limit_ms;  // of each further byte
     uint32_t since_us;
-    uint32_t begun_us;
   };
 
   void advance(uint8_t port, uint32_t now_us);
@@ -63,6 +62,7 @@ class Mice {
   Port ports_[kPorts];
   uint8_t round_ = 0;     // ports that were polled
   uint8_t finished_ = 0;  // ports of the round before
+  uint32_t round_us_ = 0;  // its start
   bool armed_ = false;
   bool measured_round_ = false;  // adapt_period() was called for it
   uint8_t period_ = 1;

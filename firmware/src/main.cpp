@@ -23,6 +23,7 @@ void setup() {
   board::power_down_unused();
   board::start_watchdog();
   board::begin_led();
+  board::begin_supply();
   idle::begin();
   twi::begin();
   uart::begin();

@@ -45,6 +45,7 @@ from linkpose.wire.messages import (
 )
 from virtual_uno import CLOCK_HZ, Faults
 
+NOT_HUNG = 0xFFFF
 MakeBoard = Callable[..., WireLink]
 
 
@@ -267,7 +268,9 @@ def _check_ramp(samples: list[Sample], starts: NDArray[np.float64]) -> None:
     """The row that each sample's counts name is the newest one the sensor had when its burst began."""
     rows = np.array([sample.accel_x + 30000 * sample.accel_y for sample in samples])
     for sample, row in zip(samples, rows.tolist(), strict=True):
-        assert sample[4:11] == (row % 30000, row // 30000, -(row % 1000), row % 100, row % 30000, -(row % 30000), 123)
+        assert sample[4:7] == (row % 30000, row // 30000, -(row % 1000))
+        assert sample.imu_temp - row % 100 in (0, 1)  # the emulated sensor's noise
+        assert sample[8:11] == (row % 30000, -(row % 30000), 123)
     read_at_ms = starts[: len(rows)] / CLOCK_HZ * 1000
     age_ms = read_at_ms - rows
     assert age_ms.min() >= 0
@@ -288,7 +291,8 @@ def test_the_simulated_rig_reaches_the_wire_unchanged(board: MakeBoard) -> None:
     newest = np.floor(starts / CLOCK_HZ * 1000).astype(int)
     counts = run.imu_counts(np.arange(newest[-1] + 1) / 1000, 0)
     for sample, row in zip(link.samples, newest.tolist(), strict=True):
-        assert any(sample[4:11] == tuple(counts[max(0, row - age)].tolist()) for age in (0, 1, 2))
+        candidates = [counts[max(0, row - age)].tolist() for age in (0, 1, 2)]
+        assert [*sample[4:7], *sample[8:11]] in [counts[:3] + counts[4:] for counts in candidates]
 
 
 def test_imu_reads_begin_at_a_fixed_distance_from_the_tick(board: MakeBoard) -> None:
@@ -495,18 +499,6 @@ def test_wrong_bytes_never_set_the_sensor_up_wrong(board: MakeBoard) -> None:
     assert {sample[4:7] for sample in settled} == {(2048, 1024, 4096)}
 
 
-def test_another_chip_is_not_taken_for_the_sensor(board: MakeBoard) -> None:
-    link = board(mpu6050={"whoAmI": 0x12})
-    link.boot()
-    link.run_ms(500)
-    link.send(GetInfo())
-    hello = link.expect(Hello, 50)
-    assert not found(hello) & Sensors.MPU6050
-    link.carry_out(Start())
-    link.run_ms(200)
-    assert not any(valid(sample, SampleFlags.IMU_VALID) for sample in link.samples)
-
-
 def test_boots_without_sensors(board: MakeBoard) -> None:
     link = board()
     link.uno.imu.unplug()
@@ -519,15 +511,44 @@ def test_boots_without_sensors(board: MakeBoard) -> None:
     assert lost(link.samples) == 0
 
 
-def test_a_program_that_hangs_is_reset(board: MakeBoard) -> None:
-    """The watchdog brings it back, and HELLO says so."""
+def test_a_program_that_hangs_with_interrupts_off_is_reset(board: MakeBoard) -> None:
     link = board()
     link.start()
     link.uno.hang()
-    assert link.boot().reset_cause & ResetCause.WATCHDOG
+    hello = link.boot()
+    assert hello.reset_cause & ResetCause.WATCHDOG
+    assert hello.hung_at == NOT_HUNG
     link.carry_out(Start())
     link.run_ms(100)
     assert len(link.samples) >= 9
+
+
+def test_a_program_that_hangs_restarts_and_reports_where(board: MakeBoard) -> None:
+    """It restarts without a reset: a bootloader that leaves the watchdog on would be reset in a loop."""
+    link = board(mice=[{}])
+    link.start(1500)
+    link.uno.watch(["reset"])
+    at = link.uno.hang(interrupts=True)
+    hello = link.boot()
+    assert hello.reset_cause == ResetCause.WATCHDOG | ResetCause.HUNG
+    assert hello.hung_at == at
+    assert len(link.uno.events()) == 0
+    link.carry_out(Start())
+    link.run_ms(1500)
+    assert valid(link.samples[-1], SampleFlags.IMU_VALID) and valid(link.samples[-1], SampleFlags.MOUSE1_VALID)
+    assert lost(link.samples) == 0
+    link.uno.reset()
+    hello = link.boot()
+    assert (hello.reset_cause, hello.hung_at) == (ResetCause.EXTERNAL, NOT_HUNG)
+
+
+@pytest.mark.parametrize(("supply_v", "band_gap_v"), [(5.0, 1.1), (4.2, 1.1), (5.0, 1.0)])
+def test_supply_voltage_is_measured_against_the_band_gap(board: MakeBoard, supply_v: float, band_gap_v: float) -> None:
+    link = board(adc={"bandGapV": band_gap_v})
+    link.uno.supply(supply_v)
+    link.start()
+    link.run_ms(2100)
+    assert link.status.vcc_mv / 1000 == pytest.approx(supply_v * 1.1 / band_gap_v, abs=0.025)
 
 
 def test_a_wrong_bit_rate_is_garbage_both_ways(board: MakeBoard) -> None:

@@ -6,13 +6,14 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
-from linkpose.device.link import Arrival, Disconnected, Link
-from linkpose.errors import LinkposeError
+from linkpose.device.connection import Arrival, Connection, Disconnected
+from linkpose.device.ports import find_again, usb_identity
+from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
 from linkpose.sensors.conversion import Settings
 from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
@@ -51,17 +52,16 @@ SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
+LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
+RECEIVE_TIMEOUT_S = 0.1
 RETRY_INTERVAL_S = 0.25
-
-FLASH = "type `linkpose flash`"
-UPGRADE = "type `pip install --upgrade linkpose`"
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
-class WrongBoard(LinkposeError):
-    """A board that cannot be gone on with, however long it is waited for."""
+class AnotherBoard(BoardError):
+    """Another board answers at the port than the one that the recording began with."""
 
 
 class Placement(NamedTuple):
@@ -96,25 +96,29 @@ class Session:
         self.port = port
         self._notify = notify
         self._capture = capture
-        self._link = Link(port, capture)
+        self._connection = Connection(port, capture)
+        self._usb = usb_identity(port)
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
         self._started: Arrival | None = None  # what came together with the ACK of START
-        self._heard_at = self._asked_at = self._pinged_at = 0.0  # s, monotonic: last sample, GET_INFO and PING
+        self._pinged_at = 0.0  # s, perf_counter
+        self._silent_s = self._asked_s = (
+            0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
+        )
         self._corrupt_before = Corrupt()
         try:
             self.hello = self._handshake()
         except BaseException:
-            self._link.close()
+            self._connection.close()
             raise
 
     @property
     def rig(self) -> Rig | None:
         """The rig that a simulated board brings along; None of a real one."""
-        return self._link.rig
+        return self._connection.rig
 
     @property
     def settings(self) -> Configure:
@@ -126,43 +130,43 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Disconnected):
-            self._link.send(Stop())
-        self._link.close()
+            self._connection.send(Stop())
+        self._connection.close()
 
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
-        link = self._link
+        connection = self._connection
         heard = bytearray()
-        deadline, ask_at = time.monotonic() + HANDSHAKE_TIMEOUT_S, 0.0
-        while time.monotonic() < deadline:
-            if time.monotonic() >= ask_at:
-                link.send(Stop())
-                link.send(GetInfo())
-                ask_at = time.monotonic() + ASK_INTERVAL_S
-            arrival = link.receive(0.05)
+        deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
+        while time.perf_counter() < deadline:
+            if time.perf_counter() >= ask_at:
+                connection.send(Stop())
+                connection.send(GetInfo())
+                ask_at = time.perf_counter() + ASK_INTERVAL_S
+            arrival = connection.receive(0.05)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
-                    raise WrongBoard(_other_protocol(message))
+                    raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
-                    link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
-        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
+        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
 
     def _check_versions(self, hello: Hello) -> None:
-        """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
+        """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise WrongBoard(_other_schema(hello))
+            raise _other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
-            older, cure = ("board", FLASH) if hello.protocol_minor < PROTOCOL_MINOR else ("linkpose", UPGRADE)
+            older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
             self._notify(
-                f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
-                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
+                f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
         check_hello(hello)
 
@@ -172,16 +176,16 @@ class Session:
         """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
         self._command(settings, Command.CONFIGURE)
         time.sleep(SETTLE_S)
-        self._link.send(GetInfo())
+        self._connection.send(GetInfo())
         self.hello = self._await(Hello, "GET_INFO")
         return self.hello
 
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
-        deadline = time.monotonic() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
+        deadline = time.perf_counter() + MICE_TIMEOUT_S
+        while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
             time.sleep(ASK_INTERVAL_S)
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
     def self_test(self, device: int = 0) -> SelfTestResult:
@@ -195,7 +199,7 @@ class Session:
         A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
         """
         for _ in range(ATTEMPTS):
-            self._link.send(message)
+            self._connection.send(message)
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for at, answer in enumerate(arrival.messages):
                     if isinstance(answer, Nak) and answer.command == command:
@@ -223,9 +227,9 @@ class Session:
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
-        deadline = time.monotonic() + timeout_s
-        while (left := deadline - time.monotonic()) > 0:
-            arrival = self._link.receive(left)
+        deadline = time.perf_counter() + timeout_s
+        while (left := deadline - time.perf_counter()) > 0:
+            arrival = self._connection.receive(left)
             if arrival is not None:
                 yield arrival
 
@@ -233,7 +237,7 @@ class Session:
 
     def _ping(self) -> None:
         self._token = (self._token + 1) % (1 << 32)
-        self._pings = {self._token: self._link.send(Ping(self._token))}
+        self._pings = {self._token: self._connection.send(Ping(self._token))}
 
     def _hear_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
@@ -255,48 +259,61 @@ class Session:
 
     # ---- streaming ----
 
-    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
-        """Samples as they arrive, in lists of those that came together, for `duration_s` of the board's time.
+    def stream(self, duration_s: float | None = None) -> Generator[list[Placement], None, None]:
+        """Samples as they arrive, in lists of those that arrived together, for `duration_s` of the board's time.
 
-        A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
-        was reset or unplugged is waited for, and goes on in the same timeline with the gap marked.
+        A list may be empty: the caller gets its turn several times a second even when nothing arrives. After a reset or
+        an unplugged cable the stream waits for the board and continues in the same timeline, with the gap marked. It
+        ends with the duration in any case.
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
-        while True:
+        self._began_s = self._connection.now()
+        while not timeline.is_over:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} is gone ({error.reason}); waiting for the board to come back, Ctrl-C ends")
+                self._notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
                 timeline.interrupted("cable")
                 yield []
-                for _ in self._reconnect():
-                    yield []
+                yield from self._reconnect(timeline)
                 continue
             yield placements
-            if timeline.is_over:
-                return
+            if self._silent_s > LATE_S:
+                self._end_when_due(timeline)
+        if timeline.missing_at_end:
+            self._notify(
+                f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
+                "are counted as lost"
+            )
+
+    def _end_when_due(self, timeline: Timeline) -> None:
+        """End the timeline when the duration has passed without a sample that would have ended it."""
+        first_s = timeline.start_s if timeline.samples else self._began_s
+        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
         self._clock = DeviceClock()
         self._tie_clocks()
         self._started = self._command(Start(), Command.START)
-        self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
+        self._pinged_at = time.perf_counter()
+        self._silent_s = self._asked_s = 0.0
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._link.receive(0.1), None
-        now = time.monotonic()
+        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
+        now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
         if arrival is None:
-            self._ask_when_silent(now)
+            self._silent_s += RECEIVE_TIMEOUT_S  # not by the clock: a suspended program has not waited
+            self._ask_when_silent()
             return []
         placements = []
         for message in arrival.messages:
             if isinstance(message, Sample):
-                self._heard_at = now
+                self._silent_s = self._asked_s = 0.0
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
@@ -304,13 +321,13 @@ class Session:
                 self._hear(message, arrival, timeline)
         return placements
 
-    def _ask_when_silent(self, now: float) -> None:
-        """A board that fell silent may have been reset while its HELLO was lost: ask who is there."""
-        if now - self._heard_at > SILENCE_S and now - self._asked_at > SILENCE_S:
-            if self._asked_at <= self._heard_at:
+    def _ask_when_silent(self) -> None:
+        """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
+        if self._silent_s - self._asked_s > SILENCE_S:
+            if self._asked_s == 0.0:
                 self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
-            self._asked_at = now
-            self._link.send(GetInfo())
+            self._asked_s = self._silent_s
+            self._connection.send(GetInfo())
 
     def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
         if isinstance(message, Pong):
@@ -318,7 +335,7 @@ class Session:
         elif isinstance(message, Status):
             self._status = message
         elif isinstance(message, OtherProtocol):
-            raise WrongBoard(_other_protocol(message))
+            raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
             self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
@@ -329,39 +346,63 @@ class Session:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
         if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
-            raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
+            raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
         self._begin()
 
-    def _reconnect(self) -> Iterator[None]:
-        """Waits until the board can be opened again and streams; yields while it waits. Raises WrongBoard."""
-        self._link.close()
-        for part, count in self._link.decoder.corrupt.as_dict().items():
+    def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:
+        """Wait until the board can be opened again and streams, or the duration is over; yields while it waits.
+
+        Raises WrongFirmware or AnotherBoard for a board with which the recording cannot continue.
+        """
+        self._connection.close()
+        for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
-        while True:
+        obstacles: set[str] = set()
+        while not timeline.is_over:
             time.sleep(RETRY_INTERVAL_S)
-            yield
-            try:
-                self._link = Link(self.port, self._capture)
-            except LinkposeError:
-                continue
-            try:
-                self._resume(self._handshake())
-            except WrongBoard:
-                raise
-            except (Disconnected, LinkposeError):
-                self._link.close()
-                continue
-            self._notify(f"the board is back at {self.port}; going on, the gap is marked")
-            return
+            yield []
+            self._end_when_due(timeline)
+            obstacle = self._open_again()
+            if obstacle is None:
+                return
+            if obstacle and obstacle not in obstacles:
+                obstacles.add(obstacle)
+                self._notify(f"{obstacle}; still waiting")
+
+    def _open_again(self) -> str | None:
+        """Continue with the board that has returned. None: done; otherwise the obstacle, "" while it is absent."""
+        port = find_again(self.port, self._usb)
+        if port is None:
+            return ""
+        try:
+            self._connection = Connection(port, self._capture)
+        except PortNotFound:
+            return ""
+        except LinkposeError as error:
+            return str(error)
+        self.port = port
+        try:
+            self._resume(self._handshake())
+        except (WrongFirmware, AnotherBoard):
+            raise
+        except Disconnected:
+            self._connection.close()
+            return ""
+        except LinkposeError as error:
+            self._connection.close()
+            return str(error)
+        self._usb = usb_identity(port)
+        self._notify(f"the board is back at {port}; continuing, the gap is marked")
+        return None
 
     # ---- health ----
 
     def health(self) -> Health:
         """Counts so far."""
         timeline = self.timeline
-        now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
+        now, before = self._connection.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
         duration = timeline.duration_s
         return Health(
             samples=timeline.samples,
@@ -374,6 +415,19 @@ class Session:
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
             status=self._status,
         )
+
+
+def summary(health: Health) -> dict[str, Any]:
+    """The closing summary of a session, as `record --json` prints it."""
+    return {
+        "event": "summary",
+        "samples": health.samples,
+        "lost": health.lost,
+        "corrupt": health.corrupt.total,
+        "gaps": len(health.gaps),
+        "duration_s": round(health.duration_s, 6),
+        "rate_hz": round(health.rate_hz, 3),
+    }
 
 
 def firmware_version(hello: Hello) -> str:
@@ -400,33 +454,35 @@ def _reason(code: int) -> str:
         return f"reason {code}"
 
 
-def _other_protocol(other: OtherProtocol) -> str:
+def _other_protocol(other: OtherProtocol) -> WrongFirmware:
     theirs = f"{other.protocol_major}.{other.protocol_minor}"
     ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
     if other.protocol_major < PROTOCOL_MAJOR:
-        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; {FLASH}"
-    return f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; {UPGRADE}"
+        return WrongFirmware(f"the board's firmware is old: it uses protocol {theirs}, this linkpose {ours}", True)
+    return WrongFirmware(f"this linkpose is old: it uses protocol {ours}, the board's firmware {theirs}", False)
 
 
-def _other_schema(hello: Hello) -> str:
+def _other_schema(hello: Hello) -> WrongFirmware:
     theirs = firmware_version(hello)
     release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
     if release > tuple(map(int, VERSION.split("."))):
-        return f"this linkpose {VERSION} is older than the board's firmware {theirs}, their schemas differ; {UPGRADE}"
-    return f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas; {FLASH}"
+        text = f"this linkpose {VERSION} is older than the board's firmware {theirs}, and their schemas differ"
+        return WrongFirmware(text, False)
+    text = f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas"
+    return WrongFirmware(text, True)
 
 
 def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
     """What came instead of a HELLO, and what to do about it."""
     if not heard:
-        return "the board is silent; type `linkpose flash` if it never had this firmware, or choose another --port"
+        return "the board is silent; it may never have had this firmware, or another port is the board's"
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
     if printable > 0.8 * len(heard):
         text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
-        return f"another firmware answers: {text!r}; type `linkpose flash` to put linkpose's on the board"
+        return f"another firmware answers: {text!r}"
     if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
         return "the board answers only in part; check the cable and try again"
     return (
-        "only noise came, and no frame; the device runs at another baud rate or is no linkpose board: check the port, "
-        "or type `linkpose flash`"
+        "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "
+        "the port"
     )

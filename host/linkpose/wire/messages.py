@@ -8,14 +8,14 @@ from typing import NamedTuple
 VERSION = "0.1.0"
 PROTOCOL_MAJOR = 2
 PROTOCOL_MINOR = 0
-SCHEMA_CRC = 0x171967ae
+SCHEMA_CRC = 0xf12908e4
 BAUD = 250000
 MAX_FRAME = 132
 
 # Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-IMU_OFFSET_US = 13
-IMU2_OFFSET_US_400_KHZ = 520
-IMU2_OFFSET_US_100_KHZ = 1750
+IMU_OFFSET_US = 41
+IMU2_OFFSET_US_400_KHZ = 568
+IMU2_OFFSET_US_100_KHZ = 1708
 
 
 class ResetCause(IntFlag):
@@ -324,7 +324,7 @@ class Configure(NamedTuple):
     dlpf: int  # 0 to 6
     baro_oversampling: int  # 0 to 3
     mouse_counts_per_mm: int  # 1/mm; 1, 2, 4, 8
-    i2c_khz: int  # kHz; 100, 400
+    i2c_khz: int  # kHz; 400, or 100 at sample rates up to 125 Hz
 
 
 class Start(NamedTuple):

@@ -1,5 +1,6 @@
 #include "Clock.h"
 
+#include <Messages.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <util/atomic.h>
@@ -13,9 +14,11 @@ namespace {
 
 constexpr uint32_t kStepsPerSecond = F_CPU / 8;
 
-// The burst begins this many steps after the tick: more than the longest time for which another interrupt or a locked
-// section can hold the tick's interrupt up, so that all bursts begin at the same distance.
-constexpr uint8_t kBurstDelaySteps = 24;
+// The burst begins this many 0.5 us steps after the tick: longer than another interrupt or a locked section can delay the
+// tick's interrupt, so that all bursts begin at the same distance from their ticks. The longest are the pin changes, 24 us
+// when three clocks fall at once, and 10 us for port 4. A larger value delays every burst; wire::kImuOffsetUs follows it.
+constexpr uint8_t kBurstDelaySteps = 80;
+static_assert(kBurstDelaySteps / 2 + 1 == wire::kImuOffsetUs, "the schema states the distance");
 
 volatile uint32_t tick_number;
 volatile uint32_t tick_us;
@@ -86,7 +89,7 @@ ISR(TIMER1_COMPA_vect) {
   idle::note_wake();
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
-  twi::start_burst();
+  twi::start_bursts();
   clock::tick_has_mice = ps2::start_armed();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;

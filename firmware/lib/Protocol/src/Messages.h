@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kProtocolMajor = 2;
 constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0x171967ae;
+constexpr uint32_t kSchemaCrc = 0xf12908e4;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -21,9 +21,9 @@ constexpr uint8_t kMaxPayloadToHost = 109;
 constexpr uint8_t kMaxPayloadToBoard = 13;
 
 // Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-constexpr uint16_t kImuOffsetUs = 13;
-constexpr uint16_t kImu2OffsetUs400Khz = 520;
-constexpr uint16_t kImu2OffsetUs100Khz = 1750;
+constexpr uint16_t kImuOffsetUs = 41;
+constexpr uint16_t kImu2OffsetUs400Khz = 568;
+constexpr uint16_t kImu2OffsetUs100Khz = 1708;
 
 // Why the board started: the ATmega328P's MCUSR, and `hung` if the watchdog interrupt stored the program counter.
 namespace reset_cause {
@@ -360,7 +360,7 @@ struct __attribute__((packed)) Configure {
   uint8_t dlpf;  // 0 to 6
   uint8_t baro_oversampling;  // 0 to 3
   uint8_t mouse_counts_per_mm;  // 1/mm; 1, 2, 4, 8
-  uint16_t i2c_khz;  // kHz; 100, 400
+  uint16_t i2c_khz;  // kHz; 400, or 100 at sample rates up to 125 Hz
   static constexpr uint8_t kType = 0x82;
   static constexpr uint8_t kSize = 10;
 };

@@ -2,6 +2,13 @@
 
 #include <string.h>
 
+#ifdef __AVR__
+#include <avr/pgmspace.h>
+#else
+#define PROGMEM
+#define memcpy_P memcpy
+#endif
+
 namespace {
 
 enum Command : uint8_t {
@@ -50,7 +57,7 @@ struct Step {
   bool required;
   bool argument;
 };
-constexpr Step kSteps[] = {
+constexpr Step kSteps[] PROGMEM = {
     {kSetDefaults, 1, 0, true, false},
     {kReadId, 2, 0, false, false},
     {kScaling1To1, 1, 0, false, false},
@@ -65,12 +72,18 @@ constexpr Step kSteps[] = {
 constexpr uint8_t kStepCount = sizeof kSteps / sizeof kSteps[0];
 constexpr uint8_t kModeStep = 7;
 
+Step step_at(uint8_t number) {
+  Step step;
+  memcpy_P(&step, &kSteps[number], sizeof step);
+  return step;
+}
+
 // Time limits. The protocol allows a mouse 15 ms to the first clock of a request, 2 ms for the byte and 20 ms to the answer.
-constexpr uint32_t kAnswerUs = 50000;
-constexpr uint32_t kNextUs = 25000;
-constexpr uint32_t kPowerOnUs = 1000000;  // the self-test usually takes 300 to 500 ms; an empty port is probed once a second
-constexpr uint32_t kRepeatedUs = 8000;    // between two bytes of a repeated packet, which is ready; a byte takes 1.1 ms
-constexpr uint32_t kGatedUs = 8000;       // a report in stream mode is at most 5 ms away at 200 Hz; its first byte 1.1 ms
+constexpr uint16_t kAnswerMs = 50;
+constexpr uint16_t kNextMs = 25;
+constexpr uint16_t kPowerOnMs = 1000;  // the self-test usually takes 300 to 500 ms; an empty port is probed once a second
+constexpr uint16_t kRepeatedMs = 8;    // between two bytes of a repeated packet, which is ready; a byte takes 1.1 ms
+constexpr uint16_t kGatedMs = 8;       // a report in stream mode is at most 5 ms away at 200 Hz; its first byte 1.1 ms
 constexpr uint8_t kTries = 3;             // of a command: the first and two repetitions
 constexpr uint8_t kSilentTries = 2;       // of a command without any answer
 constexpr uint8_t kSilentLimit = 3;       // polls without an answer: the mouse is absent
@@ -89,6 +102,21 @@ uint8_t resolution_code(uint8_t counts_per_mm) {
 }
 
 }  // namespace
+
+Ps2Mouse::Ps2Mouse(uint8_t counts_per_mm)
+    : wanted_resolution_(counts_per_mm),
+      repeats_answer_(false),
+      self_testing_(false),
+      no_remote_mode_(false),
+      stream_(false),
+      set_up_wanted_(false),
+      reset_wanted_(false),
+      probed_(false),
+      ever_found_(false),
+      overflow_(false),
+      answered_(false),
+      has_baseline_(false),
+      measured_(false) {}
 
 void Ps2Mouse::configure(uint8_t counts_per_mm) {
   wanted_resolution_ = counts_per_mm;
@@ -121,7 +149,7 @@ void Ps2Mouse::begin_reset() {
 }
 
 uint8_t Ps2Mouse::set_up_byte() const {
-  const Step& step = kSteps[step_];
+  const Step step = step_at(step_);
   if (step.argument) return step.byte == kResolutionArgument ? resolution_code(wanted_resolution_) : kReportRateHz;
   return step_ == kModeStep && stream_ ? kStreamMode : step.byte;
 }
@@ -137,18 +165,18 @@ Ps2Mouse::Request Ps2Mouse::next() {
   if (reset_wanted_) begin_reset();
   set_up_wanted_ = reset_wanted_ = false;
   switch (state_) {
-    case State::kListen: return {false, 0, 2, false, kPowerOnUs, kNextUs};
-    case State::kProbe: return {true, kSetDefaults, 1, true, kAnswerUs, kNextUs};
-    case State::kReset: return {true, kResetMouse, 1, true, kAnswerUs, kNextUs};
+    case State::kListen: return {false, 0, 2, false, kPowerOnMs, kNextMs};
+    case State::kProbe: return {true, kSetDefaults, 1, true, kAnswerMs, kNextMs};
+    case State::kReset: return {true, kResetMouse, 1, true, kAnswerMs, kNextMs};
     case State::kSetUp:
-      if (repeats_answer_) return {true, kResendLast, 1, true, kAnswerUs, kNextUs};
-      return {true, set_up_byte(), kSteps[step_].answers, true, kAnswerUs, kNextUs};
+      if (repeats_answer_) return {true, kResendLast, 1, true, kAnswerMs, kNextMs};
+      return {true, set_up_byte(), step_at(step_).answers, true, kAnswerMs, kNextMs};
     case State::kPoll:
-      if (!stream_) return {true, kReadData, 1 + kPacket, true, kAnswerUs, kNextUs};
-      if (quiet_ >= kQuietLimit) return {true, kEnable, 1, true, kAnswerUs, kNextUs};
-      return {false, 0, kPacket, false, kGatedUs, kRepeatedUs};
-    case State::kResend: return {true, kResendLast, repeat_, false, kAnswerUs, kRepeatedUs};
-    default: return {false, 0, kPacket, false, kAnswerUs, kRepeatedUs};
+      if (!stream_) return {true, kReadData, 1 + kPacket, true, kAnswerMs, kNextMs};
+      if (quiet_ >= kQuietLimit) return {true, kEnable, 1, true, kAnswerMs, kNextMs};
+      return {false, 0, kPacket, false, kGatedMs, kRepeatedMs};
+    case State::kResend: return {true, kResendLast, repeat_, false, kAnswerMs, kRepeatedMs};
+    default: return {false, 0, kPacket, false, kAnswerMs, kRepeatedMs};
   }
 }
 
@@ -196,7 +224,7 @@ void Ps2Mouse::take_set_up(const Answer& answer) {
 }
 
 void Ps2Mouse::take_step(const uint8_t* bytes) {
-  const uint8_t byte = kSteps[step_].byte;
+  const uint8_t byte = step_at(step_).byte;
   if (byte == kReadId) id_ = bytes[1];
   if (byte == kStatus) return take_status(bytes + 1);
   go_to_step(step_ + 1);
@@ -220,7 +248,7 @@ void Ps2Mouse::use_stream_mode() {
 }
 
 void Ps2Mouse::retry_step(const Answer& answer) {
-  const Step& step = kSteps[step_];
+  const Step step = step_at(step_);
   const bool silent = answer.ending == Ending::kTimeout;
   if (silent && ++silent_ >= kSilentSetUpLimit) {
     state_ = State::kListen;
@@ -235,7 +263,7 @@ void Ps2Mouse::retry_step(const Answer& answer) {
 }
 
 void Ps2Mouse::skip_step() {
-  const Step& step = kSteps[step_];
+  const Step step = step_at(step_);
   lacks_ |= step.lack;
   if (step.required) {
     state_ = State::kListen;
@@ -251,7 +279,7 @@ void Ps2Mouse::skip_step() {
     return finish_set_up();
   }
   const uint8_t next = step_ + 1;
-  go_to_step(kSteps[next].argument ? next + 1 : next);
+  go_to_step(step_at(next).argument ? next + 1 : next);
 }
 
 void Ps2Mouse::finish_set_up() {

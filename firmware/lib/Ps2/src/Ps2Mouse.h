@@ -21,8 +21,8 @@ class Ps2Mouse {
     uint8_t byte;       // to send
     uint8_t answers;    // bytes expected
     bool acknowledged;  // the first answer must be ACK
-    uint32_t first_us;  // time limit of the first answer
-    uint32_t next_us;   // time limit of each further answer
+    uint16_t first_ms;  // time limit of the first answer
+    uint16_t next_ms;   // time limit of each further answer
   };
   enum class Ending : uint8_t { kDone, kBadParity, kBadFraming, kNotTaken, kRefused, kTimeout };
   struct Answer {
@@ -40,7 +40,7 @@ class Ps2Mouse {
     kLacksStatus = 0x10,
   };
 
-  explicit Ps2Mouse(uint8_t counts_per_mm) : wanted_resolution_(counts_per_mm) {}
+  explicit Ps2Mouse(uint8_t counts_per_mm);
 
   // Both take effect with the next transaction.
   void configure(uint8_t counts_per_mm);
@@ -134,18 +134,19 @@ class Ps2Mouse {
   uint8_t partial_count_ = 0;
   uint8_t partial_[3];        // bytes of a packet before a byte with bad parity
   uint8_t repeat_ = 0;        // bytes expected after RESEND
-  bool repeats_answer_ = false;  // in set-up: the answer had bad parity and is requested again
-  bool self_testing_ = false;    // after RESET
-  bool no_remote_mode_ = false;
-  bool stream_ = false;          // gated stream mode in place of remote mode
-  bool set_up_wanted_ = false;
-  bool reset_wanted_ = false;
-  bool probed_ = false;
-  bool ever_found_ = false;
-  bool overflow_ = false;
-  bool answered_ = false;
-  bool has_baseline_ = false;  // the counter was read at the end of a complete round
-  bool measured_ = false;
+  // Single bits: four mice, and RAM is short.
+  bool repeats_answer_ : 1;  // in set-up: the answer had bad parity and is requested again
+  bool self_testing_ : 1;    // after RESET
+  bool no_remote_mode_ : 1;
+  bool stream_ : 1;          // gated stream mode in place of remote mode
+  bool set_up_wanted_ : 1;
+  bool reset_wanted_ : 1;
+  bool probed_ : 1;
+  bool ever_found_ : 1;
+  bool overflow_ : 1;
+  bool answered_ : 1;
+  bool has_baseline_ : 1;  // the counter was read at the end of a complete round
+  bool measured_ : 1;
   uint16_t dx_ = 0;
   uint16_t dy_ = 0;
   uint16_t parity_errors_ = 0;
