@@ -322,6 +322,8 @@ void probe_adc() {
 int main() {
   const uint8_t cause = MCUSR;
   MCUSR = 0;
+  MCUSR = 0xFF;
+  const uint8_t cause_after_writing_ones = MCUSR;
   const uint8_t watchdog = WDTCSR;
   wdt_disable();
   UCSR0A = _BV(U2X0);
@@ -338,6 +340,7 @@ int main() {
     }
   }
   print("first_reset_cause", cause);
+  print("reset_cause_after_writing_ones", cause_after_writing_ones);
   probe_twi();
   probe_interrupts();
   probe_flags();

@@ -149,6 +149,7 @@ def test_timer_ticks_wake_the_core_without_drift(probed: Probed) -> None:
 
 def test_watchdog_resets_and_stays_on(probed: Probed) -> None:
     assert probed.values["first_reset_cause"] == [0x01]
+    assert probed.values["reset_cause_after_writing_ones"] == [0]
     assert probed.values["second_reset_cause"] == [0x08]
     assert probed.values["watchdog_still_on"] == [1]
     resets = probed.events[probed.events["kind"] == "reset"]

@@ -201,9 +201,9 @@ class VirtualUno:
         boot_address: int = 0,
     ) -> None:
         """`adc`, `mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's
-        modules of these names. `imu2`: options of a second inertial sensor at 0x69 (None: there is none); `bmp280`: options of a
-        BMP280 in place of the BMP180; `magnetometer`: "hmc5883l", "qmc5883l" or "qmc5883p". `bootloader_s`
-        is the time that a bootloader waits after a reset from outside (0: there is none);
+        modules of these names. `imu2`: options of a second inertial sensor at 0x69 (None: there is none); `bmp280`:
+        options of a BMP280 in place of the BMP180; `magnetometer`: "hmc5883l", "qmc5883l" or "qmc5883p".
+        `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
         `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
         self._emulator = _Emulator.take()

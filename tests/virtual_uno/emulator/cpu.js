@@ -28,6 +28,10 @@ class Cpu extends CPU {
     this.readHooks = new Array(this.data.length).fill(undefined); // dense: data accesses look here first
     this.writeHooks = new Array(this.data.length).fill(undefined);
     this.peripherals = [];
+    this.writeHooks[MCUSR] = (value) => { // its flags can only be cleared
+      this.data[MCUSR] &= value;
+      return true;
+    };
     this.nextEvent = null;
     this.nextEventCycle = Infinity;
     this.eventCycle = -1; // cycle of the event that is running, -1 outside of events
