@@ -278,7 +278,7 @@ class StreamDecoder:
             if len(piece) >= _SHORTEST_SAMPLE and payload[0] == _SAMPLE_TYPE:
                 unpack = sample_of(len(piece) << 8 | payload[sections_at])
                 if unpack and crc_hqx(payload[:-2], 0xFFFF) == payload[-2] | payload[-1] << 8:
-                    append(unpack(payload))
+                    append(unpack(payload))  # type: ignore[arg-type]  # never None: the length is in the key
                     continue
             if (message := self._decode(payload)) is not None:
                 append(message)
