@@ -195,10 +195,15 @@ def _continuous_sign(q: Floats) -> Floats:
 
 
 def _common_offset(compared: Iterable[Mapping[Quantity, Pair]]) -> tuple[float, float]:
-    """The offset (s) of the filter that fits best, and its residual. Yaw and rotations have no origin in common."""
-    usable = [[pair for q, pair in both.items() if q not in (YAW, *CHAIN_ROTATION)] for both in compared]
-    offsets = [find_offset(pairs) for pairs in usable if pairs]
+    """The offset (s) of the filter that fits best, and its residual."""
+    offsets = [find_offset(pairs) for both in compared if (pairs := _comparable(both))]
     return min(offsets, key=lambda found: found[1]) if offsets else (0.0, np.inf)
+
+
+def _comparable(both: Mapping[Quantity, Pair]) -> list[Pair]:
+    """The pairs that move alike. A link's x and y do not where the two count yaw from different directions."""
+    unaligned = (YAW, *CHAIN_ROTATION, *((X, Y) if YAW in both else ()))
+    return [pair for q, pair in both.items() if q not in unaligned]
 
 
 # ---- doubts ----
