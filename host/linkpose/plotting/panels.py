@@ -45,7 +45,7 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
         if quantity is YAW and drawn:
             value = _from_start_of(drawn[0][0], track)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
-    _view_values(axes, [value for _, value in drawn])
+    view_values(axes, [value for _, value in drawn])
     shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
     finish(axes, quantity.axis_label)
     if legend:
@@ -63,7 +63,7 @@ def _from_start_of(estimate: Track, reference: Track) -> Floats:
     return np.asarray((theirs - theirs[at] + ours[known[0]] + 180.0) % 360.0 - 180.0)
 
 
-def _view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
+def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
     """Limits the y axis to the values: ±2σ of a filter that has just started is wider than all motion."""
     known = [value[np.isfinite(value)] for value in values_drawn]
     together = np.concatenate([k for k in known if len(k)]) if any(len(k) for k in known) else np.zeros(0)
@@ -73,7 +73,7 @@ def _view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
         axes.set_ylim(low - margin, high + margin)
 
 
-def order_legend(axes: Axes, best_first: Sequence[str]) -> None:
+def order_legend(axes: Axes, best_first: Sequence[str], columns: int = 6) -> None:
     """The legend above the axes: the reference, the filters from the best on, then bands and shades."""
     handles, labels = axes.get_legend_handles_labels()
     rank = {label: i for i, label in enumerate(best_first)}
@@ -86,7 +86,7 @@ def order_legend(axes: Axes, best_first: Sequence[str]) -> None:
     once = {label: handle for handle, label in order}
     if once:
         axes.legend(
-            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, frameon=False, fontsize=8,
+            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False, fontsize=8,
             borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
         )  # fmt: skip
 
