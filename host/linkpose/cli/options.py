@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint, Rig
 
 if TYPE_CHECKING:
@@ -160,6 +159,11 @@ def simulated_outputs(what: str) -> Callable[[Function], Function]:
     return decorate
 
 
+def next_and_quiet(function: Function) -> Function:
+    """-q of a command that ends with what to type next."""
+    return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
+
+
 def show_next(quiet: bool, following: str) -> None:
     """What to type next, on stderr."""
     if not quiet:
@@ -198,13 +202,3 @@ def load_recordings(paths: Sequence[Path]) -> list[Recording]:
     for remark in (remark for recording in loaded for remark in recording.remarks):
         click.echo(remark, err=True)
     return loaded
-
-
-def save_rig(path: Path, rig: Rig) -> None:
-    """Writes a rig file, whole or not at all. Raises LinkposeError where it cannot be written."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        partial.write_text(rig.to_toml(), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise LinkposeError(f"cannot write the rig file {path}: {error.strerror}") from error

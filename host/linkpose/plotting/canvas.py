@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,7 @@ COLOURS = {
 AXES_COLOURS = {"x": _RED, "y": _GREEN, "z": _BLUE}
 OTHERS = (_SKY, _GREEN, _ORANGE, _RED)  # of series that are no filter: mice, beacons
 TRUTH: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.1, "zorder": 5}
+REFERENCES = ("truth", "reference")  # labels of what is drawn as TRUTH
 BAND_ALPHA = 0.18
 _BEST = ("joint-inertial", "planar-ekf", "chain")  # drawn thick
 _BESIDES = ("-", ":", "-.")  # the second and third file
@@ -56,10 +58,15 @@ def finish(axes: Axes, label: str) -> None:
     axes.margins(x=0.0)
 
 
-def legend_above(axes: Axes, columns: int = 5) -> None:
-    """A legend above the axes, where it hides nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    once = dict(zip(labels, handles, strict=True))
+def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -> None:
+    """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
+    rank = {label: i for i, label in enumerate(best_first)}
+
+    def place(item: tuple[object, str]) -> int:
+        return -1 if item[1] in REFERENCES and best_first else rank.get(item[1], len(rank))
+
+    order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
+    once = {label: handle for handle, label in order}
     if once:
         axes.legend(
             once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False,

@@ -9,7 +9,6 @@ import numpy as np
 
 from linkpose.plotting.canvas import OTHERS, TRUTH, finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import draw
-from linkpose.plotting.panels import order_legend
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
             inside = (run.time_s >= _SHOWN_S[0]) & (run.time_s <= _SHOWN_S[1])
         _scale_to(axes, 100 * np.concatenate([run.truth_m[inside], run.height_m["tilt"][inside]]))
         if run is runs[0]:
-            order_legend(axes, [title(name) for name in best_first])
+            legend_above(axes, best_first=[title(name) for name in best_first])
     figure.axes[-1].set_xlabel("time (s)")
     return figure
 

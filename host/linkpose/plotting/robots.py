@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import order_legend, shade_unknown, view_values
+from linkpose.plotting.panels import shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.sensors.measurements import Floats
@@ -67,7 +67,7 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
-    order_legend(axes, [track.label for track in tracks], columns=3)
+    legend_above(axes, 3, [track.label for track in tracks])
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
