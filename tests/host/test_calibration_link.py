@@ -15,7 +15,6 @@ from linkpose import filters
 from linkpose.calibration.imu import calibrate_imu, with_calibration
 from linkpose.calibration.joint import JointCalibration, calibrate_joint, is_calibrated
 from linkpose.calibration.joint import with_calibration as joint_with_calibration
-from linkpose.calibration.rigfile import write_rig
 from linkpose.cli import calibrate_imu as imu_command
 from linkpose.cli import calibrate_joint as joint_command
 from linkpose.cli import simulate_link
@@ -23,7 +22,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Rig
+from linkpose.sensors.rig import Imu, Rig
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.messages import SampleFlags
 
@@ -340,20 +339,3 @@ def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
     assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)
     with pytest.raises(LinkposeError, match="six rests do not fit 10 s: simulate 23 s or more"):
         LinkRun(1, 0, 10.0, rests=True)
-
-
-def test_a_rig_file_is_replaced_whole_and_keeps_link_and_permissions(tmp_path):
-    real, link = tmp_path / "real.toml", tmp_path / "rig.toml"
-    write_rig(real, Rig())
-    real.chmod(0o640)
-    link.symlink_to(real)
-    planted = tmp_path / ".rig.toml.part"
-    planted.symlink_to(tmp_path / "elsewhere")
-    write_rig(link, Rig(Joint((0.0, 0.0, 1.0))))
-    assert link.is_symlink() and Rig.load(real).joint.j2s_m == (0.0, 0.0, 1.0)
-    assert real.stat().st_mode & 0o777 == 0o640 and not (tmp_path / "elsewhere").exists()
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".rig.toml.part", "real.toml", "rig.toml"]
-    with pytest.raises(LinkposeError, match="no regular file"):
-        write_rig(Path("/dev/null"), Rig())
-    with pytest.raises(LinkposeError, match="cannot write the rig file"):
-        write_rig(tmp_path / "no" / "rig.toml", Rig())

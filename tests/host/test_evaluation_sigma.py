@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from linkpose.cli.cures import cure
 from linkpose.cli.evaluate import command
-from linkpose.errors import LinkposeError
+from linkpose.errors import TooFewRows
 from linkpose.evaluation.scores import evaluate
 from linkpose.evaluation.statistics import Statistics
 from linkpose.recording.table import Table
@@ -76,11 +77,12 @@ def test_from_and_to_limit_the_rows():
 def test_less_than_half_of_the_rows_is_no_score():
     """A reference that ends early, and one whose rows are too far apart to be compared."""
     truth = table("truth", height_m=np.where(T < 12, motion(), np.nan))
-    with pytest.raises(LinkposeError, match=r"only 1200 of 4000 estimates of joint .* --from 0 --to 11\.99"):
+    with pytest.raises(TooFewRows, match=r"only 1200 of 4000 estimates of joint .* less than half") as error:
         evaluate(table(joint_height_m=motion()), truth)
+    assert cure(error.value) == "to score the common part alone, add --from 0 --to 11.99"
     assert score(table(joint_height_m=motion()), truth, from_s=0.0, to_s=11.99).rows == 1200
     sparse = Table(Path("truth.csv"), "truth", {"time_s": T[:1000:10], "height_m": motion()[:1000:10]}, {}, None, 2)
-    with pytest.raises(LinkposeError, match=r"only 100 of 400 estimates of joint"):
+    with pytest.raises(TooFewRows, match=r"only 100 of 400 estimates of joint"):
         evaluate(table(joint_height_m=motion()), sparse)
 
 

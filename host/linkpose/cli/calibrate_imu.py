@@ -26,12 +26,11 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     are enough for the gyro's bias and the noise. `linkpose simulate link --rests` simulates such a recording.
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
-    from linkpose.calibration.rigfile import write_rig
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_imu(loaded)
-    write_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
     else:

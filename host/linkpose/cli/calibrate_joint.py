@@ -30,12 +30,11 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
         is_calibrated,
         with_calibration,
     )
-    from linkpose.calibration.rigfile import write_rig
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_joint(loaded, rig)
-    write_rig(rig_file, with_calibration(rig, found, with_imu))
+    with_calibration(rig, found, with_imu).save(rig_file)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
     else:

@@ -33,12 +33,11 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     recordings, are better), each with a second of rest before it. The gyro shows which recording is which.
     """
     from linkpose.calibration.mice import calibrate_mice, with_calibration
-    from linkpose.calibration.rigfile import write_rig
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_mice(loaded, rig, length)
-    write_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
     if not quiet:

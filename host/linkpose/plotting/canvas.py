@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotWrite, FileError, FileExists
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,19 +75,19 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
 
 
 def check_output(path: Path | None, force: bool) -> None:
-    """Raises LinkposeError where a picture of this name cannot be written: better before the work than after it."""
+    """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
     if path is None:
         return
     if path.suffix.lower() not in FORMATS:
-        raise LinkposeError(f"{path} is no picture that linkpose writes; name a file that ends in {', '.join(FORMATS)}")
+        raise FileError(path, f"{path} is no picture that linkpose writes; its name must end in {', '.join(FORMATS)}")
     if path.exists() and not force:
-        raise LinkposeError(f"{path} exists already; name another file or add --force to replace it")
+        raise FileExists(path)
     if not path.absolute().parent.is_dir():
-        raise LinkposeError(f"cannot write {path}: there is no folder {path.absolute().parent}")
+        raise CannotWrite(path, f"there is no folder {path.absolute().parent}")
 
 
 def save(figure: Figure, path: Path, force: bool) -> None:
-    """Writes the picture in the format that the file's ending names. Raises LinkposeError as `check_output` does, and
+    """Writes the picture in the format that the file's ending names. Raises FileError as `check_output` does, and
     where the file cannot be written.
     """
     check_output(path, force)
@@ -96,4 +96,4 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     try:
         figure.savefig(path, dpi=130, metadata=metadata.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
-        raise LinkposeError(f"cannot write {path}: {error}; name a file in a folder you may write to") from error
+        raise CannotWrite(path, str(error)) from error

@@ -36,7 +36,8 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
     for axes, run in zip(figure.subplots(len(runs), 1), runs, strict=True):
         best_first = ["joint-inertial", "joint", "tilt", "imu-baro", "baro"]
         for name in reversed(best_first):
-            draw(axes, run.time_s, 100 * run.height_m[name], label=title(name), **line_style(name))
+            style = line_style(name) | ({"alpha": 0.4, "linewidth": 0.7} if name == "baro" else {})
+            draw(axes, run.time_s, 100 * run.height_m[name], label=title(name), **style)
         draw(axes, run.time_s, 100 * run.truth_m, label="truth", **TRUTH)
         finish(axes, f"Test {run.test}: height (cm)")
         inside = np.full(len(run.time_s), True)
