@@ -15,7 +15,7 @@ from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.device.ports import find_again, usb_identity
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
 from linkpose.sensors.conversion import Settings
-from linkpose.sensors.devices import Sensors, check_hello, found
+from linkpose.sensors.devices import Sensors, check_hello, found, mouse_remarks
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Placed, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
@@ -27,6 +27,7 @@ from linkpose.wire.messages import (
     Ack,
     Command,
     Configure,
+    DeviceState,
     GetInfo,
     Hello,
     Message,
@@ -47,7 +48,8 @@ ASK_INTERVAL_S = 0.4
 ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
-MICE_TIMEOUT_S = 1.5
+MICE_TIMEOUT_S = 3.0  # self-test up to 1.5 s, set-up of a slow mouse 0.6 s
+LOW_SUPPLY_MV = 4500  # below it an ATmega328P at 16 MHz is out of its specification, and 5 V mice are too
 SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
@@ -103,6 +105,8 @@ class Session:
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
+        self._mouse_ports: int | None = None  # of the recording; None: not known yet
+        self._supply_reported = False
         self._started: Arrival | None = None  # what came together with the ACK of START
         self._pinged_at = 0.0  # s, perf_counter
         self._silent_s = self._asked_s = (
@@ -181,12 +185,26 @@ class Session:
         return self.hello
 
     def wait_for_mice(self, count: int) -> None:
-        """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
+        """Wait until no mouse is being set up and `count` ports have mice, for at most MICE_TIMEOUT_S.
+
+        The ports known afterwards are those of the recording; a mouse at another port is reported when it appears.
+        """
         deadline = time.perf_counter() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
+        told = False
+        while self._mice_missing(count) and time.perf_counter() < deadline:
+            if not told:
+                self._notify("Waiting for the mice, which are being set up or have not been found yet")
+                told = True
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
+        self._mouse_ports = max(Settings.of(self.hello).mouse_ports, count)
+        for remark in mouse_remarks(self.hello):
+            self._notify(remark)
+
+    def _mice_missing(self, count: int) -> bool:
+        starting = any(mouse.state == DeviceState.STARTING for mouse in self.hello.mice)
+        return starting or Settings.of(self.hello).mouse_ports < count
 
     def self_test(self, device: int = 0) -> SelfTestResult:
         """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
@@ -314,12 +332,30 @@ class Session:
         for message in arrival.messages:
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
+                if self._mouse_ports is not None and len(message.mice) > 2 * self._mouse_ports:
+                    self._report_new_mouse(len(message.mice) // 2)
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
             else:
                 self._hear(message, arrival, timeline)
         return placements
+
+    def _report_new_mouse(self, port: int) -> None:
+        self._mouse_ports = port
+        self._notify(
+            f"A mouse appeared at port {port}, which had none at the start: its movement is not recorded. "
+            "Plug mice in before the start, or add a [[mouse]] for each to the rig"
+        )
+
+    def _check_supply(self, status: Status) -> None:
+        if not 0 < status.vcc_mv < LOW_SUPPLY_MV or self._supply_reported:
+            return
+        self._supply_reported = True
+        self._notify(
+            f"The supply of the board is {status.vcc_mv / 1000:.1f} V (±10 %), below 4.5 V: mice or sensors may fail. "
+            "Use a shorter USB cable or another port, or supply the mice separately"
+        )
 
     def _ask_when_silent(self) -> None:
         """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
@@ -334,6 +370,7 @@ class Session:
             self._hear_pong(message, arrival.time_s)
         elif isinstance(message, Status):
             self._status = message
+            self._check_supply(message)
         elif isinstance(message, OtherProtocol):
             raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
@@ -435,9 +472,11 @@ def firmware_version(hello: Hello) -> str:
 
 
 def reset_causes(hello: Hello) -> str:
-    """Names of the reset flags that are set, such as "watchdog"."""
+    """Names of the reset flags that are set, such as "watchdog", or where the firmware hung."""
     from linkpose.wire.messages import ResetCause
 
+    if hello.reset_cause & ResetCause.HUNG:
+        return f"the firmware hung at program counter {hello.hung_at:#06x}"
     names = [cause.name.lower().replace("_", " ") for cause in ResetCause if hello.reset_cause & cause and cause.name]
     return ", ".join(names) or "cause unknown"
 
