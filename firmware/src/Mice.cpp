@@ -1,5 +1,7 @@
 #include "Mice.h"
 
+#include <Idle.h>
+
 namespace {
 
 // The period grows after three late rounds in a row, or when one round in five is late; it shrinks after a second (at
@@ -38,6 +40,7 @@ void Mice::reset(uint8_t ports) {
 }
 
 void Mice::run() {
+  if (!idle::take_mice_work()) return;
   const uint32_t now = clock::now_us();
   if (armed_ && !ps2::round_waiting()) {
     armed_ = false;
@@ -77,7 +80,7 @@ bool Mice::transaction_ended(uint8_t number, uint32_t now_us) {
     port.since_us = now_us;
     port.limit_ms = port.next_limit_ms;
   }
-  return now_us - port.since_us >= uint32_t{1000} * port.limit_ms;
+  return (now_us - port.since_us) >> 10 >= port.limit_ms;  // 1024 us for 1 ms: a division would take longer
 }
 
 void Mice::finish_transaction(uint8_t number, uint32_t now_us) {

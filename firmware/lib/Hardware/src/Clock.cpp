@@ -75,14 +75,6 @@ uint16_t steps_left() {
   return left;
 }
 
-void arm_deadline_locked(uint16_t steps) {
-  OCR1B = TCNT1 + steps;
-  TIFR1 = _BV(OCF1B);
-  TIMSK1 |= _BV(OCIE1B);
-}
-
-void disarm_deadline() { TIMSK1 &= static_cast<uint8_t>(~_BV(OCIE1B)); }
-
 }  // namespace clock
 
 ISR(TIMER1_COMPA_vect) {
@@ -100,7 +92,7 @@ ISR(TIMER1_COMPA_vect) {
     clock::period_steps = clock::next_period_steps;
     OCR1A = clock::period_steps - 1;  // well before TCNT1 gets there
   }
-  idle::signal_work();
+  idle::signal_mice_work();
 }
 
 ISR(TIMER1_COMPB_vect) {

@@ -61,7 +61,7 @@ inline __attribute__((always_inline)) void edge(uint8_t pins, uint8_t now) {
     case Ps2Bits::Act::kHoldClock:
       pull(port, clock_of(port));
       release(port, data_of(port));
-      idle::signal_work();
+      idle::signal_mice_work();
       break;
   }
 }
