@@ -8,17 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from linkpose import filters
+from linkpose import filters, quantities
 from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.sensors.conversion import TIME_DECIMALS
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
-from linkpose.wire.messages import Sensors
-
-_SMOOTHED = "joint-inertial"
-_DECIMALS = 6  # a micrometre, a microdegree
 
 
 def sensors_of(measurements: Measurements) -> Sensors:
@@ -70,20 +67,21 @@ class Estimator:
             reasons = "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
             raise LinkposeError(f"no filter can run on this ({reasons})")
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
-        self._decimals = np.array([TIME_DECIMALS, *(_decimals(name) for name in self.columns[1:])], dtype=np.int64)
+        self._decimals = np.array(
+            [TIME_DECIMALS, *(quantities.decimals(name) for name in self.columns[1:])], dtype=np.int64
+        )
 
     def smooth(self) -> None:
-        """Puts the smoother in the place of joint-inertial: from here on, `process` takes one whole recording.
+        """Puts a smoother in the place of each filter that has one: from here on, `process` takes a whole recording.
 
-        Raises LinkposeError where joint-inertial does not run.
+        Raises LinkposeError where none of the filters has one.
         """
+        smoothable = [name for name, able in filters.REGISTRY.items() if able.smoother]
         names = [f.name for f in self.filters]
-        if _SMOOTHED not in names:
-            reason = f": {self.left_out[_SMOOTHED]}" if _SMOOTHED in self.left_out else ""
-            raise LinkposeError(f"{_SMOOTHED}, which is what can be smoothed, does not run{reason}")
-        from linkpose.filters.smoother import JointInertialSmoother  # and with it the compiler, which is slow to load
-
-        self.filters[names.index(_SMOOTHED)] = JointInertialSmoother(self._rig)
+        if not set(smoothable) & set(names):
+            reasons = "".join(f"; {self.left_out[name]}" for name in smoothable if name in self.left_out)
+            raise LinkposeError(f"no filter that can be smoothed ({', '.join(smoothable)}) runs{reasons}")
+        self.filters = [filters.create_smoother(f.name, self._rig) if f.name in smoothable else f for f in self.filters]
 
     def warm_up(self) -> None:
         """Compiles all that `process` and `text` need, or loads it compiled: no sample waits for a compiler."""
@@ -118,10 +116,6 @@ class Estimator:
             }
             for row in estimates.tolist()
         ]
-
-
-def _decimals(column: str) -> int:
-    return 0 if column.endswith("_excluded") else _DECIMALS
 
 
 class EstimateWriter(CsvFile):

@@ -195,7 +195,7 @@ def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
     recording = tmp_path / "r.csv"
     linkpose("record", recording, "--port", SIM, "--duration", 1)
     done = linkpose("estimate", recording, "--smooth", "--filter", "tilt")
-    assert done.status == 2 and "joint-inertial, which is what can be smoothed, does not run" in done.err
+    assert done.status == 2 and "no filter that can be smoothed (joint-inertial) runs" in done.err
     recording.write_text(re.sub(r'"joint": \{.*?\}, ', "", recording.read_text()))
     done = linkpose("estimate", recording, "--smooth", "-o", tmp_path / "e.csv")
     assert done.status == 2 and "joint-inertial needs J2S" in done.err
@@ -306,7 +306,7 @@ OTHER = PortInfo("/dev/ttyS0", "", None, None, None, False, None)
     ("found", "sentence"),
     [
         ([], "no serial port is connected"),
-        ([OTHER], "no UNO is connected; the ports there are: /dev/ttyS0"),
+        ([OTHER], "no UNO is connected; the ports are: /dev/ttyS0"),
         ([UNO, OTHER, dataclasses.replace(UNO, port="/dev/ttyACM1")], "2 boards are connected: /dev/ttyACM0"),
         ([OTHER, UNO], "there is no port /dev/ttyACM0"),  # chosen, and then not there in this test
     ],
@@ -314,6 +314,11 @@ OTHER = PortInfo("/dev/ttyS0", "", None, None, None, False, None)
 def test_the_only_uno_is_chosen_and_none_or_several_are_listed(monkeypatch, refused, found, sentence):
     monkeypatch.setattr(ports, "find_ports", lambda: found)
     assert sentence in refused("info")
+
+
+def test_the_environment_may_name_the_port(monkeypatch, linkpose):
+    monkeypatch.setenv("LINKPOSE_PORT", "sim://link?seed=3")
+    assert json.loads(linkpose("info", "--json").out)["protocol"]
 
 
 def test_ports_json(monkeypatch, linkpose):

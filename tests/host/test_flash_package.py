@@ -64,6 +64,7 @@ def test_the_wheel_holds_the_firmware_as_it_stands_here(built: tuple[Path, Path]
     brought = installed / "linkpose" / "_firmware"
     assert files(brought / "firmware") == files(ROOT / "firmware")
     assert (brought / "platformio.ini").read_bytes() == (ROOT / "platformio.ini").read_bytes()
+    assert files(installed / "linkpose" / "_docs") == files(ROOT / "host" / "docs")
     prebuilt = Path("linkpose", "flashing", "firmware.hex")
     assert (installed / prebuilt).read_bytes() == (ROOT / "host" / prebuilt).read_bytes()
 

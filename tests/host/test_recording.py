@@ -30,8 +30,8 @@ from linkpose.simulation import board
 from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.capture import decode_capture
-from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Configure, Hello, HelloMouse, Sample
+from linkpose.wire.frames import StreamDecoder, encode, sample
+from linkpose.wire.messages import Configure, DeviceState, Hello, HelloMouse, Sample
 
 CLI = [sys.executable, "-m", "linkpose"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
@@ -48,7 +48,7 @@ def test_the_data_sheets_example():
 def test_every_raw_count_comes_back_from_the_decimals_kept(range_g, range_deg_s):
     counts = np.arange(-32768, 32768)
     converter = Converter(Settings.of(hello_with(accel_range_g=range_g, gyro_range_deg_s=range_deg_s)))
-    rows = [converter.row(Sample(0, 0, c, c, c, c, c, c, c, 0, 0, 0, 1), 0.0, 0, 1).imu for c in counts.tolist()]
+    rows = [converter.row(sample(0, 0, 1, (c,) * 7), 0.0, 0, 1).imu for c in counts.tolist()]
     for at, scale, decimals in (
         (0, mpu6050.accel_scale(range_g), mpu6050.ACCEL_DECIMALS),
         (3, mpu6050.gyro_scale(range_deg_s), mpu6050.GYRO_DECIMALS),
@@ -61,19 +61,17 @@ def test_every_raw_count_comes_back_from_the_decimals_kept(range_g, range_deg_s)
 
 def hello_with(mice: int = 0, **settings: int) -> Hello:
     hello = board.hello(board.DEFAULTS._replace(**settings))
-    return hello._replace(mice=tuple(HelloMouse(0, 8, 100) for _ in range(mice)))
+    return hello._replace(mice=tuple(HelloMouse(DeviceState.OK, 0, 0x60, 8, 200, 0) for _ in range(mice)))
 
 
 raw_samples = st.lists(
     st.builds(
-        Sample,
+        sample,
         seq=st.just(0),
         t_us=st.just(0),
-        **{name: st.integers(-32768, 32767) for name in Sample._fields[2:9]},
-        baro_ut=st.integers(0, 65535),
-        baro_up=st.integers(0, 2**19 - 1),
-        baro_count=st.integers(0, 3),
         flags=st.integers(0, 0x1FFF),
+        imu=st.tuples(*[st.integers(-32768, 32767)] * 7),
+        baro=st.tuples(st.integers(0, 65535), st.integers(0, 2**19 - 1), st.integers(0, 3)),
         mice=st.integers(0, 3).flatmap(lambda mice: st.tuples(*[st.integers(-32768, 32767)] * 2 * mice)),
     ),
     min_size=1,
@@ -404,9 +402,9 @@ def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
 
 
 def test_the_converter_forgets_a_barometer_that_went_away():
-    hello = board.hello(Configure(100, 8, 1000, 3, 0, 8))
+    hello = board.hello(Configure(100, 8, 1000, 3, 0, 8, 400))
     converter = Converter(Settings.of(hello))
-    base = Sample(0, 0, 0, 0, 0, 0, 0, 0, 0, 27898, 23843, 7, 8)
+    base = sample(0, 0, 8, baro=(27898, 23843, 7))
     rows = [
         converter.row(base, 0.0, 0, 8),
         converter.row(base, 0.01, 1, 8),

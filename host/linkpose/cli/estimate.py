@@ -145,8 +145,8 @@ def _live(
     from linkpose.device.ports import choose_port
     from linkpose.device.session import Session
     from linkpose.sensors.conversion import Settings
+    from linkpose.sensors.devices import found
     from linkpose.sensors.measurements import Measurements
-    from linkpose.wire.messages import Sensors
 
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(live.raw_capture(raw, request.force))
@@ -157,7 +157,7 @@ def _live(
         with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            settings, sensors = Settings.of(session.hello), Sensors(session.hello.sensors)
+            settings, sensors = Settings.of(session.hello), found(session.hello)
             used = rig.with_delay_of(settings.dlpf)
             estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
             _check(estimator, request, console)
@@ -184,9 +184,12 @@ def _live(
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
-    """Names the filters that cannot run. Raises LinkposeError when J2S is to be found and nobody looks for it."""
+    """Names the filters that cannot run. Raises LinkposeError when J2S is to be estimated and no filter does it."""
+    from linkpose import filters
+
     if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
-        raise LinkposeError("--j2s auto is found by joint-inertial, which does not run; add --filter joint-inertial")
+        name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
+        raise LinkposeError(f"--j2s auto is estimated by {name}, which does not run; add --filter {name}")
     for reason in dict.fromkeys(estimator.left_out.values()):
         names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
         console.say(f"without {names}: {reason}")

@@ -83,7 +83,9 @@ FILE = click.Path(path_type=Path)
 
 def port(function: Function) -> Function:
     return click.option(
-        "--port", metavar="PORT", help="Device, pyserial URL or sim://link. Default: the only UNO connected."
+        "--port",
+        metavar="PORT",
+        help="Device, pyserial URL or sim://link. Default: $LINKPOSE_PORT, otherwise the only UNO connected.",
     )(function)
 
 

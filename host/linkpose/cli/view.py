@@ -6,13 +6,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from linkpose import quantities
 from linkpose.cli.live import health_line
 from linkpose.device.session import Health
-from linkpose.filters import NAMES
 from linkpose.sensors.measurements import Floats
 
 REDRAW_INTERVAL_S = 0.1
-_SUBJECTS = {"height over the joint centre, live": "height_m", "the robot's motion, live": "x_m"}
+# Title of a table -> the filters in it: those that estimate this quantity.
+_SUBJECTS = {"height over the joint, live": quantities.HEIGHT, "motion of the robot, live": quantities.HEADING}
+
+# Values of a filter, (value, σ); σ is NaN where the filter gives none.
+_Estimates = dict[quantities.Quantity, tuple[float, float]]
 
 
 class View:
@@ -49,14 +53,13 @@ class View:
         ]
         return Group(*sections, caption)
 
-    def _by_filter(self, estimates: Floats) -> dict[str, dict[str, float]]:
-        """The row taken apart: filter -> quantity with its unit -> value."""
-        prefixes = {name.replace("-", "_") + "_": name for name in sorted(NAMES, key=len, reverse=True)}
-        rows: dict[str, dict[str, float]] = {}
-        for column, value in zip(self._columns[1:], estimates[1:].tolist(), strict=True):
-            prefix = next(p for p in prefixes if column.startswith(p))
-            rows.setdefault(prefixes[prefix], {})[column.removeprefix(prefix)] = value
-        return rows
+    def _by_filter(self, estimates: Floats) -> dict[str, _Estimates]:
+        """The row taken apart: filter -> quantity -> (value, σ)."""
+        row = dict(zip(self._columns, estimates.tolist(), strict=True))
+        return {
+            name: {q: (row[column], row.get(quantities.std_column(column) or "", math.nan)) for q, column in of.items()}
+            for name, of in quantities.by_filter(self._columns).items()
+        }
 
     def close(self) -> None:
         """Takes the table off the screen."""
@@ -71,27 +74,27 @@ class View:
         self.close()
 
 
-def _section(title: str, rows: Mapping[str, Mapping[str, float]]) -> Any:
-    """The filters in rows, their quantities in columns; a standard deviation stands behind its value."""
+def _section(title: str, rows: Mapping[str, _Estimates]) -> Any:
+    """The filters in rows, their quantities in columns; σ follows its value."""
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
     table.add_column("filter", no_wrap=True)
-    named = list(dict.fromkeys(name for values in rows.values() for name in values))
-    quantities = [name for name in named if "_std_" not in name]
-    for quantity in quantities:
-        table.add_column(quantity, justify="right", min_width=8)
+    shown = [quantity for quantity in quantities.ALL if any(quantity in values for values in rows.values())]
+    for quantity in shown:
+        unit = f" ({quantity.value.unit})" if quantity.value.unit else ""
+        table.add_column(f"{quantity.name}{unit}", justify="right", min_width=8)
     for name, values in rows.items():
-        table.add_row(name, *(_text(quantity, values) for quantity in quantities))
+        table.add_row(name, *(_text(quantity, values) for quantity in shown))
     return table
 
 
-def _text(quantity: str, values: Mapping[str, float]) -> str:
+def _text(quantity: quantities.Quantity, values: _Estimates) -> str:
     """A value as it is shown; the excluded mice by their numbers."""
-    value = values.get(quantity, math.nan)
+    value, std = values.get(quantity, (math.nan, math.nan))
     if math.isnan(value):
         return ""
-    if quantity == "excluded":
+    if quantity is quantities.EXCLUDED:
         return ", ".join(str(port + 1) for port in range(int(value).bit_length()) if int(value) >> port & 1) or "none"
-    std = values.get("_std_".join(quantity.split("_", 1)), math.nan)
-    return f"{value:+.3f}" + ("" if math.isnan(std) else f" ±{std:.3f}")
+    _, scale, decimals = quantity.value
+    return f"{scale * value:+.{decimals}f}" + ("" if math.isnan(std) else f" ±{scale * std:.{decimals}f}")

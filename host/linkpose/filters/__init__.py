@@ -1,18 +1,19 @@
-"""The filters, by name. A filter and its compiler (numba) are imported only when it is made."""
+"""The registry of filters: what each needs and offers. A filter and its compiler (numba) are imported on creation."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
-from typing import NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
-from linkpose.wire.messages import Sensors
 
 Floats = NDArray[np.float64]
 
@@ -20,28 +21,47 @@ ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180
 MOST_MICE = 4  # the firmware's ports
 
 
-class _Entry(NamedTuple):
-    """Where a filter is, and what it cannot do without."""
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a filter needs and offers. The estimator, the smoother's choice, scores and plots decide by these."""
 
-    module: str
+    module: str  # below linkpose.filters
     cls: str
-    sensors: Sensors
-    needs_j2s: bool
+    sensors: Sensors  # without which it cannot run
+    # Of J2S (the vector from the joint centre to the sensor): "guess" runs with a rough one and estimates it.
+    j2s: Literal["none", "guess", "known"] = "none"
     needs_mice: bool = False
+    is_odometric: bool = False  # its pose counts from where the robot stood at the first sample
+    smoother: str | None = None  # class in linkpose.filters.smoother that takes its place over a whole recording
+
+    @property
+    def is_barometric(self) -> bool:
+        """Whether the height comes from the air pressure, whose noise is decimetres."""
+        return bool(self.sensors & Sensors.BMP180)
 
 
-_FILTERS = {
-    "joint": _Entry("joint", "JointFilter", Sensors.MPU6050, True),
-    "tilt": _Entry("tilt", "TiltFilter", Sensors.MPU6050, False),
-    "imu-baro": _Entry("imu_baro", "ImuBaroFilter", ALL_SENSORS, False),
-    "baro": _Entry("baro", "BaroFilter", Sensors.BMP180, False),
-    "joint-inertial": _Entry("joint_inertial", "JointInertialFilter", Sensors.MPU6050, True),
-    "tilt-inertial": _Entry("tilt_inertial", "TiltInertialFilter", Sensors.MPU6050, False),
-    "mice": _Entry("mice", "MiceFilter", Sensors(0), False, True),
-    "planar-ekf": _Entry("planar", "PlanarEkf", Sensors(0), False, True),
-    "planar-ukf": _Entry("planar", "PlanarUkf", Sensors(0), False, True),
+_IMU, _ANY = Sensors.MPU6050, Sensors(0)
+
+# Best first: the order of columns, tables and legends.
+REGISTRY: dict[str, Capabilities] = {
+    "joint-inertial": Capabilities(
+        "joint_inertial", "JointInertialFilter", _IMU, "guess", smoother="JointInertialSmoother"
+    ),
+    "tilt-inertial": Capabilities("tilt_inertial", "TiltInertialFilter", _IMU),
+    "joint": Capabilities("joint", "JointFilter", _IMU, "known"),
+    "tilt": Capabilities("tilt", "TiltFilter", _IMU),
+    "imu-baro": Capabilities("imu_baro", "ImuBaroFilter", ALL_SENSORS),
+    "baro": Capabilities("baro", "BaroFilter", Sensors.BMP180),
+    "planar-ekf": Capabilities("planar", "PlanarEkf", _ANY, needs_mice=True, is_odometric=True),
+    "planar-ukf": Capabilities("planar", "PlanarUkf", _ANY, needs_mice=True, is_odometric=True),
+    "mice": Capabilities("mice", "MiceFilter", _ANY, needs_mice=True, is_odometric=True),
 }
-NAMES = tuple(_FILTERS)
+NAMES = tuple(REGISTRY)
+
+
+def capabilities(name: str) -> Capabilities | None:
+    """The filter's capabilities; None of a name that is no filter here, such as `ekf` of `localize`."""
+    return REGISTRY.get(name)
 
 
 class Filter(Protocol):
@@ -80,19 +100,34 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST
 
     Raises CannotRun where the rig or the sensors do not allow it, LinkposeError for no such name.
     """
-    if name not in _FILTERS:
+    if name not in REGISTRY:
         raise LinkposeError(f"there is no filter {name!r}: take {', '.join(NAMES)}")
-    entry = _FILTERS[name]
-    for missing in entry.sensors & ~sensors:
+    needs = REGISTRY[name]
+    for missing in needs.sensors & ~sensors:
         raise CannotRun(f"{name} needs the {missing.name}, which does not answer: check its wiring")
-    if entry.needs_j2s and rig.joint.j2s_m is None:
-        raise CannotRun(f"{name} needs J2S: type `linkpose calibrate joint`, or give it with --j2s X,Y,Z")
-    if name == "joint" and rig.joint.known_j2s_m is None:
-        raise CannotRun("joint needs a J2S that is known; joint-inertial is the filter that estimates it")
-    if entry.needs_mice:
+    _check_j2s(name, needs, rig)
+    if needs.needs_mice:
         _check_mice(rig, sensors, mice)
-    made: Filter = getattr(importlib.import_module(f"linkpose.filters.{entry.module}"), entry.cls)(rig)
+    made: Filter = getattr(importlib.import_module(f"linkpose.filters.{needs.module}"), needs.cls)(rig)
     return made
+
+
+def create_smoother(name: str, rig: Rig) -> Filter:
+    """The smoother that takes the place of a filter whose capabilities name one: it processes one whole recording."""
+    cls = REGISTRY[name].smoother
+    if cls is None:
+        raise CannotRun(f"{name} has no smoother")
+    made: Filter = getattr(importlib.import_module("linkpose.filters.smoother"), cls)(rig)
+    return made
+
+
+def _check_j2s(name: str, needs: Capabilities, rig: Rig) -> None:
+    """Raises CannotRun where J2S is missing, or too uncertain for the filter."""
+    if needs.j2s != "none" and rig.joint.j2s_m is None:
+        raise CannotRun(f"{name} needs J2S: type `linkpose calibrate joint`, or give it with --j2s X,Y,Z")
+    if needs.j2s == "known" and rig.joint.known_j2s_m is None:
+        estimators = ", ".join(other for other, able in REGISTRY.items() if able.j2s == "guess")
+        raise CannotRun(f"{name} needs a J2S that is known; {estimators} is the filter that estimates it")
 
 
 def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:

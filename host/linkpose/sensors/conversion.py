@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from linkpose.sensors import bmp180, mpu6050
-from linkpose.wire.messages import Hello, Sample, SampleFlags
+from linkpose.wire.messages import DeviceState, Hello, Sample, SampleFlags
 
 TIME_DECIMALS = 6
 
@@ -45,8 +45,8 @@ class Settings:
     @staticmethod
     def of(hello: Hello) -> Settings:
         """The settings that a HELLO announces."""
-        words = bmp180.Calibration(*(getattr(hello, name) for name in bmp180.Calibration._fields))
-        found = [port for port, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF]
+        words = bmp180.Calibration.of(hello.baro_words)
+        found = [port for port, mouse in enumerate(hello.mice, 1) if mouse.state != DeviceState.ABSENT]
         return Settings(
             hello.sample_rate_hz,
             hello.accel_range_g,

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation.motion import HandMotion
-from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
+from linkpose.wire.frames import sample
+from linkpose.wire.messages import HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -89,7 +91,7 @@ class RawBlock(NamedTuple):
             strict=True,
         )
         for seq, t_us, (ax, ay, az), temp, (gx, gy, gz), ut, up, count, flags in rows:
-            yield Sample(seq, t_us, ax, ay, az, temp, gx, gy, gz, ut, up, count, flags)
+            yield sample(seq, t_us, flags, (ax, ay, az, temp, gx, gy, gz), baro=(ut, up, count))
 
 
 class LinkRun:

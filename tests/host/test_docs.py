@@ -1,0 +1,69 @@
+"""The documentation: the site builds without a warning, and the commands on its pages run."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "host" / "docs"
+_BLOCK = re.compile(r"^```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+# Commands that need a board with a bootloader, and the test that runs them.
+HARDWARE = {
+    "linkpose ports": "tests/host/test_cli.py",
+    "linkpose flash --prebuilt": "tests/host/test_flash.py",
+}
+
+
+def commands(page: Path) -> list[str]:
+    """The commands that a page shows after `$ `, in order."""
+    lines = [line for block in _BLOCK.findall(page.read_text(encoding="utf-8")) for line in block.splitlines()]
+    return [line[2:].strip() for line in lines if line.startswith("$ ")]
+
+
+def pages_with_commands() -> list[str]:
+    return [page.name for page in sorted(DOCS.glob("*.md")) if commands(page)]
+
+
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", ROOT / "host/mkdocs.yml", "-d", tmp_path]
+    done = subprocess.run(build, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "quickstart" / "index.html").is_file()
+    assert "COBS" in (tmp_path / "protocol" / "index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", pages_with_commands())
+def test_the_commands_of_a_page_run(name: str, tmp_path: Path) -> None:
+    """In one folder, in the order of the page. A simulated link stands in for the board on the port."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "LINKPOSE_PORT": "sim://link?seed=1"}
+    for command in commands(DOCS / name):
+        if command in HARDWARE:
+            assert (ROOT / HARDWARE[command]).is_file()
+            continue
+        program, *arguments = shlex.split(command)
+        assert program == "linkpose", f"{name}: a console block shows linkpose commands only, not {command!r}"
+        done = subprocess.run(
+            [sys.executable, "-m", "linkpose", *arguments],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, f"{name}: {command}\n{done.stderr}"
+
+
+def test_every_cited_key_is_in_the_references() -> None:
+    known = set(re.findall(r"\*\*\[(\w[\w-]*)\]\*\*", (DOCS / "references.md").read_text(encoding="utf-8")))
+    sources = [*DOCS.glob("*.md"), *(ROOT / "host" / "linkpose").rglob("*.py")]
+    papers = re.compile(r"\[(Link|Thesis|Mice|[A-Z][a-z]+\d{4})\](?!\()")
+    cited = {key for source in sources for key in papers.findall(source.read_text(encoding="utf-8"))}
+    assert cited <= known
+    assert {"Link", "Thesis", "Mice"} <= known
