@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from linkpose import filters
-from linkpose.evaluation.planar import CASES, PoseError, baseline, pose_error
+from linkpose.experiments.planar import CASES, PoseError, baseline, pose_error
 
 FILTERS = ("planar-ekf", "planar-ukf")
 

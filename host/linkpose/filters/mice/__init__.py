@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
-from linkpose.filters import CannotRun
+from linkpose.errors import CannotRun
 from linkpose.filters._imu import ImuCalibration, read_gyro
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
 from linkpose.filters.mice.reading import (
