@@ -124,7 +124,9 @@ class SensorHealth:
             codes = self._excuse(codes, time_s)
         self.samples += len(codes)
         self.saturated += int(np.count_nonzero(saturated))
-        if self.cause == Cause.OK and self._pending is None and not codes.any():
+        if self._pending is None and self.cause is not None and (codes == int(self.cause)).all():
+            if self.cause:
+                self.invalid[self.cause] = self.invalid.get(self.cause, 0) + len(codes)
             return []
         for cause, number in zip(*np.unique(codes, return_counts=True), strict=True):
             if cause != Cause.OK:
@@ -178,10 +180,17 @@ class _Repeats:
 
     def follow(self, values: Floats, time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
         """`values` (N, K); repetitions (N, K) and their duration in s (N, K). NaN repeats nothing."""
+        return self.run(self.same(values), time_s)
+
+    def same(self, values: Floats) -> Bools:
+        """Whether each value (N, K) equals the one before."""
         before = np.full((1, values.shape[1]), np.nan) if self._last is None else self._last
-        same = values == np.concatenate([before, values[:-1]])
         self._last = values[-1:].copy()
-        return self.run(same, time_s)
+        return np.asarray(values == np.concatenate([before, values[:-1]]))
+
+    def restart(self, time_s: Floats) -> None:
+        """As `run` of a block in which nothing repeats."""
+        self._count, self._begin_s = np.zeros(1, np.int64), time_s[-1:].copy()
 
     def run(self, same: Bools, time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
         """`same` (N, K): the sample continues the run of the one before."""
@@ -207,24 +216,19 @@ class _ImuFlags:
     causes: Mapping[int, Cause]
 
 
-_IMU_FLAGS = _ImuFlags(
-    SampleFlags.IMU_VALID,
-    SampleFlags.ACCEL_SATURATED | SampleFlags.GYRO_SATURATED,
-    {
-        SampleFlags.IMU_BLANK: Cause.BLANK,
-        SampleFlags.IMU_FROZEN: Cause.FROZEN,
-        SampleFlags.IMU_OUT_OF_RANGE: Cause.OUT_OF_RANGE,
-    },
-)
-_IMU2_FLAGS = _ImuFlags(
-    SampleFlags.IMU2_VALID,
-    SampleFlags.ACCEL2_SATURATED | SampleFlags.GYRO2_SATURATED,
-    {
-        SampleFlags.IMU2_BLANK: Cause.BLANK,
-        SampleFlags.IMU2_FROZEN: Cause.FROZEN,
-        SampleFlags.IMU2_OUT_OF_RANGE: Cause.OUT_OF_RANGE,
-    },
-)
+def _imu_flags(number: str) -> _ImuFlags:
+    """As plain integers: an IntFlag costs several µs each time it meets an array."""
+    bit = {flag.name: int(flag) for flag in SampleFlags}
+    causes = {f"IMU{number}_{cause.name}": cause for cause in (Cause.BLANK, Cause.FROZEN, Cause.OUT_OF_RANGE)}
+    return _ImuFlags(
+        bit[f"IMU{number}_VALID"],
+        bit[f"ACCEL{number}_SATURATED"] | bit[f"GYRO{number}_SATURATED"],
+        {bit[name]: cause for name, cause in causes.items()},
+    )
+
+
+_IMU_FLAGS, _IMU2_FLAGS = _imu_flags(""), _imu_flags("2")
+_MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in (1, 2, 3, 4)}
 
 
 class _Imu:
@@ -232,6 +236,7 @@ class _Imu:
 
     def __init__(self, flags: _ImuFlags) -> None:
         self._flags = flags
+        self._caused = sum(flags.causes)  # all of these bits
         self._burst = _Repeats()
         self._axes = _Repeats()
         self._stuck = _Repeats()
@@ -242,25 +247,34 @@ class _Imu:
         """Cause (N,) of each sample."""
         values = np.concatenate([accel, gyro], axis=1)
         codes = np.zeros(len(values), np.int8)
-        counts, _ = self._axes.follow(values, time_s)
-        same = counts > 0
-        _, stuck_s = self._check_axes(same, counts, time_s)
+        same = self._axes.same(values)
+        if not same.any():  # most samples of a sensor with noise
+            for each in (self._axes, self._stuck, self._burst):
+                each.restart(time_s)
+            return self._judge(codes, values, temp, flags)
+        counts, _ = self._axes.run(same, time_s)
+        stuck_s = self._check_axes(same, counts, time_s)
         repeats, held_s = self._burst.run(np.asarray(same.all(axis=1))[:, None], time_s)
         codes[stuck_s.max(axis=1, initial=0.0) >= STUCK_S - 1e-6] = Cause.STUCK
-        codes[(temp < TEMPERATURE_RANGE_DEGC[0]) | (temp > TEMPERATURE_RANGE_DEGC[1])] = Cause.OUT_OF_RANGE
         codes[(repeats[:, 0] >= FROZEN_REPEATS) & (held_s[:, 0] >= FROZEN_S - 1e-6)] = Cause.FROZEN
+        return self._judge(codes, values, temp, flags)
+
+    def _judge(self, codes: Codes, values: Floats, temp: Floats, flags: NDArray[np.integer[Any]]) -> Codes:
+        """Add to `codes` what a sample shows by itself."""
+        codes[(temp < TEMPERATURE_RANGE_DEGC[0]) | (temp > TEMPERATURE_RANGE_DEGC[1])] = Cause.OUT_OF_RANGE
         codes[~values.any(axis=1)] = Cause.BLANK
         codes[~np.isfinite(values).all(axis=1)] = Cause.SILENT
-        for flag, cause in self._flags.causes.items():
-            codes[flags & flag != 0] = cause
+        if (flags & self._caused).any():
+            for flag, cause in self._flags.causes.items():
+                codes[flags & flag != 0] = cause
         return codes
 
-    def _check_axes(self, same: Bools, counts: NDArray[np.int64], time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
+    def _check_axes(self, same: Bools, counts: NDArray[np.int64], time_s: Floats) -> Floats:
         """How long each axis has repeated while the two others of its kind changed; 0 for less than STUCK_REPEATS."""
         lively = (counts < LIVELY_REPEATS).reshape(len(counts), 2, 3)
         others = lively[:, :, [1, 0, 0]] & lively[:, :, [2, 2, 1]]
         repeats, held_s = self._stuck.run(same & others.reshape(same.shape), time_s)
-        return repeats, np.where(repeats >= STUCK_REPEATS, np.nan_to_num(held_s), 0.0)
+        return np.where(repeats >= STUCK_REPEATS, held_s, 0.0)
 
 
 class _Baro:
@@ -321,17 +335,17 @@ class HealthMonitor:
         if "baro" in self.sensors:
             block = self._check_baro(block, changes)
         for port in range(block.mice_counts.shape[1]):
-            health = self.sensors.get(f"mouse{port + 1}")
-            if health is not None:
+            name = f"mouse{port + 1}"
+            if (health := self.sensors.get(name)) is not None:
                 silent = np.asarray(np.isnan(block.mice_counts[:, port]).any(axis=1)).astype(np.int8)
-                overflow = flags & SampleFlags[f"MOUSE{port + 1}_OVERFLOW"] != 0
+                overflow = flags & _MOUSE_OVERFLOW[name] != 0
                 changes += health.count(silent, time_s, overflow)
         return block, changes
 
     def _check_imu(self, block: Measurements, flags: NDArray[np.int64], changes: list[Change]) -> Measurements:
         codes = self._imu.check(block.accel_m_s2, block.gyro_rad_s, block.imu_temp_degC, flags, block.time_s)
         changes += self.sensors["imu"].count(codes, block.time_s, flags & _IMU_FLAGS.saturated != 0)
-        bad = codes != Cause.OK
+        bad = codes != 0
         if not bad.any():
             return block
         return replace(
@@ -339,13 +353,13 @@ class HealthMonitor:
             accel_m_s2=np.where(bad[:, None], np.nan, block.accel_m_s2),
             gyro_rad_s=np.where(bad[:, None], np.nan, block.gyro_rad_s),
             imu_temp_degC=np.where(bad, np.nan, block.imu_temp_degC),
-            flags=(block.flags & ~np.where(bad, SampleFlags.IMU_VALID, 0).astype(block.flags.dtype)),
+            flags=(block.flags & ~np.where(bad, _IMU_FLAGS.valid, 0).astype(block.flags.dtype)),
         )
 
     def _check_baro(self, block: Measurements, changes: list[Change]) -> Measurements:
         codes = self._baro.check(block.pressure_Pa, block.baro_fresh, block.time_s)
         changes += self.sensors["baro"].count(codes, block.time_s, np.zeros(0, np.bool_))
-        bad = codes != Cause.OK
+        bad = codes != 0
         if not bad.any():
             return block
         return replace(
