@@ -53,10 +53,10 @@ def framed(payload: bytes) -> bytes:
     [
         (b"", "the board is silent"),
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
-        (random.Random(3).randbytes(60), "only noise came"),
-        (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 2.0"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 2.0, the board's firmware 3.0"),
+        (random.Random(3).randbytes(60), "only noise was received"),
+        (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -104,7 +104,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     with PtyBoard(tmp_path / "port"):
         first = Session(str(tmp_path / "port"), print)
         next(iter(first.stream()))
-        first._link.close()  # as a killed program leaves it: no STOP
+        first._connection.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
             seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]
@@ -117,7 +117,7 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
     how long anything takes.
     """
-    from linkpose.cli.live import Recorder
+    from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
     said: list[str] = []
@@ -125,7 +125,7 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
         behind = None
         for placements in session.stream():
-            recorder.take(placements)
+            recorder.convert(placements)
             timeline = session.timeline
             if waiting and waiting[0][0](said, timeline.samples):
                 waiting.pop(0)[1]()

@@ -43,8 +43,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self._table:
             return None
-        command = importlib.import_module(self._modules + cmd_name).command
-        assert isinstance(command, click.Command)
+        command: click.Command = importlib.import_module(self._modules + cmd_name).command
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -73,7 +72,9 @@ def main() -> None:
         error.show()
         status = error.exit_code
     except LinkposeError as error:
-        click.echo(f"linkpose: {printable(error)}", err=True)
+        from linkpose.cli.cures import sentence
+
+        click.echo(f"linkpose: {printable(sentence(error))}", err=True)
         status = 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):

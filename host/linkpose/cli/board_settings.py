@@ -1,15 +1,12 @@
-"""Options that put other settings in force on the board, for as long as it is not reset."""
+"""Options that change the board's settings; linkpose restores them after a reset of the board."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
-
-if TYPE_CHECKING:
-    from linkpose.device.session import Session
 
 # Option -> what it sets in CONFIGURE, its values, and what it is.
 _OPTIONS = {
@@ -40,9 +37,3 @@ def board_settings(function: Callable[..., Any]) -> Callable[..., Any]:
         kind = click.Choice(values) if isinstance(values, tuple) else values
         decorated = click.option(option, field, type=kind, metavar="N", help=text)(decorated)
     return decorated
-
-
-def apply(board: dict[str, int], session: Session) -> None:
-    """Configures the board where anything was typed. Raises LinkposeError when it refuses."""
-    if board:
-        session.configure(session.settings._replace(**board))

@@ -29,7 +29,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> N
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_imu(loaded)
-    options.save_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     if json_lines:
         click.echo(json.dumps(_object(found)))
     else:

@@ -28,7 +28,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_joint(loaded, rig)
-    options.save_rig(rig_file, with_calibration(rig, found, with_imu))
+    with_calibration(rig, found, with_imu).save(rig_file)
     (x, y, z), (sx, sy, sz) = found.j2s_m.tolist(), found.std_m.tolist()
     if json_lines:
         values = {"j2s_m": [x, y, z], "std_m": [sx, sy, sz], "residual_m_s2": found.residual_m_s2}

@@ -36,7 +36,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_mice(loaded, rig, length)
-    options.save_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(_object(mouse)) if json_lines else _line(mouse))
     click.echo(f"written to {rig_file}", err=True)

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from linkpose.cli import options
-from linkpose.cli.board_settings import apply, board_settings
+from linkpose.cli.board_settings import board_settings
+from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
-    from linkpose.device.session import Placement
     from linkpose.estimation import EstimateWriter, Estimator
 
 WORST_STD_M = 0.03  # of a J2S that the motion has told
@@ -98,7 +98,7 @@ def command(
 
 def _replay(path: Path, request: Request, console: Console) -> None:
     """Estimates over a recording, as fast as it goes."""
-    from linkpose.estimation import Estimator, mice_of, sensors_of
+    from linkpose.estimation import Estimator
     from linkpose.recording.reader import load_recording
 
     recording = load_recording(path)
@@ -107,7 +107,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with while_compiling(console.say):
         measurements = recording.measurements
-        estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
+        estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
         _check(estimator, request, console)
         if request.smooth:
             _smooth(estimator)
@@ -118,7 +118,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     with _Sink(estimator, request, head) as sink:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_outcome(estimator)})
-    _tell_j2s(estimator, console)
+    _report_j2s(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
 
@@ -140,46 +140,41 @@ def _live(
     console: Console,
 ) -> None:
     """Estimates as the board measures."""
+    from linkpose.board import Board
     from linkpose.cli import live
     from linkpose.cli.view import View
-    from linkpose.device.ports import choose_port
-    from linkpose.device.session import Session
-    from linkpose.sensors.conversion import Settings
-    from linkpose.sensors.devices import found
     from linkpose.sensors.measurements import Measurements
 
     with contextlib.ExitStack() as stack:
-        capture = stack.enter_context(live.raw_capture(raw, request.force))
-        session = stack.enter_context(Session(port or choose_port(), console.say, capture))
-        apply(board, session)
-        rig = options.resolve_rig(request.rig_file, request.joint, session.rig)
-        session.wait_for_mice(len(rig.mouse))
+        connected = stack.enter_context(
+            Board(
+                port, settings=board, rig=request.rig_file, joint=request.joint, raw=raw, force=request.force,
+                notify=console.say,
+            )
+        )  # fmt: skip
         with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            settings, sensors = Settings.of(session.hello), found(session.hello)
-            used = rig.with_delay_of(settings.dlpf)
-            estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
+            estimator = Estimator.for_board(request.filter_names, connected)
             _check(estimator, request, console)
             estimator.warm_up()
-        recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
-        head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": used.as_dict()}
-        sink = stack.enter_context(_Sink(estimator, request, head))
+        if record:
+            connected.record(record, force=request.force)
+        head = {"device": connected.port, "filters": [f.name for f in estimator.filters]}
+        sink = stack.enter_context(_Sink(estimator, request, head | {"rig": estimator.rig.as_dict()}))
         view = stack.enter_context(View(estimator.columns, console.shows_progress))
 
-        def handle(placements: list[Placement]) -> None:
-            rows = recorder.take(placements)
-            if rows:
-                estimates = estimator.process(Measurements.of(rows))
+        def handle(block: Measurements) -> None:
+            if len(block):
+                estimates = estimator.process(block)
                 sink.write(estimates)
-                view.show(estimates[-1], session.health)
+                view.show(estimates[-1], connected.session.health)
 
-        ended = live.run(session, duration, handle)
+        ended = live.run_board(connected, duration, handle)
         view.close()
-        recorder.close(ended)
-        health = session.health()
+        health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
-        _tell_j2s(estimator, console)
+        _report_j2s(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
 
 
@@ -190,8 +185,9 @@ def _check(estimator: Estimator, request: Request, console: Console) -> None:
     if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
         name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
         raise LinkposeError(f"--j2s auto is estimated by {name}, which does not run; add --filter {name}")
-    for reason in dict.fromkeys(estimator.left_out.values()):
-        names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
+    left_out = {name: sentence(reason) for name, reason in estimator.left_out.items()}
+    for reason in dict.fromkeys(left_out.values()):
+        names = ", ".join(name for name, why in left_out.items() if why == reason)
         console.say(f"without {names}: {reason}")
 
 
@@ -204,7 +200,7 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     return outcome
 
 
-def _tell_j2s(estimator: Estimator, console: Console) -> None:
+def _report_j2s(estimator: Estimator, console: Console) -> None:
     """J2S where it was to be found, and what the motion did not tell of it."""
     found = estimator.found_j2s
     if not found:

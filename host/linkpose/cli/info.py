@@ -22,15 +22,14 @@ OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of th
 @options.as_json
 @options.verbosity
 def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, quiet: bool) -> None:
-    """Show the board's versions, sensors, settings and link health. Takes about three seconds."""
+    """Show the board's versions, sensors, settings and data health. Takes about three seconds."""
+    from linkpose.board import open_session
     from linkpose.cli import live
-    from linkpose.device.ports import choose_port
-    from linkpose.device.session import Session
 
     console = live.Console(quiet, verbose)
-    with Session(port or choose_port(), console.say) as session:
+    with open_session(port, console.say) as session:
         tested = _self_test(session) if self_test else {}
-        live.run(session, OBSERVED_S, lambda _: console.progress(lambda: "observing the link ..."))
+        live.run(session.stream(OBSERVED_S), lambda _: console.progress(lambda: "observing the connection ..."))
         report = _report(session, session.health()) | tested
     if json_lines:
         click.echo(json.dumps(report))

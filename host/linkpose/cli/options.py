@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.errors import LinkposeError
-from linkpose.sensors.rig import Joint, Rig
+from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
     from linkpose.recording.reader import Recording
@@ -40,17 +39,13 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
         return x, y, z
 
 
-# A J2S of which nothing is known but that it is some metres long at the most.
-UNKNOWN_JOINT = Joint((0.0, 0.0, 0.0), 1.0)
-
-
 class JointType(VectorType):
     """A joint by its J2S: three numbers, or `auto` for one that is to be estimated."""
 
     name = "X,Y,Z|auto"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Joint:
-        return UNKNOWN_JOINT if value == "auto" else Joint(super().convert(value, param, ctx))
+        return UNKNOWN_JOINT if str(value).lower() == "auto" else Joint(super().convert(value, param, ctx))
 
 
 class SecondsType(click.ParamType):  # type: ignore[type-arg]
@@ -69,7 +64,11 @@ class SecondsType(click.ParamType):  # type: ignore[type-arg]
 
 
 class FiniteRange(click.FloatRange):
-    """A number within bounds. click's own range lets NaN and infinity pass."""
+    """A number within bounds. click's own range accepts NaN and infinity, and shows an open end as None."""
+
+    def _describe_range(self) -> str:
+        ends = (self.min, ">" if self.min_open else ">="), (self.max, "<" if self.max_open else "<=")
+        return ", ".join(f"{sign}{end:g}" for end, sign in ends if end is not None)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = float(super().convert(value, param, ctx))
@@ -150,13 +149,8 @@ def verbosity(function: Function) -> Function:
 
 
 def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:
-    """The rig file where one is named, or else the one that came along; `--j2s` goes before either's.
-
-    How late the readings are is theirs rather than the rig's: what came along tells it where the rig file does not.
-    """
-    rig = Rig.load(rig_file) if rig_file else brought or Rig()
-    if brought is not None and rig.imu.delay_s is None:
-        rig = replace(rig, imu=replace(rig.imu, delay_s=brought.imu.delay_s))
+    """The rig file if one is named, otherwise the rig of the recording or simulated board; --j2s replaces its J2S."""
+    rig = as_rig(rig_file, brought)
     return replace(rig, joint=joint) if joint else rig
 
 
@@ -168,13 +162,3 @@ def load_recordings(paths: Sequence[Path]) -> list[Recording]:
     for remark in (remark for recording in loaded for remark in recording.remarks):
         click.echo(remark, err=True)
     return loaded
-
-
-def save_rig(path: Path, rig: Rig) -> None:
-    """Writes a rig file, whole or not at all. Raises LinkposeError where it cannot be written."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        partial.write_text(rig.to_toml(), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise LinkposeError(f"cannot write the rig file {path}: {error.strerror}") from error

@@ -6,14 +6,14 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
-from linkpose.device.link import Arrival, Disconnected, Link
-from linkpose.device.ports import NoSuchPort, find_again, usb_identity
-from linkpose.errors import LinkposeError
+from linkpose.device.connection import Arrival, Connection, Disconnected
+from linkpose.device.ports import find_again, usb_identity
+from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
 from linkpose.sensors.conversion import Settings
 from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
@@ -56,15 +56,12 @@ LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
 RECEIVE_TIMEOUT_S = 0.1
 RETRY_INTERVAL_S = 0.25
 
-FLASH = "type `linkpose flash`"
-UPGRADE = "type `pip install --upgrade linkpose`"
-
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
-class WrongBoard(LinkposeError):
-    """A board that cannot be gone on with, however long it is waited for."""
+class AnotherBoard(BoardError):
+    """Another board answers at the port than the one that the recording began with."""
 
 
 class Placement(NamedTuple):
@@ -99,7 +96,7 @@ class Session:
         self.port = port
         self._notify = notify
         self._capture = capture
-        self._link = Link(port, capture)
+        self._connection = Connection(port, capture)
         self._usb = usb_identity(port)
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
@@ -115,13 +112,13 @@ class Session:
         try:
             self.hello = self._handshake()
         except BaseException:
-            self._link.close()
+            self._connection.close()
             raise
 
     @property
     def rig(self) -> Rig | None:
         """The rig that a simulated board brings along; None of a real one."""
-        return self._link.rig
+        return self._connection.rig
 
     @property
     def settings(self) -> Configure:
@@ -133,43 +130,43 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Disconnected):
-            self._link.send(Stop())
-        self._link.close()
+            self._connection.send(Stop())
+        self._connection.close()
 
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
-        link = self._link
+        connection = self._connection
         heard = bytearray()
         deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
         while time.perf_counter() < deadline:
             if time.perf_counter() >= ask_at:
-                link.send(Stop())
-                link.send(GetInfo())
+                connection.send(Stop())
+                connection.send(GetInfo())
                 ask_at = time.perf_counter() + ASK_INTERVAL_S
-            arrival = link.receive(0.05)
+            arrival = connection.receive(0.05)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
-                    raise WrongBoard(_other_protocol(message))
+                    raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
-                    link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
-        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
+        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
 
     def _check_versions(self, hello: Hello) -> None:
-        """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
+        """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise WrongBoard(_other_schema(hello))
+            raise _other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
-            older, cure = ("board", FLASH) if hello.protocol_minor < PROTOCOL_MINOR else ("linkpose", UPGRADE)
+            older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
             self._notify(
-                f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
-                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
+                f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
         check_hello(hello)
 
@@ -179,7 +176,7 @@ class Session:
         """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
         self._command(settings, Command.CONFIGURE)
         time.sleep(SETTLE_S)
-        self._link.send(GetInfo())
+        self._connection.send(GetInfo())
         self.hello = self._await(Hello, "GET_INFO")
         return self.hello
 
@@ -188,7 +185,7 @@ class Session:
         deadline = time.perf_counter() + MICE_TIMEOUT_S
         while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
             time.sleep(ASK_INTERVAL_S)
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
     def self_test(self, device: int = 0) -> SelfTestResult:
@@ -202,7 +199,7 @@ class Session:
         A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
         """
         for _ in range(ATTEMPTS):
-            self._link.send(message)
+            self._connection.send(message)
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for at, answer in enumerate(arrival.messages):
                     if isinstance(answer, Nak) and answer.command == command:
@@ -232,7 +229,7 @@ class Session:
         """What arrives within a time."""
         deadline = time.perf_counter() + timeout_s
         while (left := deadline - time.perf_counter()) > 0:
-            arrival = self._link.receive(left)
+            arrival = self._connection.receive(left)
             if arrival is not None:
                 yield arrival
 
@@ -240,7 +237,7 @@ class Session:
 
     def _ping(self) -> None:
         self._token = (self._token + 1) % (1 << 32)
-        self._pings = {self._token: self._link.send(Ping(self._token))}
+        self._pings = {self._token: self._connection.send(Ping(self._token))}
 
     def _hear_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
@@ -262,7 +259,7 @@ class Session:
 
     # ---- streaming ----
 
-    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
+    def stream(self, duration_s: float | None = None) -> Generator[list[Placement], None, None]:
         """Samples as they arrive, in lists of those that arrived together, for `duration_s` of the board's time.
 
         A list may be empty: the caller gets its turn several times a second even when nothing arrives. After a reset or
@@ -271,7 +268,7 @@ class Session:
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
-        self._began_s = self._link.now()
+        self._began_s = self._connection.now()
         while not timeline.is_over:
             try:
                 placements = self._next(timeline)
@@ -293,7 +290,7 @@ class Session:
     def _end_when_due(self, timeline: Timeline) -> None:
         """End the timeline when the duration has passed without a sample that would have ended it."""
         first_s = timeline.start_s if timeline.samples else self._began_s
-        timeline.end_if_past(self._link.now() - first_s - LATE_S)
+        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
@@ -304,7 +301,7 @@ class Session:
         self._silent_s = self._asked_s = 0.0
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._link.receive(RECEIVE_TIMEOUT_S), None
+        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
         now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
@@ -330,7 +327,7 @@ class Session:
             if self._asked_s == 0.0:
                 self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
             self._asked_s = self._silent_s
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
 
     def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
         if isinstance(message, Pong):
@@ -338,7 +335,7 @@ class Session:
         elif isinstance(message, Status):
             self._status = message
         elif isinstance(message, OtherProtocol):
-            raise WrongBoard(_other_protocol(message))
+            raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
             self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
@@ -349,7 +346,7 @@ class Session:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
         if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
-            raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
+            raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
         self._begin()
@@ -357,10 +354,10 @@ class Session:
     def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:
         """Wait until the board can be opened again and streams, or the duration is over; yields while it waits.
 
-        Raises WrongBoard for a board with which the recording cannot continue.
+        Raises WrongFirmware or AnotherBoard for a board with which the recording cannot continue.
         """
-        self._link.close()
-        for part, count in self._link.decoder.corrupt.as_dict().items():
+        self._connection.close()
+        for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
         obstacles: set[str] = set()
         while not timeline.is_over:
@@ -380,21 +377,21 @@ class Session:
         if port is None:
             return ""
         try:
-            self._link = Link(port, self._capture)
-        except NoSuchPort:
+            self._connection = Connection(port, self._capture)
+        except PortNotFound:
             return ""
         except LinkposeError as error:
             return str(error)
         self.port = port
         try:
             self._resume(self._handshake())
-        except WrongBoard:
+        except (WrongFirmware, AnotherBoard):
             raise
         except Disconnected:
-            self._link.close()
+            self._connection.close()
             return ""
         except LinkposeError as error:
-            self._link.close()
+            self._connection.close()
             return str(error)
         self._usb = usb_identity(port)
         self._notify(f"the board is back at {port}; continuing, the gap is marked")
@@ -405,7 +402,7 @@ class Session:
     def health(self) -> Health:
         """Counts so far."""
         timeline = self.timeline
-        now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
+        now, before = self._connection.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
         duration = timeline.duration_s
         return Health(
             samples=timeline.samples,
@@ -418,6 +415,19 @@ class Session:
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
             status=self._status,
         )
+
+
+def summary(health: Health) -> dict[str, Any]:
+    """The closing summary of a session, as `record --json` prints it."""
+    return {
+        "event": "summary",
+        "samples": health.samples,
+        "lost": health.lost,
+        "corrupt": health.corrupt.total,
+        "gaps": len(health.gaps),
+        "duration_s": round(health.duration_s, 6),
+        "rate_hz": round(health.rate_hz, 3),
+    }
 
 
 def firmware_version(hello: Hello) -> str:
@@ -444,33 +454,35 @@ def _reason(code: int) -> str:
         return f"reason {code}"
 
 
-def _other_protocol(other: OtherProtocol) -> str:
+def _other_protocol(other: OtherProtocol) -> WrongFirmware:
     theirs = f"{other.protocol_major}.{other.protocol_minor}"
     ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
     if other.protocol_major < PROTOCOL_MAJOR:
-        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; {FLASH}"
-    return f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; {UPGRADE}"
+        return WrongFirmware(f"the board's firmware is old: it uses protocol {theirs}, this linkpose {ours}", True)
+    return WrongFirmware(f"this linkpose is old: it uses protocol {ours}, the board's firmware {theirs}", False)
 
 
-def _other_schema(hello: Hello) -> str:
+def _other_schema(hello: Hello) -> WrongFirmware:
     theirs = firmware_version(hello)
     release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
     if release > tuple(map(int, VERSION.split("."))):
-        return f"this linkpose {VERSION} is older than the board's firmware {theirs}, their schemas differ; {UPGRADE}"
-    return f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas; {FLASH}"
+        text = f"this linkpose {VERSION} is older than the board's firmware {theirs}, and their schemas differ"
+        return WrongFirmware(text, False)
+    text = f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas"
+    return WrongFirmware(text, True)
 
 
 def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
     """What came instead of a HELLO, and what to do about it."""
     if not heard:
-        return "the board is silent; type `linkpose flash` if it never had this firmware, or choose another --port"
+        return "the board is silent; it may never have had this firmware, or another port is the board's"
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
     if printable > 0.8 * len(heard):
         text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
-        return f"another firmware answers: {text!r}; type `linkpose flash` to put linkpose's on the board"
+        return f"another firmware answers: {text!r}"
     if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
         return "the board answers only in part; check the cable and try again"
     return (
-        "only noise came, and no frame; the device runs at another baud rate or is no linkpose board: check the port, "
-        "or type `linkpose flash`"
+        "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "
+        "the port"
     )

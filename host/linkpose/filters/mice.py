@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
-from linkpose.filters import CannotRun
+from linkpose.errors import CannotRun
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import LONGEST_STEP_S, Floats, ImuCalibration, read_gyro
 from linkpose.filters._vector import Vec

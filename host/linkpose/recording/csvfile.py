@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotWrite, FileError, FileExists
 
 
 def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
@@ -67,10 +67,9 @@ def create(path: Path, force: bool) -> int:
             flags = os.O_WRONLY
         return os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
     except FileExistsError:
-        raise LinkposeError(f"{path} exists already; name another file or add --force to replace it") from None
+        raise FileExists(path) from None
     except OSError as error:
-        reason = error.strerror
-        raise LinkposeError(f"cannot write {path}: {reason}; name a file in a folder you may write to") from error
+        raise CannotWrite(path, error.strerror) from error
 
 
 def write_all(fd: int, path: Path, data: bytes) -> None:
@@ -86,10 +85,11 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
         if written:
             _cut_back(fd, data[:written])
         if error.errno == errno.EPIPE:
-            raise LinkposeError(f"the reader of {path} has gone; nothing more can be written to it") from error
-        raise LinkposeError(
+            raise FileError(path, f"the reader of {path} has gone; nothing more can be written to it") from error
+        raise FileError(
+            path,
             f"cannot write to {path} any more: {error.strerror}; what was written so far is whole, "
-            "make room or name a file on another disk"
+            "make room or name a file on another disk",
         ) from error
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import difflib
 import json
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import FileFormatError
 from linkpose.recording import columns
 from linkpose.recording.table import Table, read_bytes, read_table
 from linkpose.recording.units import suspicions
@@ -45,8 +46,12 @@ class Recording:
         return value if isinstance(value, int) and 0 <= value < len(mpu6050.DLPF_DELAY_S) else None
 
 
-def load_recording(path: Path) -> Recording:
-    """Reads a recording. Raises LinkposeError naming the file, the line and the cure for anything that is none."""
+def load_recording(path: str | PathLike[str]) -> Recording:
+    """Reads a recording: a CSV file, or a raw capture (`.bin`).
+
+    Raises FileError, which names the file, the line and the reason, for anything else.
+    """
+    path = Path(path)
     if path.suffix == ".bin":
         return _from_capture(path)
     return _from_csv(path)
@@ -61,7 +66,7 @@ def _from_csv(path: Path) -> Recording:
     has_imu = all(name in table.columns for name in columns.ACCEL + columns.GYRO)
     if not (has_imu or mouse_ports):
         missing = [name for name in columns.ACCEL + columns.GYRO if name not in table.columns]
-        raise LinkposeError(f"{path} has no column {', '.join(missing)}, and no mice: nothing to estimate from")
+        raise FileFormatError(path, f"{path} has no column {', '.join(missing)}, and no mice: nothing to estimate from")
     measurements = Measurements(
         table.columns["time_s"],
         _vectors(table, columns.ACCEL),
@@ -80,14 +85,14 @@ def _from_csv(path: Path) -> Recording:
 
 
 def _check_columns(table: Table) -> int:
-    """Number of mouse ports; raises LinkposeError for a column that no recording has, or without time_s."""
+    """Number of mouse ports; raises FileFormatError for a column that no recording has, or without time_s."""
     table.require("time_s")
     known = columns.names(columns.MAX_MICE)
     for name in table.columns:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
             hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
-            raise LinkposeError(f"{table.path}: unknown column {name}; {hint}")
+            raise FileFormatError(table.path, f"{table.path}: unknown column {name}; {hint}")
     ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
     for port in ports:
         table.require(*columns.mouse_columns(port))
@@ -123,18 +128,19 @@ def _flags(table: Table) -> NDArray[np.uint16]:
     flags = table.columns["flags"]
     wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFF)))
     if len(wrong):
-        raise LinkposeError(
-            f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 65535"
+        raise FileFormatError(
+            table.path, f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 65535"
         )
     return flags.astype(np.uint16)
 
 
 def _metadata_object(table: Table, name: str) -> dict[str, Any]:
-    """This part of the metadata, empty where there is none; raises LinkposeError where it is no object."""
+    """This part of the metadata, empty where there is none; raises FileFormatError where it is no object."""
     part = table.metadata.get(name, {})
     if not isinstance(part, dict):
-        raise LinkposeError(
-            f"{table.path}, line 2: {name} is {json.dumps(part)[:40]}; it must be a JSON object, or be left out"
+        raise FileFormatError(
+            table.path,
+            f"{table.path}, line 2: {name} is {json.dumps(part)[:40]}; it must be a JSON object, or be left out",
         )
     return part
 
@@ -158,9 +164,9 @@ def _from_capture(path: Path) -> Recording:
     capture = decode_capture(read_bytes(path))
     hellos = [(before, message) for before, message in capture.others if isinstance(message, Hello)]
     if not hellos:
-        raise LinkposeError(f"{path} holds no HELLO of a board; it is no raw capture of `linkpose record --raw`")
+        raise FileFormatError(path, f"{path} holds no HELLO of a board; it is not a raw capture")
     if not len(capture.samples):
-        raise LinkposeError(f"{path} holds no sample; the board was never started")
+        raise FileFormatError(path, f"{path} holds no sample; the board was never started")
     first = [hello for before, hello in hellos if before == 0]
     settings = Settings.of(first[-1] if first else hellos[0][1])
     raw = capture.samples
