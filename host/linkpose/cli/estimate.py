@@ -16,7 +16,7 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -104,6 +104,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
+    if recording.unusable and not request.filter_names:
+        raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with while_compiling(console.say):
         measurements = recording.measurements
@@ -168,7 +170,7 @@ def _live(
             if len(block):
                 estimates = estimator.process(block)
                 sink.write(estimates)
-                view.show(estimates[-1], connected.session.health)
+                view.show(estimates[-1], lambda: connected.health)
 
         ended = live.run_board(connected, duration, handle)
         view.close()
@@ -176,6 +178,7 @@ def _live(
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
         _report_j2s(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        connected.check_usable()
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.wire.messages import SampleFlags
+from linkpose.wire.messages import DeviceState, Hello, SampleFlags
+
+DEVICE_NAMES = ("imu", "imu2", "baro", "mag")  # in the order of HELLO's devices
 
 Codes = NDArray[np.int8]
 Bools = NDArray[np.bool_]
@@ -309,12 +311,21 @@ class _Baro:
         return equal
 
 
+def expected_sensors(hello: Hello, mouse_ports: int) -> dict[str, str]:
+    """The sensors of a board for HealthMonitor: all its devices, and the mouse ports that a recording has."""
+    states = [device.state for device in hello.devices] + [mouse.state for mouse in hello.mice[:mouse_ports]]
+    names = [*DEVICE_NAMES, *(f"mouse{port}" for port in range(1, len(hello.mice) + 1))]
+    words = {DeviceState.ABSENT: "absent", DeviceState.STARTING: "being set up"}
+    return {name: words.get(DeviceState(state), "ok") for name, state in zip(names, states, strict=False)}
+
+
 class HealthMonitor:
     """Checks consecutive blocks of measurements of one board or recording."""
 
     def __init__(self, rate_hz: float, sensors: Mapping[str, str]) -> None:
         """`sensors`: "imu", "imu2", "baro", "mag", "mouse1" ... with "ok", "being set up" or "absent"."""
         self._rate_hz = rate_hz
+        self._samples = 0
         self._absent = [name for name, state in sensors.items() if state == "absent"]
         self.sensors = {
             name: SensorHealth(name, starting=state == "being set up")
@@ -328,6 +339,7 @@ class HealthMonitor:
         """The block with NaN for every invalid value, and the sensors whose state changed."""
         if not len(block):
             return block, []
+        self._samples += len(block)
         changes: list[Change] = []
         flags, time_s = block.flags.astype(np.int64), block.time_s
         if "imu" in self.sensors:
@@ -378,8 +390,7 @@ class HealthMonitor:
     def is_usable(self) -> bool:
         """Whether an inertial sensor or a mouse gave usable data. True before the first sample."""
         kinds = [health for name, health in self.sensors.items() if name.startswith(("imu", "mouse"))]
-        seen = any(health.samples for health in self.sensors.values())
-        return not seen or any(health.is_usable(self._rate_hz) for health in kinds if health.samples)
+        return not self._samples or any(health.is_usable(self._rate_hz) for health in kinds if health.samples)
 
     @property
     def why_unusable(self) -> str:
