@@ -89,8 +89,8 @@ void Link::send_hello() {
   hello.mouse_counts_per_mm = settings.mouse_counts_per_mm;
   hello.i2c_khz = settings.i2c_khz;
   sampler_.describe(hello.devices);
-  memset(hello.baro_words, 0, sizeof hello.baro_words);
-  memcpy(hello.baro_words, sampler_.baro().calibration(), 2 * Bmp180::kCalibrationWords);
+  static_assert(sizeof hello.baro_words == 2 * Barometer::kWords, "all words");
+  memcpy(hello.baro_words, sampler_.baro().calibration(), sizeof hello.baro_words);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
     const bool found = mouse.id() != Ps2Mouse::kNoId;

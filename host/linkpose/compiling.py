@@ -134,13 +134,13 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
 _the_folder = functools.cache(cache_folder)
 
 
-def _decorator(**options: Any) -> Callable[[Function], Function]:
+def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     # Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
     options = {"error_model": "numpy", **options}
 
     def decorate(function: Function) -> Function:
         made: Any = numba.njit(**options)(function)
-        folder = _the_folder()
+        folder = _the_folder() if keep else None
         if folder is not None:
             made._cache = _kept(function, folder)
         return cast(Function, made)
@@ -157,7 +157,7 @@ def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
         _config.CACHE_DIR = asked
 
 
-compiled = _decorator()
-inlined = _decorator(inline="always")
-# Without the wrappers for Python, which take a quarter of the time to compile.
-inner = _decorator(no_cpython_wrapper=True, no_cfunc_wrapper=True)
+compiled = _decorator(True)
+inlined = _decorator(False, inline="always")
+# Without wrappers for Python and without a file of its own: both cost half of the time to compile.
+inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)

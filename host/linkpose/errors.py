@@ -83,7 +83,7 @@ class PortBusy(PortError):
     """Another program has the port open. `holder` names it where the system knows."""
 
     def __init__(self, port: str, holder: str | None = None) -> None:
-        super().__init__(port, f"{port} is in use by {holder or 'another program'}; close it and try again")
+        super().__init__(port, f"{port} is in use by {holder or 'another program'}. Close it and try again")
         self.holder = holder
 
 
@@ -93,7 +93,7 @@ class PermissionDenied(PortError):
     def __init__(self, port: str, group: str) -> None:
         super().__init__(
             port,
-            f"no permission to open {port}; join the group that owns it with `sudo usermod -aG {group} $USER` "
+            f"no permission to open {port}. Join the group that owns it with `sudo usermod -aG {group} $USER` "
             "and log in again",
         )
         self.group = group
@@ -108,9 +108,7 @@ class NoBoardFound(LinkposeError):
     def __init__(self, ports: Sequence[Any], simulated_will_do: bool = True) -> None:
         self.ports, self.simulated_will_do = tuple(ports), simulated_will_do
         listed = describe_ports(self.ports)
-        super().__init__(
-            f"no UNO is connected; the ports there are: {listed}" if ports else "no serial port is connected"
-        )
+        super().__init__(f"no UNO is connected; the ports are: {listed}" if ports else "no serial port is connected")
 
 
 class SeveralBoardsFound(LinkposeError):

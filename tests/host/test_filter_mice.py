@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.mice import redundancy
+from linkpose.experiments.mice import redundancy
 from linkpose.filters.mice import MiceFilter, MiceParameters, fault_limit
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements

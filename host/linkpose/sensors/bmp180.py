@@ -67,6 +67,17 @@ def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int
     return temperature, p + ((x1 + (-7357 * p >> 16) + 3791) >> 4)
 
 
+def is_impossible(ut: NDArray[np.int64], words: Calibration) -> NDArray[np.bool_]:
+    """Where (N,) a temperature reading makes a divisor of `compensate` zero: no BMP180 gives it."""
+    import numpy as np
+
+    x1 = (ut - words.ac6) * words.ac5 >> 15
+    zero = x1 + words.md == 0
+    b6 = x1 + _quotient(words.mc << 11, np.where(zero, 1, x1 + words.md)) - 4000
+    x3 = ((words.ac3 * b6 >> 13) + (words.b1 * (b6 * b6 >> 12) >> 16) + 2) >> 2
+    return np.asarray(zero | (words.ac4 * (x3 + 32768) >> 15 == 0))
+
+
 def _quotient(numerator: int, denominator: Integers) -> Integers:
     """Division that rounds towards zero, as C's does (Python's and NumPy's round down)."""
     sign = (1 - 2 * (denominator < 0)) * (-1 if numerator < 0 else 1)

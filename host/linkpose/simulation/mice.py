@@ -141,6 +141,7 @@ class MiceRun:
         mice = ring(3) if mice is None else mice
         _check(seed, duration_s, rate_hz, len(mice), path, errors, faults, length_m)
         self.seed, self.duration_s, self.rate_hz, self.mice, self.errors = seed, duration_s, rate_hz, mice, errors
+        self.path = path
         self.accel_range_g, self.gyro_range_deg_s, self.faults = accel_range_g, gyro_range_deg_s, faults
         self._mouse_errors = mouse_errors or LEVELS[errors]
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))

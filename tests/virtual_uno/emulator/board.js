@@ -2,11 +2,13 @@
 // An Arduino UNO with a GY-87 on A4/A5 and PS/2 mice on port D: the parts and the wires between them.
 
 const { Bmp180 } = require("./bmp180");
+const { Bmp280 } = require("./bmp280");
 const { CLOCK_HZ, Cpu, RESET_CAUSE } = require("./cpu");
 const { makePorts } = require("./gpio");
 const { I2cBus } = require("./i2c_bus");
 const { readHex } = require("./hex");
 const { Log } = require("./log");
+const { makeMagnetometer } = require("./magnetometer");
 const { Mpu6050 } = require("./mpu6050");
 const { Ps2Host } = require("./ps2host");
 const { Ps2Mouse } = require("./ps2mouse");
@@ -34,12 +36,17 @@ class Board {
    *  @param {object} options
    *  @param {number} options.seed of everything random: SRAM at power-on, faults
    *  @param {object} [options.mpu6050] see Mpu6050
+   *  @param {object} [options.imu2] a second inertial sensor, at 0x69: see Mpu6050
    *  @param {object} [options.bmp180] see Bmp180
+   *  @param {object} [options.bmp280] a BMP280 in place of the BMP180
+   *  @param {string} [options.magnetometer] chip behind the first inertial sensor's auxiliary bus: see magnetometer.js
    *  @param {object[]} [options.mice] see Ps2Mouse; one for each port from the first on
    *  @param {number} [options.bootloaderS] how long the UNO's bootloader waits for a program after a reset from outside;
    *    it clears MCUSR before it starts the one that is there. 0: no bootloader
    *  @param {number} [options.bootAddress] where every reset begins: that of a bootloader which is part of the program */
-  constructor(hex, { seed, mpu6050 = {}, bmp180 = {}, mice = [], bootloaderS = 0, bootAddress = 0 }) {
+  constructor(hex, options) {
+    const { seed, mpu6050 = {}, imu2 = null, bmp180 = {}, bmp280 = null, magnetometer = null } = options;
+    const { mice = [], bootloaderS = 0, bootAddress = 0 } = options;
     const random = seededRandom(seed);
     this.bootloaderCycles = bootloaderS * CLOCK_HZ;
     this.log = new Log();
@@ -56,9 +63,15 @@ class Board {
     this.line.usart = this.usart;
     this.bus = new I2cBus(cpu, this.ports.C, random);
     this.twi = new Twi(cpu, this.bus);
+    const traffic = () => this.bus.traffic;
     this.mpu6050 = new Mpu6050(cpu, mpu6050);
-    this.bmp180 = new Bmp180(cpu, () => this.bus.traffic, random, bmp180);
+    this.bmp180 = bmp280 ? new Bmp280(cpu, traffic, bmp280) : new Bmp180(cpu, traffic, random, bmp180);
     this.bus.slaves.push(this.mpu6050, this.bmp180);
+    if (imu2) this.bus.slaves.push((this.imu2 = new Mpu6050(cpu, { address: 0x69, ...imu2 })));
+    if (magnetometer) {
+      this.magnetometer = makeMagnetometer(magnetometer, cpu, () => this.mpu6050.bypass);
+      this.bus.slaves.push(this.magnetometer);
+    }
     this.mice = mice.map((mouse, index) => {
       const [name, clock, data] = MOUSE_PORTS[index];
       return new Ps2Mouse(cpu, this.ports[name], [clock, data], index + 1, mouse);

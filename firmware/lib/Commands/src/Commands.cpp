@@ -26,7 +26,8 @@ NakReason check(const wire::Configure& c, const Board& board) {
   if (c.dlpf > 6) return NakReason::kDlpfOutOfRange;
   if (c.baro_oversampling > 3) return NakReason::kBaroOversamplingOutOfRange;
   if (!is_one_of(c.mouse_counts_per_mm, 1, 8)) return NakReason::kMouseResolutionOutOfRange;
-  if (c.i2c_khz != 100 && c.i2c_khz != 400) return NakReason::kI2cClockOutOfRange;
+  const bool slow_bus = c.i2c_khz == 100 && c.sample_rate_hz <= kMaxSlowBusHz;
+  if (!slow_bus && c.i2c_khz != 400) return NakReason::kI2cClockOutOfRange;
   if (!line_carries(c.sample_rate_hz, board.sample_size())) return NakReason::kLinkTooSlow;
   return kFine;
 }

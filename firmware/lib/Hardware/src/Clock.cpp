@@ -86,7 +86,7 @@ ISR(TIMER1_COMPA_vect) {
   idle::note_wake();
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
-  twi::start_burst();
+  twi::start_bursts();
   clock::tick_serves_mice = ps2::start_prepared();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
