@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pty_board import PtyBoard
 
+from linkpose.recording.reader import load_recording
+from linkpose.recording.table import read_table
 from linkpose.sensors.health import Cause, Change, HealthMonitor
 from linkpose.sensors.measurements import Measurements
-from linkpose.wire.messages import SampleFlags
+from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.messages import Message, Sample, SampleFlags
 
 RATE_HZ = 100.0
 N = 400
@@ -195,3 +201,62 @@ def test_data_without_a_living_sensor_are_named(imu: object, usable: bool) -> No
     monitor.check(between(0, N, imu))
     assert monitor.is_usable == usable
     assert "no usable data: the IMU" in monitor.why_unusable
+
+
+# ---- from the board and from files ----
+
+
+class FrozenBoard:
+    """Repeats one IMU reading in all samples from the n-th on, to the `last`-th."""
+
+    def __init__(self, first: int, last: int = 1 << 30) -> None:
+        self._first, self._last, self._count = first, last, 0
+        self._decoder = StreamDecoder()
+        self._burst: dict[str, int] = {}
+
+    def __call__(self, data: bytes) -> bytes:
+        return b"".join(encode(self._change(message)) for message in self._decoder.feed(data))
+
+    def _change(self, message: Message) -> Message:
+        if not isinstance(message, Sample):
+            return message
+        self._count += 1
+        if self._count <= self._first or self._count > self._last:
+            return message
+        names = [f"{kind}_{axis}" for kind in ("accel", "gyro") for axis in "xyz"] + ["imu_temp"]
+        self._burst = self._burst or {name: getattr(message, name) for name in names}
+        return message._replace(**self._burst)
+
+
+def test_a_sensor_that_freezes_while_recording_is_reported_and_stored(linkpose, tmp_path) -> None:
+    out = tmp_path / "r.csv"
+    with PtyBoard(tmp_path / "port", spoil=FrozenBoard(30, 90)):
+        result = linkpose("record", out, "--port", tmp_path / "port", "--duration", 1.5, "--json")
+    assert result.status == 0
+    lines = [line for line in result.err.splitlines() if "the IMU" in line]
+    assert re.fullmatch(r"0\.\d\d s: the IMU repeats the same reading\. Unplug the board .*", lines[0])
+    assert re.fullmatch(r"0\.\d\d s: the IMU is back after 0\.\d\d s", lines[1])
+    summary = json.loads(result.out.splitlines()[-1])
+    assert summary["sensors"]["imu"]["invalid"]["frozen"] == pytest.approx(40, abs=2)
+    recording = load_recording(out)
+    assert recording.health["imu"]["invalid"] == summary["sensors"]["imu"]["invalid"]
+    assert any("the IMU repeats the same reading" in remark for remark in recording.remarks)
+    closing = read_table(out, "recording").closing
+    assert closing is not None
+    assert closing["sensors"] == summary["sensors"]
+
+
+def test_a_run_without_usable_data_fails_with_its_cure(linkpose, refused, tmp_path) -> None:
+    out = tmp_path / "r.csv"
+    with PtyBoard(tmp_path / "port", spoil=FrozenBoard(0)):
+        result = linkpose("record", out, "--port", tmp_path / "port", "--duration", 1.2)
+    assert result.status == 1
+    last = result.err.splitlines()[-1]
+    assert last.startswith("linkpose: no usable data: the IMU repeats the same reading. Check the wiring")
+    assert "no usable data: the IMU repeats" in refused("estimate", out)
+
+
+def test_info_shows_the_health_of_each_sensor(linkpose) -> None:
+    report = json.loads(linkpose("info", "--port", "sim://link?speed=20", "--json").out)
+    assert report["health"]["imu"]["state"] == "ok"
+    assert report["health"]["imu2"] == {"state": "absent"}
