@@ -30,13 +30,17 @@ class _Messages(_Stream):
     """Drops what cannot be written."""
 
     def write(self, text: str) -> int:
-        with contextlib.suppress(OSError, ValueError):
+        try:
             return self._stream.write(text)
-        return len(text)
+        except (OSError, ValueError):
+            _discard(self._stream)
+            return len(text)
 
     def flush(self) -> None:
-        with contextlib.suppress(OSError, ValueError):
+        try:
             self._stream.flush()
+        except (OSError, ValueError):
+            _discard(self._stream)
 
 
 class _Results(_Stream):
