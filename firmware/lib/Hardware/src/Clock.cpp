@@ -14,10 +14,11 @@ namespace {
 
 constexpr uint32_t kStepsPerSecond = F_CPU / 8;
 
-// The burst begins this many 0.5 us steps after the tick: longer than another interrupt or a locked section can delay the
-// tick's interrupt, so that all bursts begin at the same distance from their ticks. The longest are the pin changes, 24 us
-// when three clocks fall at once, and 10 us for port 4. A larger value delays every burst; wire::kImuOffsetUs follows it.
-constexpr uint8_t kBurstDelaySteps = 80;
+// The burst begins this many 0.5 us steps after the tick: close to the longest delay by one mouse's pin change
+// (10 us; three at once take 24 us). It must not be longer: interrupts are off until the burst has
+// begun and the time is latched, and a mouse that sends meanwhile holds its clock low for only 30 us. With 24 steps edges
+// of a mouse at 16.6 kHz were missed at 250 Hz and its packets had to be repeated. wire::kImuOffsetUs follows it.
+constexpr uint8_t kBurstDelaySteps = 16;
 static_assert(kBurstDelaySteps / 2 + 1 == wire::kImuOffsetUs, "the schema states the distance");
 
 volatile uint32_t tick_number;
