@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
-from linkpose.device.link import Arrival, Disconnected, Link
+from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import Settings
 from linkpose.sensors.rig import Rig
@@ -95,7 +95,7 @@ class Session:
         self.port = port
         self._notify = notify
         self._capture = capture
-        self._link = Link(port, capture)
+        self._connection = Connection(port, capture)
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
@@ -107,13 +107,13 @@ class Session:
         try:
             self.hello = self._handshake()
         except BaseException:
-            self._link.close()
+            self._connection.close()
             raise
 
     @property
     def rig(self) -> Rig | None:
         """The rig that a simulated board brings along; None of a real one."""
-        return self._link.rig
+        return self._connection.rig
 
     @property
     def settings(self) -> Configure:
@@ -125,22 +125,22 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Disconnected):
-            self._link.send(Stop())
-        self._link.close()
+            self._connection.send(Stop())
+        self._connection.close()
 
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
-        link = self._link
+        connection = self._connection
         heard = bytearray()
         deadline, ask_at = time.monotonic() + HANDSHAKE_TIMEOUT_S, 0.0
         while time.monotonic() < deadline:
             if time.monotonic() >= ask_at:
-                link.send(Stop())
-                link.send(GetInfo())
+                connection.send(Stop())
+                connection.send(GetInfo())
                 ask_at = time.monotonic() + ASK_INTERVAL_S
-            arrival = link.receive(0.05)
+            arrival = connection.receive(0.05)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
@@ -149,9 +149,9 @@ class Session:
                     raise WrongBoard(_other_protocol(message))
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
-                    link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
-        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
+        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), connection.decoder.corrupt)}")
 
     def _check_versions(self, hello: Hello) -> None:
         """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
@@ -170,7 +170,7 @@ class Session:
         """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
         self._command(settings, Command.CONFIGURE)
         time.sleep(SETTLE_S)
-        self._link.send(GetInfo())
+        self._connection.send(GetInfo())
         self.hello = self._await(Hello, "GET_INFO")
         return self.hello
 
@@ -179,7 +179,7 @@ class Session:
         deadline = time.monotonic() + MICE_TIMEOUT_S
         while Settings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
             time.sleep(ASK_INTERVAL_S)
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
     def self_test(self) -> SelfTestResult:
@@ -193,7 +193,7 @@ class Session:
         A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
         """
         for _ in range(ATTEMPTS):
-            self._link.send(message)
+            self._connection.send(message)
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for at, answer in enumerate(arrival.messages):
                     if isinstance(answer, Nak) and answer.command == command:
@@ -223,7 +223,7 @@ class Session:
         """What arrives within a time."""
         deadline = time.monotonic() + timeout_s
         while (left := deadline - time.monotonic()) > 0:
-            arrival = self._link.receive(left)
+            arrival = self._connection.receive(left)
             if arrival is not None:
                 yield arrival
 
@@ -231,7 +231,7 @@ class Session:
 
     def _ping(self) -> None:
         self._token = (self._token + 1) % (1 << 32)
-        self._pings = {self._token: self._link.send(Ping(self._token))}
+        self._pings = {self._token: self._connection.send(Ping(self._token))}
 
     def _hear_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
@@ -283,7 +283,7 @@ class Session:
         self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._link.receive(0.1), None
+        arrival, self._started = self._started or self._connection.receive(0.1), None
         now = time.monotonic()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
@@ -308,7 +308,7 @@ class Session:
             if self._asked_at <= self._heard_at:
                 self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
             self._asked_at = now
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
 
     def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
         if isinstance(message, Pong):
@@ -334,14 +334,14 @@ class Session:
 
     def _reconnect(self) -> Iterator[None]:
         """Waits until the board can be opened again and streams; yields while it waits. Raises WrongBoard."""
-        self._link.close()
-        for part, count in self._link.decoder.corrupt.as_dict().items():
+        self._connection.close()
+        for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
         while True:
             time.sleep(RETRY_INTERVAL_S)
             yield
             try:
-                self._link = Link(self.port, self._capture)
+                self._connection = Connection(self.port, self._capture)
             except LinkposeError:
                 continue
             try:
@@ -349,7 +349,7 @@ class Session:
             except WrongBoard:
                 raise
             except (Disconnected, LinkposeError):
-                self._link.close()
+                self._connection.close()
                 continue
             self._notify(f"the board is back at {self.port}; going on, the gap is marked")
             return
@@ -359,7 +359,7 @@ class Session:
     def health(self) -> Health:
         """Counts so far."""
         timeline = self.timeline
-        now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
+        now, before = self._connection.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
         duration = timeline.duration_s
         return Health(
             samples=timeline.samples,
