@@ -104,7 +104,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
         first._link.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
-            seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]
+            seqs = [n for block in second.stream(0.3) for n in block.seq.tolist()]
     assert seqs == list(range(30))
 
 
@@ -116,8 +116,8 @@ def record_through(port: Path, out: Path, duration: float, *happenings) -> tuple
     said: list[str] = []
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
         waiting = list(happenings)
-        for placements in session.stream(duration):
-            recorder.take(placements)
+        for block in session.stream(duration):
+            recorder.take(block)
             if waiting and session.timeline.duration_s >= waiting[0][0]:
                 waiting.pop(0)[1]()
         recorder.close("duration")
@@ -183,7 +183,7 @@ def test_an_ack_of_start_that_is_lost_costs_no_sample(tmp_path):
     start_ack = encode(Ack(Command.START))
     port = tmp_path / "port"
     with PtyBoard(port, spoil=lambda data: data.replace(start_ack, b"")), Session(str(port), print) as session:
-        seqs = [p.place.seq for placements in session.stream(0.3) for p in placements]
+        seqs = [n for block in session.stream(0.3) for n in block.seq.tolist()]
     assert seqs == list(range(30))
 
 
@@ -211,8 +211,8 @@ def test_corrupt_bytes_are_counted_and_lost_samples_too(tmp_path, linkpose):
 def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_path):
     with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
         seqs = []
-        for placements in session.stream(1.5):
+        for block in session.stream(1.5):
             if not seqs:
                 time.sleep(1.0)  # a slow disk
-            seqs += [p.place.seq for p in placements]
+            seqs += block.seq.tolist()
     assert seqs == list(range(150))

@@ -122,8 +122,8 @@ def test_another_firmware_in_the_middle_of_a_recording_ends_it(
         pytest.raises(WrongBoard, match=named),
         Recorder(session, out, Rig(), False) as recorder,
     ):
-        for placements in session.stream(5.0):
-            recorder.take(placements)
+        for block in session.stream(5.0):
+            recorder.take(block)
             if session.timeline.samples >= 20 and not firmware.begun:
                 firmware.begin()
                 exchange(board)

@@ -20,8 +20,8 @@ from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
-    from linkpose.device.session import Placement
     from linkpose.estimation import EstimateWriter, Estimator
+    from linkpose.sensors.measurements import Block
 
 WORST_STD_M = 0.03  # of a J2S that the motion has told
 
@@ -144,8 +144,7 @@ def _live(
     from linkpose.cli.view import View
     from linkpose.device.ports import choose_port
     from linkpose.device.session import Session
-    from linkpose.sensors.conversion import Settings
-    from linkpose.sensors.measurements import Measurements
+    from linkpose.sensors.conversion import BoardSettings
     from linkpose.wire.messages import Sensors
 
     with contextlib.ExitStack() as stack:
@@ -157,7 +156,7 @@ def _live(
         with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            settings, sensors = Settings.of(session.hello), Sensors(session.hello.sensors)
+            settings, sensors = BoardSettings.of(session.hello), Sensors(session.hello.sensors)
             used = rig.with_delay_of(settings.dlpf)
             estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
             _check(estimator, request, console)
@@ -167,14 +166,14 @@ def _live(
         sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress))
 
-        def handle(placements: list[Placement]) -> None:
-            rows = recorder.take(placements)
-            if rows:
-                estimates = estimator.process(Measurements.of(rows))
+        def handle(block: Block) -> None:
+            measurements = recorder.take(block)
+            if len(measurements):
+                estimates = estimator.process(measurements)
                 sink.write(estimates)
                 view.show(estimates[-1], session.health)
 
-        ended = live.run(session, duration, handle)
+        ended = live.run(session, duration, len(rig.mouse), handle)
         view.close()
         recorder.close(ended)
         health = session.health()

@@ -29,7 +29,7 @@ def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, 
     console = live.Console(quiet, verbose)
     with Session(port or choose_port(), console.say) as session:
         tested = _self_test(session) if self_test else {}
-        live.run(session, OBSERVED_S, lambda _: console.progress(lambda: "observing the link ..."))
+        live.run(session, OBSERVED_S, 0, lambda _: console.progress(lambda: "observing the link ..."))
         report = _report(session, session.health()) | tested
     if json_lines:
         click.echo(json.dumps(report))

@@ -15,11 +15,12 @@ from typing import Any, BinaryIO
 
 import click
 
-from linkpose.device.session import Health, Placement, Session
+from linkpose.device.session import Health, Session
 from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, metadata
-from linkpose.sensors.conversion import Converter, Row, Settings
+from linkpose.sensors.conversion import BoardSettings
+from linkpose.sensors.measurements import Block, Measurements
 from linkpose.sensors.rig import Rig
 
 PROGRESS_INTERVAL_S = 0.2
@@ -61,25 +62,22 @@ class Console:
 
 
 class Recorder:
-    """Turns a session's samples into rows, and writes them where a recording is asked for."""
+    """Writes a session's blocks where a recording is asked for."""
 
     def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool) -> None:
         self._session = session
-        settings = Settings.of(session.hello)
-        mouse_ports = max(settings.mouse_ports, len(rig.mouse))
-        self._converter = Converter(settings, mouse_ports)
         self._writer: RecordingWriter | None = None
         if path is not None:
+            settings = BoardSettings.of(session.hello)
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
             head = metadata(session.hello, settings, session.port, rig, clock)
-            self._writer = RecordingWriter(path, head, mouse_ports, force)
+            self._writer = RecordingWriter(path, head, max(settings.mouse_ports, len(rig.mouse)), force)
 
-    def take(self, placements: list[Placement]) -> list[Row]:
-        """The samples as rows, which are on their way to the disk."""
-        rows = [self._converter.row(sample, *place) for sample, place in placements]
-        if self._writer is not None and rows:
-            self._writer.write_rows(rows)
-        return rows
+    def take(self, block: Block) -> Measurements:
+        """Writes the block; its measurements."""
+        if self._writer is not None and len(block.seq):
+            self._writer.write_block(block)
+        return block.measurements
 
     def close(self, ended: str) -> None:
         """Writes the closing line: "duration", "interrupted" or "failure"."""
@@ -100,12 +98,12 @@ class Recorder:
             self.close("failure")
 
 
-def run(session: Session, duration_s: float | None, handle: Callable[[list[Placement]], None]) -> str:
-    """Hands the stream's samples to `handle` until the time is over or the user ends it; which of the two it was."""
+def run(session: Session, duration_s: float | None, mouse_ports: int, handle: Callable[[Block], None]) -> str:
+    """Hands the stream's blocks to `handle` until the time is over or the user ends it; which of the two it was."""
     with ending_well():
         try:
-            for placements in session.stream(duration_s):
-                handle(placements)
+            for block in session.stream(duration_s, mouse_ports):
+                handle(block)
         except KeyboardInterrupt:
             return "interrupted"
     return "duration"

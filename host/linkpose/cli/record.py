@@ -36,7 +36,8 @@ def command(
     """Record the sensors into OUT, a CSV file. Without OUT the file is named by date and time. Ctrl-C ends it well."""
     from linkpose.cli import live
     from linkpose.device.ports import choose_port
-    from linkpose.device.session import Placement, Session
+    from linkpose.device.session import Session
+    from linkpose.sensors.measurements import Block
 
     path = out or Path(f"linkpose-{datetime.datetime.now():%Y%m%d-%H%M%S}.csv")
     live.refuse_same_file(path, raw)
@@ -49,9 +50,9 @@ def command(
         with live.Recorder(session, path, rig, force) as recorder:
             console.say(f"recording to {path}" + ("" if duration else ", Ctrl-C ends"))
 
-            def handle(placements: list[Placement]) -> None:
-                recorder.take(placements)
+            def handle(block: Block) -> None:
+                recorder.take(block)
                 console.progress(lambda: live.health_line(session.health()))
 
-            recorder.close(live.run(session, duration, handle))
+            recorder.close(live.run(session, duration, len(rig.mouse), handle))
         live.show_summary(console, session.health(), json_lines, f": {path}")

@@ -8,14 +8,15 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import BinaryIO, TypeVar
 
 from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.errors import LinkposeError
-from linkpose.sensors.conversion import Settings
+from linkpose.sensors.conversion import BoardSettings, Converter, Placed
+from linkpose.sensors.measurements import Block
 from linkpose.sensors.rig import Rig
-from linkpose.sensors.timeline import Gap, Placed, Timeline
+from linkpose.sensors.timeline import Gap, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
@@ -61,13 +62,6 @@ Notify = Callable[[str], None]
 
 class WrongBoard(LinkposeError):
     """A board that cannot be gone on with, however long it is waited for."""
-
-
-class Placement(NamedTuple):
-    """A sample and its place in time."""
-
-    sample: Sample
-    place: Placed
 
 
 @dataclass(slots=True)
@@ -177,7 +171,7 @@ class Session:
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
         deadline = time.monotonic() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
+        while BoardSettings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
@@ -253,25 +247,29 @@ class Session:
 
     # ---- streaming ----
 
-    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
-        """Samples as they arrive, in lists of those that came together, for `duration_s` of the board's time.
+    def stream(self, duration_s: float | None = None, mouse_ports: int = 0) -> Iterator[Block]:
+        """Samples as they arrive, in blocks of those that arrived together, for `duration_s` of the board's time.
 
-        A list may be empty: the caller gets its turn several times a second even when nothing arrives. A board that
-        was reset or unplugged is waited for, and goes on in the same timeline with the gap marked.
+        The blocks have room for `mouse_ports` mice, or for those found if they are more. A block may be empty: the
+        caller regains control several times a second even if nothing arrives. If the board is reset or unplugged, the
+        stream waits for it and continues in the same timeline with the gap marked.
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
+        settings = BoardSettings.of(self.hello)
+        converter = Converter(settings, max(settings.mouse_ports, mouse_ports))
+        nothing = converter.convert_placed((), ())
         self._begin()
         while True:
             try:
-                placements = self._next(timeline)
+                samples, places = self._next(timeline)
             except Disconnected as error:
                 self._notify(f"{self.port} is gone ({error.reason}); waiting for the board to come back, Ctrl-C ends")
                 timeline.interrupted("cable")
-                yield []
+                yield nothing
                 for _ in self._reconnect():
-                    yield []
+                    yield nothing
                 continue
-            yield placements
+            yield converter.convert_placed(samples, places) if samples else nothing
             if timeline.is_over:
                 return
 
@@ -282,7 +280,8 @@ class Session:
         self._started = self._command(Start(), Command.START)
         self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
 
-    def _next(self, timeline: Timeline) -> list[Placement]:
+    def _next(self, timeline: Timeline) -> tuple[list[Sample], list[Placed]]:
+        """The samples that arrived next, and their places."""
         arrival, self._started = self._started or self._connection.receive(0.1), None
         now = time.monotonic()
         if now - self._pinged_at >= PING_INTERVAL_S:
@@ -290,17 +289,18 @@ class Session:
             self._ping()
         if arrival is None:
             self._ask_when_silent(now)
-            return []
-        placements = []
+            return [], []
+        samples, places = [], []
         for message in arrival.messages:
             if isinstance(message, Sample):
                 self._heard_at = now
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
-                    placements.append(Placement(message, place))
+                    samples.append(message)
+                    places.append(place)
             else:
                 self._hear(message, arrival, timeline)
-        return placements
+        return samples, places
 
     def _ask_when_silent(self, now: float) -> None:
         """A board that fell silent may have been reset while its HELLO was lost: ask who is there."""
@@ -326,7 +326,7 @@ class Session:
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
+        if BoardSettings.of(before).bmp180 != BoardSettings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
             raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))

@@ -6,7 +6,7 @@ import difflib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,23 @@ from linkpose.errors import LinkposeError
 from linkpose.recording import columns
 from linkpose.recording.table import Table, read_bytes, read_table
 from linkpose.recording.units import suspicions
-from linkpose.sensors import bmp180, mpu6050
-from linkpose.sensors.conversion import GAP_BEFORE, MOUSE_VALID, TIME_DECIMALS, Settings
+from linkpose.sensors import mpu6050
+from linkpose.sensors.conversion import (
+    COUNT_FIELDS,
+    GAP_BEFORE,
+    MAX_MICE,
+    TIME_DECIMALS,
+    BoardSettings,
+    Converter,
+    RawSamples,
+)
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
 from linkpose.wire.messages import Hello, SampleFlags
+
+if TYPE_CHECKING:
+    from linkpose.wire.capture import Capture
 
 _T_WRAP = 1 << 32
 _SEQ_WRAP = 1 << 16
@@ -82,13 +93,13 @@ def _from_csv(path: Path) -> Recording:
 def _check_columns(table: Table) -> int:
     """Number of mouse ports; raises LinkposeError for a column that no recording has, or without time_s."""
     table.require("time_s")
-    known = columns.names(columns.MAX_MICE)
+    known = columns.names(MAX_MICE)
     for name in table.columns:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
             hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
             raise LinkposeError(f"{table.path}: unknown column {name}; {hint}")
-    ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
+    ports = [p for p in range(1, MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
     for port in ports:
         table.require(*columns.mouse_columns(port))
     return max(ports, default=0)
@@ -162,12 +173,13 @@ def _from_capture(path: Path) -> Recording:
     if not len(capture.samples):
         raise LinkposeError(f"{path} holds no sample; the board was never started")
     first = [hello for before, hello in hellos if before == 0]
-    settings = Settings.of(first[-1] if first else hellos[0][1])
+    settings = BoardSettings.of(first[-1] if first else hellos[0][1])
     raw = capture.samples
     restarts = sorted({before for before, hello in hellos if 0 < before < len(raw) and not hello.streaming})
     time_s, gap_before, gaps = _times(raw, restarts, settings.sample_rate_hz)
     flags = (raw["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
-    measurements = _measurements(raw, capture.mouse_count, time_s, flags, settings)
+    counts = _raw_samples(capture)
+    measurements = Converter(settings, counts.mice.shape[1]).convert(counts, time_s, flags)
     remarks = [f"{path}: times are the board's own, for a raw capture holds no other clock"]
     if capture.corrupt.total:
         remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
@@ -197,50 +209,13 @@ def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[
     return time_s, np.where(marked, GAP_BEFORE, 0), gaps
 
 
-def _measurements(
-    raw: NDArray[np.void], mouse_count: NDArray[np.uint8], time_s: Floats, flags: NDArray[np.int64], settings: Settings
-) -> Measurements:
-    """The same values, to the last bit, as `Converter` gives one by one."""
-    valid = (flags & int(SampleFlags.IMU_VALID) != 0)[:, None]
-    accel = np.column_stack([raw[name] for name in ("accel_x", "accel_y", "accel_z")]).astype(np.float64)
-    gyro = np.column_stack([raw[name] for name in ("gyro_x", "gyro_y", "gyro_z")]).astype(np.float64)
-    accel = np.round(accel * mpu6050.accel_scale(settings.accel_range_g), mpu6050.ACCEL_DECIMALS)
-    gyro = np.round(gyro * mpu6050.gyro_scale(settings.gyro_range_deg_s), mpu6050.GYRO_DECIMALS)
-    temp = np.round(mpu6050.temperature(raw["imu_temp"].astype(np.float64)), mpu6050.TEMPERATURE_DECIMALS)
-    pressure, baro_temp, fresh = _baro(raw, flags, settings)
-    ports = int(mouse_count.max(initial=0))
-    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports].astype(np.float64)
-    mouse_valid = (flags[:, None] & np.array(MOUSE_VALID)[:ports] != 0) & (np.arange(ports) < mouse_count[:, None])
-    return Measurements(
-        time_s,
-        np.where(valid, accel, np.nan),
-        np.where(valid, gyro, np.nan),
-        np.where(valid[:, 0], temp, np.nan),
-        pressure,
-        baro_temp,
-        fresh,
-        np.where(mouse_valid[:, :, None], mice, np.nan),
-        flags.astype(np.uint16),
-    )
-
-
-def _baro(
-    raw: NDArray[np.void], flags: NDArray[np.int64], settings: Settings
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Pressure and temperature, each reading repeated until the next; where a new one came."""
-    valid = flags & int(SampleFlags.BARO_VALID) != 0
-    if not bmp180.is_sound(settings.bmp180):
-        nothing = np.full(len(raw), np.nan)
-        return nothing, nothing, np.zeros(len(raw), np.bool_)
-    count = raw["baro_count"].astype(np.int64)
-    again = np.concatenate([[True], ~valid[:-1]])  # the first reading, or the first after the sensor was away
-    fresh = valid & (again | (np.diff(count, prepend=-1) != 0))
-    ut, up = raw["baro_ut"].astype(np.int64), raw["baro_up"].astype(np.int64)
-    with np.errstate(divide="ignore"):
-        temp, pressure = bmp180.compensate(ut, up, settings.bmp180, settings.baro_oversampling)
-    latest = np.maximum.accumulate(np.where(fresh, np.arange(len(raw)), 0))
-    return (
-        np.where(valid, pressure[latest].astype(np.float64), np.nan),
-        np.where(valid, temp[latest] / 10, np.nan),
-        fresh,
+def _raw_samples(capture: Capture) -> RawSamples:
+    """The capture's samples, with the mouse ports that any of them carries."""
+    raw = capture.samples
+    ports = int(capture.mouse_count.max(initial=0))
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports]
+    return RawSamples(
+        np.stack([raw[name].astype(np.int64) for name in COUNT_FIELDS], axis=1),
+        mice.astype(np.int64),
+        capture.mouse_count.astype(np.int64),
     )

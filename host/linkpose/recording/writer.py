@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,15 @@ from typing import Any
 from linkpose import __version__
 from linkpose.recording import columns
 from linkpose.recording.csvfile import CsvFile
-from linkpose.sensors.conversion import Converter, Row, Settings
+from linkpose.sensors.conversion import BoardSettings, Converter
+from linkpose.sensors.measurements import Block
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.wire.frames import Corrupt
 from linkpose.wire.messages import Hello, Sample, Sensors
 
 
-def metadata(hello: Hello, settings: Settings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
+def metadata(hello: Hello, settings: BoardSettings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
     """The second line of a recording, from which everything in it can be understood."""
     return {
         "software": f"linkpose {__version__}",
@@ -60,6 +62,7 @@ def closing(timeline: Timeline, corrupt: Corrupt, drift_ppm: float | None, **mor
     }
 
 
+_BATCH = 4096  # samples converted at once; bounds the memory
 MOST_GAPS = 1000  # listed in the closing line; the rows mark every one
 
 
@@ -69,20 +72,24 @@ class RecordingWriter(CsvFile):
     def __init__(self, path: Path, head: dict[str, Any], mouse_ports: int, force: bool) -> None:
         super().__init__(path, "recording", head, columns.names(mouse_ports), force)
 
-    def write_rows(self, rows: Iterable[Row]) -> None:
+    def write_block(self, block: Block) -> None:
         """Adds samples."""
-        self.write("".join(columns.text(row) + "\n" for row in rows))
+        self.write(columns.text(block))
 
 
 def write_recording(
     path: Path, hello: Hello, samples: Iterable[Sample], device: str, rig: Rig, force: bool
 ) -> Timeline:
     """Writes samples that are all there already, in the board's own time; their timeline."""
-    settings = Settings.of(hello)
+    settings = BoardSettings.of(hello)
     converter, timeline, clock = Converter(settings), Timeline(settings.sample_rate_hz), BoardClock()
     head = metadata(hello, settings, device, rig, {"source": "board", "drift_ppm": None})
+    remaining = iter(samples)
     with RecordingWriter(path, head, settings.mouse_ports, force) as writer:
-        places = ((sample, timeline.place(sample, clock, 0.0)) for sample in samples)
-        writer.write_rows(converter.row(sample, *place) for sample, place in places if place is not None)
+        while batch := list(itertools.islice(remaining, _BATCH)):
+            places = ((sample, timeline.place(sample, clock, 0.0)) for sample in batch)
+            placed = [(sample, place) for sample, place in places if place is not None]
+            if placed:
+                writer.write_block(converter.convert_placed(*zip(*placed, strict=True)))
         writer.close(closing(timeline, Corrupt(), None))
     return timeline

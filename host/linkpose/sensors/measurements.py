@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-from linkpose.sensors.conversion import Row
 
 Floats = NDArray[np.float64]
 
@@ -37,19 +35,9 @@ class Measurements:
         """The samples of a slice, as views."""
         return Measurements(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    @staticmethod
-    def of(rows: Sequence[Row]) -> Measurements:
-        """The samples of some rows."""
-        imu = np.array([row.imu for row in rows]).reshape(-1, 7)
-        mice = np.array([row.mice for row in rows], dtype=np.float64)
-        return Measurements(
-            np.array([row.time_s for row in rows]),
-            np.ascontiguousarray(imu[:, :3]),
-            np.ascontiguousarray(imu[:, 3:6]),
-            np.ascontiguousarray(imu[:, 6]),
-            np.array([row.pressure_Pa for row in rows]),
-            np.array([row.baro_temp_degC for row in rows]),
-            np.array([row.baro_fresh for row in rows], dtype=np.bool_),
-            mice.reshape(len(rows), mice.size // (2 * len(rows)) if rows else 0, 2),
-            np.array([row.flags for row in rows], dtype=np.uint16),
-        )
+
+class Block(NamedTuple):
+    """Consecutive measurements together with their tick numbers."""
+
+    seq: NDArray[np.int64]  # (N,) ticks since START, without wraps; a lost sample leaves a gap
+    measurements: Measurements

@@ -3,15 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
 
 from linkpose.wire.messages import SCALES, SelfTestResult
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Number = TypeVar("Number", float, NDArray[np.float64])
 
 STANDARD_GRAVITY = 9.80665  # m/s² per g, by definition
 
@@ -29,12 +22,6 @@ def accel_scale(accel_range_g: int) -> float:
 def gyro_scale(gyro_range_deg_s: int) -> float:
     """rad/s per count at a full-scale range in deg/s."""
     return math.radians(SCALES["SAMPLE.gyro_x"].scale * gyro_range_deg_s)
-
-
-def temperature(count: Number) -> Number:
-    """Die temperature in degC of a count, or of an array of them (register map, 4.18)."""
-    scale = SCALES["SAMPLE.imu_temp"]
-    return count * scale.scale + scale.offset
 
 
 # Of the readings through the low-pass filter at DLPF_CFG 0 to 6, by the slower of the two sensors; the other comes a

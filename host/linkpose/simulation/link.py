@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig, Vector
@@ -228,7 +228,7 @@ class LinkRun:
 
     def measurements(self) -> Measurements:
         """The whole run as a recording of it would be read. Only of a run that ends."""
-        settings = Settings(
+        settings = BoardSettings(
             round(self.rate_hz),
             self.accel_range_g,
             self.gyro_range_deg_s,
@@ -240,9 +240,10 @@ class LinkRun:
         if self.count is None:
             raise LinkposeError("a run without an end has no whole recording: give it a duration")
         converter = Converter(settings)
-        return Measurements.of(
-            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
-        )
+        samples = list(self.samples())
+        raw = RawSamples.of(samples, converter.mouse_ports)
+        flags = np.array([sample.flags for sample in samples], dtype=np.int64)
+        return converter.convert(raw, np.arange(len(samples)) / self.rate_hz, flags)
 
     def _baro_of(self, tick: Integers, pressures: Integers) -> tuple[Integers, Integers]:
         """UT and UP that the SAMPLEs of these ticks carry: the last ones read."""
