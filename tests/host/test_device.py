@@ -101,7 +101,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     with PtyBoard(tmp_path / "port"):
         first = Session(str(tmp_path / "port"), print)
         next(iter(first.stream()))
-        first._link.close()  # as a killed program leaves it: no STOP
+        first._connection.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
             seqs = [n for block in second.stream(0.3) for n in block.seq.tolist()]

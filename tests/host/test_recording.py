@@ -421,9 +421,8 @@ def test_the_converter_forgets_a_barometer_that_went_away():
         parts = [
             converter.convert_placed([base] * n, places[end - n : end]) for n, end in zip(blocks, ends, strict=True)
         ]
-        assert [b.pressure_Pa.tolist() for b in [joined(parts)]] == [
-            [69964.0, 69964.0, pytest.approx(np.nan, nan_ok=True), 69964.0]
-        ]
+        expected = [69964.0, 69964.0, np.nan, 69964.0]
+        assert np.array_equal(joined(parts).pressure_Pa, expected, equal_nan=True)
         assert joined(parts).baro_fresh.tolist() == [True, False, False, True]
 
 

@@ -113,7 +113,7 @@ class Converter:
         self._baro = np.full((1, 2), np.nan)  # last pressure (Pa) and temperature (degC)
 
     def convert(self, raw: RawSamples, time_s: Floats, flags: Integers) -> Measurements:
-        """The samples taken at `time_s` (N,), s since the start, in SI units; `flags` (N,) as a recording stores them."""
+        """The samples at `time_s` (N,), s since the start, in SI units; `flags` (N,) as a recording stores them."""
         imu = np.rint((raw.counts[:, _IMU] * self._imu_scale + self._imu_offset) * _IMU_STEPS) / _IMU_STEPS
         imu[flags & IMU_VALID == 0] = np.nan
         baro, fresh = self._convert_baro(raw.counts[:, _BARO], flags)
