@@ -13,6 +13,7 @@ namespace {
 // HELLO goes out at boot when all sensors are set up or found absent, and after this time at the latest.
 constexpr uint32_t kGreetUs = 300000;
 constexpr uint32_t kStatusUs = 1000000;
+constexpr uint16_t kNotHung = 0xFFFF;
 
 // Which firmware this is. It stands in the flash as it goes out in HELLO, behind a mark that `linkpose flash` looks for in
 // a .hex before it writes it. The members are the first of wire::Hello.
@@ -74,25 +75,27 @@ void Link::greet() {
 
 void Link::send_hello() {
   const wire::Configure& settings = sampler_.settings();
-  const uint16_t* const words = sampler_.baro().calibration();
   wire::Hello hello;
   memcpy_P(&hello, &kIdentity.protocol_major, kIdentityInHello);
   hello.reset_cause = board::reset_cause();
+  hello.hung_at = kNotHung;
   hello.streaming = sampler_.streaming();
+  hello.sections = sampler_.sections();
   hello.sample_rate_hz = settings.sample_rate_hz;
-  hello.sensors = (sampler_.imu().present() ? wire::sensors::kMpu6050 : 0) |
-                  (sampler_.baro().present() ? wire::sensors::kBmp180 : 0);
-  hello.imu_id = sampler_.imu().id();
   hello.accel_range_g = settings.accel_range_g;
   hello.gyro_range_deg_s = settings.gyro_range_deg_s;
   hello.dlpf = settings.dlpf;
   hello.baro_oversampling = settings.baro_oversampling;
-  static_assert(sizeof(wire::Hello) - sizeof hello.mice - offsetof(wire::Hello, ac1) == 2 * Bmp180::kCalibrationWords,
-                "AC1 to MD stand side by side");
-  memcpy(&hello.ac1, words, 2 * Bmp180::kCalibrationWords);
+  hello.mouse_counts_per_mm = settings.mouse_counts_per_mm;
+  hello.i2c_khz = settings.i2c_khz;
+  sampler_.describe(hello.devices);
+  memset(hello.baro_words, 0, sizeof hello.baro_words);
+  memcpy(hello.baro_words, sampler_.baro().calibration(), 2 * Bmp180::kCalibrationWords);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    hello.mice[i] = {mouse.id(), mouse.counts_per_mm(), mouse.report_rate_hz()};
+    const bool found = mouse.id() != Ps2Mouse::kNoId;
+    const wire::DeviceState state = found ? wire::DeviceState::kOk : wire::DeviceState::kAbsent;
+    hello.mice[i] = {static_cast<uint8_t>(state), mouse.id(), 0, mouse.counts_per_mm(), mouse.report_rate_hz(), 0};
   }
   uart::put(wire::Hello::kType, &hello, wire::Hello::size(Mice::kPorts));
 }
@@ -116,14 +119,14 @@ void Link::send_status() {
   status.rx_overruns = uart::overruns();
   status.i2c_errors = twi::errors();
   status.i2c_recoveries = twi::recoveries();
-  status.imu_restarts = sampler_.imu().restarts();
-  status.baro_restarts = sampler_.baro().restarts();
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
   status.cpu_load = static_cast<uint16_t>(awake_us / (elapsed_us / 1000));
+  status.vcc_mv = 0;
+  sampler_.count(status.devices);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets()};
+    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets(), 0};
   }
   uart::put(wire::Status::kType, &status, wire::Status::size(Mice::kPorts));
 }

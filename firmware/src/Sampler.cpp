@@ -13,6 +13,15 @@ Mpu6050::Settings imu_settings(const wire::Configure& settings) {
 // The SAMPLE does not wait longer for the requests of a tick than this: at 500 Hz a tick is 2 ms.
 constexpr uint32_t kSampleDeadlineUs = 1500;
 
+// The number of mice in `sections` counts in these steps.
+constexpr uint8_t kOneMouse = 0x10;
+
+template <typename Part>
+uint8_t* append(uint8_t* end, const Part& part) {
+  memcpy(end, &part, sizeof part);
+  return end + sizeof part;
+}
+
 // A conversion begins at the end of its request, and after a tick not before this.
 constexpr uint32_t kConversionRequestUs = 120;
 constexpr uint32_t kConversionsBeginUs = 1000;
@@ -118,46 +127,85 @@ void Sampler::finish_request(bool ok) {
   }
 }
 
+uint8_t Sampler::sections() const {
+  uint8_t bits = static_cast<uint8_t>(mice_.in_sample() * kOneMouse);
+  if (imu_.ever_found()) bits |= wire::sections::kImu;
+  if (baro_.ever_found()) bits |= wire::sections::kBaro;
+  return bits;
+}
+
+uint8_t Sampler::sample_size() const {
+  const uint8_t bits = sections();
+  uint8_t size = sizeof(wire::Sample) + bits / kOneMouse * sizeof(wire::Sample::Mouse);
+  if (bits & wire::sections::kImu) size += sizeof(wire::Sample::Imu);
+  if (bits & wire::sections::kBaro) size += sizeof(wire::Sample::Baro);
+  return size;
+}
+
+void Sampler::describe(wire::Hello::Device* devices) const {
+  using wire::DeviceFamily;
+  using wire::DeviceKind;
+  using wire::DeviceState;
+  const DeviceState imu = imu_.present() ? DeviceState::kOk : DeviceState::kAbsent;
+  const DeviceState baro = baro_.present() ? DeviceState::kOk : DeviceState::kAbsent;
+  const auto family = [](bool found, DeviceFamily known) {
+    return static_cast<uint8_t>(found ? known : DeviceFamily::kNone);
+  };
+  const uint8_t kImu = static_cast<uint8_t>(DeviceKind::kImu);
+  const auto value = [](DeviceState state) { return static_cast<uint8_t>(state); };
+  devices[0] = {kImu, 0x68, imu_.id(), family(imu_.present(), DeviceFamily::kMpu6050), value(imu)};
+  devices[1] = {kImu, 0x69, 0, 0, value(DeviceState::kAbsent)};
+  devices[2] = {static_cast<uint8_t>(DeviceKind::kBarometer), Bmp180::kAddress,
+                baro_.present() ? Bmp180::kId : uint8_t{0}, family(baro_.present(), DeviceFamily::kBmp180), value(baro)};
+  devices[3] = {static_cast<uint8_t>(DeviceKind::kMagnetometer), 0, 0, 0, value(DeviceState::kAbsent)};
+}
+
+void Sampler::count(wire::Status::Device* devices) const {
+  memset(devices, 0, wire::Status::kMaxDevices * sizeof *devices);
+  devices[0].restarts = imu_.restarts();
+  devices[2].restarts = baro_.restarts();
+}
+
 void Sampler::send_sample() {
   namespace flag = wire::sample_flags;
-  wire::Sample sample;
-  sample.seq = static_cast<uint16_t>(tick_.number - first_tick_);
-  sample.t_us = tick_.t_us;
-  sample.accel_x = reading_.accel[0];
-  sample.accel_y = reading_.accel[1];
-  sample.accel_z = reading_.accel[2];
-  sample.imu_temp = reading_.temperature;
-  sample.gyro_x = reading_.gyro[0];
-  sample.gyro_y = reading_.gyro[1];
-  sample.gyro_z = reading_.gyro[2];
-  sample.baro_ut = baro_.temperature();
-  sample.baro_up = baro_.pressure();
-  sample.baro_count = baro_.count();
-  sample.flags = 0;
-  if (reading_.valid) sample.flags |= flag::kImuValid;
-  if (reading_.valid && reading_.accel_saturated) sample.flags |= flag::kAccelSaturated;
-  if (reading_.valid && reading_.gyro_saturated) sample.flags |= flag::kGyroSaturated;
-  if (baro_.valid()) sample.flags |= flag::kBaroValid;
+  uint8_t body[wire::Sample::kSize];
+  wire::Sample head = {static_cast<uint16_t>(tick_.number - first_tick_), tick_.t_us, 0, sections()};
+  uint8_t* end = body + sizeof head;
+  if (head.sections & wire::sections::kImu) {
+    const Mpu6050::Reading& r = reading_;
+    const wire::Sample::Imu imu = {r.accel[0], r.accel[1], r.accel[2], r.temperature, r.gyro[0], r.gyro[1], r.gyro[2]};
+    end = append(end, imu);
+    if (r.valid) head.flags |= flag::kImuValid;
+    if (r.valid && r.accel_saturated) head.flags |= flag::kAccelSaturated;
+    if (r.valid && r.gyro_saturated) head.flags |= flag::kGyroSaturated;
+  }
+  if (head.sections & wire::sections::kBaro) {
+    const wire::Sample::Baro baro = {baro_.temperature(), baro_.pressure(), baro_.count()};
+    end = append(end, baro);
+    if (baro_.valid()) head.flags |= flag::kBaroValid;
+  }
   // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
   const bool mice_read = tick_.serves_mice;
-  sample.flags |= mice_.flags(mice_read);
-  const uint8_t count = mice_.in_sample();
+  head.flags |= mice_.flags(mice_read);
+  const uint8_t count = head.sections / kOneMouse;
   for (uint8_t i = 0; i < count; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    sample.mice[i] = {mice_read ? mouse.dx() : int16_t{0}, mice_read ? mouse.dy() : int16_t{0}};
+    const int16_t dx = mice_read ? mouse.dx() : 0, dy = mice_read ? mouse.dy() : 0;
+    end = append(end, wire::Sample::Mouse{dx, dy});
   }
+  append(body, head);
   // Movement that did not get into the transmit ring goes into a later SAMPLE.
-  if (uart::put(wire::Sample::kType, &sample, wire::Sample::size(count)) && mice_read) mice_.forget_movement();
+  const uint8_t size = static_cast<uint8_t>(end - body);
+  if (uart::put(wire::Sample::kType, body, size) && mice_read) mice_.forget_movement();
 }
 
 void Sampler::send_self_test_result() {
   Mpu6050::SelfTest test;
   if (!imu_.take_self_test(test)) return;
-  wire::SelfTestResult result;
-  static_assert(sizeof result == sizeof test.trim + sizeof test.plain + sizeof test.excited + 1, "same order");
-  memcpy(&result.trim_x, test.trim, sizeof test.trim);
+  wire::SelfTestResult result = {};
+  result.family = static_cast<uint8_t>(wire::DeviceFamily::kMpu6050);
+  memcpy(&result.trim_1, test.trim, sizeof test.trim);
   memcpy(&result.plain_accel_x, test.plain, sizeof test.plain);
   memcpy(&result.excited_accel_x, test.excited, sizeof test.excited);
-  result.baro_id = baro_.present() ? Bmp180::kId : 0;
   uart::put(wire::SelfTestResult::kType, &result, wire::SelfTestResult::kSize);
 }

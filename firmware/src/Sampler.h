@@ -16,7 +16,8 @@ class Sampler {
 
   void configure(const wire::Configure& settings);
   void start();
-  void stop() { streaming_ = false; }
+  // No SAMPLE follows, not even that of the present tick.
+  void stop() { streaming_ = sample_due_ = false; }
   void self_test() { self_test_due_ = true; }
 
   const wire::Configure& settings() const { return settings_; }
@@ -24,6 +25,11 @@ class Sampler {
   bool sensors_settled() const { return imu_.settled() && baro_.settled(); }
   bool healthy() const { return imu_.present() && baro_.present(); }
   uint32_t ticks_missed() const { return ticks_missed_; }
+  // Of the next SAMPLE: HELLO's field `sections`, and the size of the body.
+  uint8_t sections() const;
+  uint8_t sample_size() const;
+  void describe(wire::Hello::Device* devices) const;
+  void count(wire::Status::Device* devices) const;
   const Mpu6050& imu() const { return imu_; }
   const Bmp180& baro() const { return baro_; }
 

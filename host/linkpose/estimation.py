@@ -13,9 +13,9 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.sensors.conversion import TIME_DECIMALS
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
-from linkpose.wire.messages import Sensors
 
 
 def sensors_of(measurements: Measurements) -> Sensors:

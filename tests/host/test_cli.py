@@ -306,7 +306,7 @@ OTHER = PortInfo("/dev/ttyS0", "", None, None, None, False, None)
     ("found", "sentence"),
     [
         ([], "no serial port is connected"),
-        ([OTHER], "no UNO is connected; the ports there are: /dev/ttyS0"),
+        ([OTHER], "no UNO is connected; the ports are: /dev/ttyS0"),
         ([UNO, OTHER, dataclasses.replace(UNO, port="/dev/ttyACM1")], "2 boards are connected: /dev/ttyACM0"),
         ([OTHER, UNO], "there is no port /dev/ttyACM0"),  # chosen, and then not there in this test
     ],

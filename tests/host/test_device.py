@@ -6,12 +6,15 @@ import json
 import random
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pty_board import PtyBoard
+from serial.tools import list_ports_common
 
+from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
 from linkpose.recording.table import read_table
@@ -34,7 +37,7 @@ def stranger(path: Path, chatter: bytes) -> PtyBoard:
 
 
 OLD_HELLO = bytes.fromhex("01") + bytes([0, 9]) + b"\x11\x22\x33\x44" + b"whatever followed then"
-NEW_HELLO = bytes.fromhex("01") + bytes([2, 0]) + b"\x11\x22\x33\x44" + bytes(60)
+NEW_HELLO = bytes.fromhex("01") + bytes([3, 0]) + b"\x11\x22\x33\x44" + bytes(60)
 
 
 def framed(payload: bytes) -> bytes:
@@ -52,8 +55,8 @@ def framed(payload: bytes) -> bytes:
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
         (random.Random(3).randbytes(60), "only noise came"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.1"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.1, the board's firmware 2.0"),
+        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -78,7 +81,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
     assert "there is no port /dev/ttyNONE" in refused("info", "--port", "/dev/ttyNONE")
     (tmp_path / "file").write_text("no port")
     assert "is not a serial port" in refused("info", "--port", tmp_path / "file")
-    assert "is no port that can be opened" in refused("info", "--port", "nonsense://x")
+    assert "nonsense://x is not a port" in refused("info", "--port", "nonsense://x")
     assert "no simulated board 'nothing'" in refused("info", "--port", "sim://nothing")
     assert "no option tset" in refused("info", "--port", "sim://link?tset=1")
     with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print):
@@ -87,7 +90,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
 
 def test_settings_are_put_in_force_or_refused_with_the_reason():
     with Session("sim://link", print) as session:
-        settings = Configure(200, 4, 500, 2, 0, 8)
+        settings = Configure(200, 4, 500, 2, 0, 8, 400)
         hello = session.configure(settings)
         assert (hello.sample_rate_hz, hello.accel_range_g, hello.gyro_range_deg_s) == (200, 4, 500)
         with pytest.raises(session_module.LinkposeError, match="gyro range out of range"):
@@ -108,21 +111,41 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     assert seqs == list(range(30))
 
 
-def record_through(port: Path, out: Path, duration: float, *happenings) -> tuple[list[str], Session]:
-    """Records for a time of the board; each happening (after s, what) is done on the way."""
+def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple[list[str], Session]:
+    """Records until `after` samples have come behind a gap.
+
+    Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
+    how long anything takes.
+    """
     from linkpose.cli.live import Recorder
     from linkpose.sensors.rig import Rig
 
     said: list[str] = []
+    waiting = list(happenings)
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
-        waiting = list(happenings)
-        for block in session.stream(duration):
+        behind = None
+        for block in session.stream():
             recorder.take(block)
-            if waiting and session.timeline.duration_s >= waiting[0][0]:
+            timeline = session.timeline
+            if waiting and waiting[0][0](said, timeline.samples):
                 waiting.pop(0)[1]()
-        recorder.close("duration")
+            if behind is None and timeline.gaps and not waiting:
+                behind = timeline.samples
+            if behind is not None and timeline.samples >= behind + after:
+                break
+        recorder.close("interrupted")
     assert not waiting
     return said, session
+
+
+def samples(count: int):
+    """The condition that so many samples have come."""
+    return lambda _said, number: number >= count
+
+
+def said_that(words: str):
+    """The condition that a message contains these words."""
+    return lambda said, _number: any(words in line for line in said)
 
 
 def check_one_gap(out: Path, cause: str) -> None:
@@ -143,36 +166,138 @@ def check_one_gap(out: Path, cause: str) -> None:
 
 def test_a_pulled_cable_is_waited_for_and_the_gap_is_marked(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        put_back = threading.Timer(0.6, board.plug)
-
-        def pull() -> None:
-            board.pull()
-            put_back.start()
-
-        said, session = record_through(tmp_path / "port", tmp_path / "r.csv", 2.0, (0.5, pull))
-    assert "is gone" in said[0] and "is back" in said[1]
+        said, session = record_through(
+            tmp_path / "port", tmp_path / "r.csv", (samples(50), board.pull), (said_that("disappeared"), board.plug)
+        )
+    assert "disappeared" in said[0] and "is back" in said[1]
     assert len(session.health().gaps) == 1
     check_one_gap(tmp_path / "r.csv", "cable")
 
 
+class UsbPorts:
+    """The system's list of ports: the boards that are plugged in, with their serial numbers."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.boards: list[tuple[PtyBoard, str | None]] = []
+        monkeypatch.setattr(ports.list_ports, "comports", self.comports)
+
+    def comports(self) -> list[list_ports_common.ListPortInfo]:
+        found = []
+        for board, number in self.boards:
+            if board.path.exists():
+                port = list_ports_common.ListPortInfo(str(board.path))
+                port.vid, port.pid, port.serial_number = 0x2341, 0x0043, number
+                found.append(port)
+        return found
+
+
+@pytest.mark.parametrize("number", ["75735", None], ids=["by its serial number", "as the only one of its kind"])
+def test_a_board_that_returns_under_another_name_is_found(tmp_path, monkeypatch, number):
+    usb = UsbPorts(monkeypatch)
+    with PtyBoard(tmp_path / "ttyACM0") as board:
+        usb.boards.append((board, number))
+        said, session = record_through(
+            tmp_path / "ttyACM0",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), lambda: board.plug(tmp_path / "ttyACM1")),
+            after=20,
+        )
+    assert f"the board is back at {tmp_path / 'ttyACM1'}" in said[1]
+    assert session.port == str(tmp_path / "ttyACM1")
+    check_one_gap(tmp_path / "r.csv", "cable")
+
+
+def test_another_board_at_the_old_name_is_not_opened(tmp_path, monkeypatch):
+    usb = UsbPorts(monkeypatch)
+    with PtyBoard(tmp_path / "ttyACM0") as board, PtyBoard(tmp_path / "other") as other:
+        usb.boards += [(board, "1"), (other, "2")]
+
+        def swap() -> None:
+            other.pull()
+            other.plug(tmp_path / "ttyACM0")
+            board.plug(tmp_path / "ttyACM1")
+
+        said, session = record_through(
+            tmp_path / "ttyACM0",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), swap),
+            after=20,
+        )
+        assert not other.heard.is_set()
+    assert session.port == str(tmp_path / "ttyACM1"), said
+
+
+def test_an_obstacle_at_the_port_is_reported_once(tmp_path, monkeypatch):
+    attempts = []
+
+    def busy(name: str) -> str | None:
+        attempts.append(name)
+        return "modem-manager (process 7)" if 1 < len(attempts) < 6 else None  # the first time is the session's own
+
+    monkeypatch.setattr(ports, "holder", busy)
+    with PtyBoard(tmp_path / "port") as board:
+        said, _ = record_through(
+            tmp_path / "port",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), board.plug),
+            after=20,
+        )
+    assert len(attempts) == 6
+    assert sum("is in use by modem-manager (process 7). Close it" in line for line in said) == 1
+
+
+def test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts(tmp_path, linkpose):
+    with PtyBoard(tmp_path / "port") as board:
+        pull = threading.Thread(target=lambda: (board.streams.wait(), board.pull()))
+        pull.start()
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 2, "--json")
+        pull.join()
+    table = read_table(tmp_path / "r.csv", "recording")
+    summary = json.loads(result.out.splitlines()[-1])
+    assert result.status == 0
+    assert summary["lost"] + summary["samples"] == 200
+    assert summary["duration_s"] == 2.0
+    assert summary["gaps"] == table.closing["gap_count"] == 1
+    assert table.closing["gaps"][0]["cause"] == "cable"
+    assert f"{summary['lost']} samples are counted as lost" in result.err
+
+
 def test_a_reset_board_goes_on_with_the_settings_of_before(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 1.0, (0.4, board.reset))
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", (samples(40), board.reset))
     assert "was reset (power on)" in said[0]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
 def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        reset = (0.3, lambda: board.reset(says_hello=False))
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 2.5, reset)
+        reset = (samples(30), lambda: board.reset(says_hello=False))
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", reset)
     assert "no sample for 1.5 s" in said[0] and "was reset" in said[1]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
-def test_a_port_that_goes_during_the_handshake_is_a_sentence(impatient, refused, tmp_path):
+def test_a_suspended_program_does_not_report_a_silent_board(tmp_path):
+    """After SIGSTOP the clock has run on, but nothing was waited for."""
+    said: list[str] = []
+    ahead_s = 0.0
+    clock = types.SimpleNamespace(perf_counter=lambda: time.perf_counter() + ahead_s, sleep=time.sleep)
+    port = tmp_path / "port"
+    with PtyBoard(port), Session(str(port), said.append) as session, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_module, "time", clock)
+        for _ in session.stream():
+            ahead_s += 10.0
+            if session.timeline.samples > 40:
+                break
+    assert not said
+
+
+def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
     with stranger(tmp_path / "port", b"") as board:
-        pull = threading.Timer(0.3, board.pull)
+        pull = threading.Thread(target=lambda: (board.heard.wait(), board.pull()))
         pull.start()
         said = refused("info", "--port", tmp_path / "port")
         pull.join()

@@ -10,11 +10,12 @@ import pytest
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig
 from linkpose.simulation.link import LinkRun
-from linkpose.wire.messages import SampleFlags, Sensors
+from linkpose.wire.messages import SampleFlags
 
 PAPER = ("joint", "tilt", "imu-baro", "baro")
 INERTIAL = ("joint", "tilt")

@@ -162,7 +162,7 @@ def uno(device: str) -> list_ports_common.ListPortInfo:
     ("found", "sentence"),
     [
         ([], "no serial port is connected; plug the board in"),
-        ([list_ports_common.ListPortInfo("/dev/ttyS9")], "no UNO is connected; the ports there are: /dev/ttyS9"),
+        ([list_ports_common.ListPortInfo("/dev/ttyS9")], "no UNO is connected; the ports are: /dev/ttyS9"),
         ([uno("/dev/ttyACM0"), uno("/dev/ttyACM1")], "2 boards are connected: /dev/ttyACM0 (Arduino Uno),"),
     ],
     ids=["none", "no board", "two boards"],
@@ -182,9 +182,9 @@ def test_a_port_that_cannot_be_opened_is_said_before_anything_is_built(
     assert "there is no port /dev/ttyNONE" in refused("flash", "--port", "/dev/ttyNONE")
     assert "sim://link is not a board that can be flashed" in refused("flash", "--port", "sim://link")
     with serial.Serial(port, exclusive=True):
-        assert "is in use by another program; close it" in refused("flash", "--port", port)
+        assert "is in use by another program. Close it" in refused("flash", "--port", port)
     monkeypatch.setattr(ports, "holder", lambda name: "screen (process 123)")
-    assert f"{port} is in use by screen (process 123); close it" in refused("flash", "--port", port)
+    assert f"{port} is in use by screen (process 123). Close it" in refused("flash", "--port", port)
 
 
 def test_a_port_without_permission_names_the_group(

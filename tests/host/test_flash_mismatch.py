@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pty_board import PtyBoard
@@ -87,7 +88,7 @@ def test_another_minor_version_is_told_and_goes_on(
         command = arguments("record {out} --duration 0.1", tmp_path / "port", tmp_path / "out.csv")
         status, _, said = linkpose(*command)
     assert status == 0
-    assert f"the board speaks protocol 1.{minor}, this linkpose 1.5" in said
+    assert f"the board speaks protocol 2.{minor}, this linkpose 2.5" in said
     assert f"the {older} is older: type `{cure}`" in said
 
 
@@ -106,12 +107,12 @@ def reset_silently(board: PtyBoard) -> None:
     [
         ({"schema_crc": 1, **OLDER}, f"firmware 0.0.1 and this linkpose {VERSION}"),
         ({"protocol_major": 0}, "it speaks protocol 0."),
-        ({"ac1": 1}, "another board answers"),
+        ({"baro_words": (1,) * 12}, "another board answers"),
     ],
     ids=["schema", "protocol", "board"],
 )
 def test_another_firmware_in_the_middle_of_a_recording_ends_it(
-    tmp_path: Path, exchange: Callable[[PtyBoard], None], fields: dict[str, int], named: str
+    tmp_path: Path, exchange: Callable[[PtyBoard], None], fields: dict[str, Any], named: str
 ) -> None:
     """It is not waited for, and what was recorded until then is kept."""
     firmware = OtherFirmware(**fields)

@@ -30,8 +30,8 @@ from linkpose.simulation import board
 from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.capture import decode_capture
-from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Configure, Hello, HelloMouse, Sample
+from linkpose.wire.frames import StreamDecoder, encode, sample
+from linkpose.wire.messages import Configure, DeviceState, Hello, HelloMouse, Sample
 
 CLI = [sys.executable, "-m", "linkpose"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
@@ -48,7 +48,7 @@ def test_the_data_sheets_example():
 def test_every_raw_count_comes_back_from_the_decimals_kept(range_g, range_deg_s):
     counts = np.arange(-32768, 32768)
     converter = Converter(BoardSettings.of(hello_with(accel_range_g=range_g, gyro_range_deg_s=range_deg_s)))
-    samples = [Sample(0, 0, c, c, c, c, c, c, c, 0, 0, 0, 1) for c in counts.tolist()]
+    samples = [sample(0, 0, 1, (c,) * 7) for c in counts.tolist()]
     size = len(samples)
     block = converter.convert(RawSamples.of(samples, 0), np.zeros(size), np.ones(size, np.int64))
     for values, scale, decimals in (
@@ -63,19 +63,17 @@ def test_every_raw_count_comes_back_from_the_decimals_kept(range_g, range_deg_s)
 
 def hello_with(mice: int = 0, **settings: int) -> Hello:
     hello = board.hello(board.DEFAULTS._replace(**settings))
-    return hello._replace(mice=tuple(HelloMouse(0, 8, 100) for _ in range(mice)))
+    return hello._replace(mice=tuple(HelloMouse(DeviceState.OK, 0, 0x60, 8, 200, 0) for _ in range(mice)))
 
 
 raw_samples = st.lists(
     st.builds(
-        Sample,
+        sample,
         seq=st.just(0),
         t_us=st.just(0),
-        **{name: st.integers(-32768, 32767) for name in Sample._fields[2:9]},
-        baro_ut=st.integers(0, 65535),
-        baro_up=st.integers(0, 2**19 - 1),
-        baro_count=st.integers(0, 3),
         flags=st.integers(0, 0x1FFF),
+        imu=st.tuples(*[st.integers(-32768, 32767)] * 7),
+        baro=st.tuples(st.integers(0, 65535), st.integers(0, 2**19 - 1), st.integers(0, 3)),
         mice=st.integers(0, 3).flatmap(lambda mice: st.tuples(*[st.integers(-32768, 32767)] * 2 * mice)),
     ),
     min_size=1,
@@ -411,9 +409,9 @@ def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
 
 
 def test_the_converter_forgets_a_barometer_that_went_away():
-    hello = board.hello(Configure(100, 8, 1000, 3, 0, 8))
+    hello = board.hello(Configure(100, 8, 1000, 3, 0, 8, 400))
     converter = Converter(BoardSettings.of(hello))
-    base = Sample(0, 0, 0, 0, 0, 0, 0, 0, 0, 27898, 23843, 7, 8)
+    base = sample(0, 0, 8, baro=(27898, 23843, 7))
     places = [Placed(0.01 * i, i, flags) for i, flags in enumerate((8, 8, 0, 8))]
     for blocks in ([4], [1, 1, 1, 1], [2, 2], [3, 1]):
         converter = Converter(BoardSettings.of(hello))
@@ -431,8 +429,8 @@ def test_an_impossible_barometer_reading_is_missing_and_spoils_no_other(size):
     """UT for which x1 + MD is 0, or B4 is 0: no BMP180 gives it."""
     words = DATASHEET_WORDS
     bad_ut = next(ut for ut in range(65536) if ((ut - words.ac6) * words.ac5 >> 15) + words.md == 0)
-    converter = Converter(BoardSettings.of(board.hello(Configure(100, 8, 1000, 3, 0, 8))))
-    samples = [Sample(0, 0, 0, 0, 0, 0, 0, 0, 0, 27898, 23843, 7 + i, 8) for i in range(5)]
+    converter = Converter(BoardSettings.of(board.hello(Configure(100, 8, 1000, 3, 0, 8, 400))))
+    samples = [sample(0, 0, 8, baro=(27898, 23843, 7 + i)) for i in range(5)]
     samples[2] = samples[2]._replace(baro_ut=bad_ut)
     places = [Placed(0.01 * i, i, 8) for i in range(5)]
     parts = [converter.convert_placed(samples[i : i + size], places[i : i + size]) for i in range(0, 5, size)]

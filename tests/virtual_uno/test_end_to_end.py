@@ -78,7 +78,7 @@ def test_info_tells_what_the_board_is(served: PtyServer) -> None:
     assert done.returncode == 0, done.stderr
     info = json.loads(done.stdout)
     assert info["sensors"] == ["mpu6050", "bmp180"]
-    assert (info["protocol"], info["sample_rate_hz"], info["mice"]) == ("1.1", 100, [])
+    assert (info["protocol"], info["sample_rate_hz"], info["mice"]) == ("2.0", 100, [])
     assert (info["samples_lost"], info["frames_corrupt"], info["self_test"]) == (0, 0, "passed")
     assert abs(info["clock_drift_ppm"]) < 5 * info["clock_drift_std_ppm"] + 100
     assert info["board"]["stack_free"] >= 250

@@ -151,7 +151,7 @@ def test_a_host_that_stalls_is_in_step_again(board: MakeBoard, tmp_path: Path) -
     with PtyServer(board().uno, tmp_path / "port", paced=False) as server:
         host = Host(tmp_path / "port")
         host.expect(Hello)
-        host.port.write(encode(Configure(500, 8, 1000, 3, 1, 8)))
+        host.port.write(encode(Configure(500, 8, 1000, 3, 1, 8, 400)))
         host.expect(Ack)
         host.port.write(encode(Start()))
         host.expect(Ack)

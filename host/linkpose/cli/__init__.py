@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from linkpose import __version__
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, printable
 
 # Command -> what it does.
 COMMANDS = {
@@ -73,12 +73,14 @@ def main() -> None:
         error.show()
         status = error.exit_code
     except LinkposeError as error:
-        click.echo(f"linkpose: {error}", err=True)
+        click.echo(f"linkpose: {printable(error)}", err=True)
         status = 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
         what = f"{type(error).__name__}: {error}"
-        click.echo(f"linkpose: unexpected {what}; please report it with what LINKPOSE_DEBUG=1 shows", err=True)
+        click.echo(
+            f"linkpose: unexpected {printable(what)}; please report it with what LINKPOSE_DEBUG=1 shows", err=True
+        )
         status = 1
     sys.exit(status if isinstance(status, int) else 0)

@@ -145,7 +145,7 @@ def _live(
     from linkpose.device.ports import choose_port
     from linkpose.device.session import Session
     from linkpose.sensors.conversion import BoardSettings
-    from linkpose.wire.messages import Sensors
+    from linkpose.sensors.devices import found
 
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(live.raw_capture(raw, request.force))
@@ -156,7 +156,7 @@ def _live(
         with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
             from linkpose.estimation import Estimator
 
-            settings, sensors = BoardSettings.of(session.hello), Sensors(session.hello.sensors)
+            settings, sensors = BoardSettings.of(session.hello), found(session.hello)
             used = rig.with_delay_of(settings.dlpf)
             estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
             _check(estimator, request, console)

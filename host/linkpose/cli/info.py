@@ -11,6 +11,7 @@ from linkpose.cli import options
 
 if TYPE_CHECKING:
     from linkpose.device.session import Health, Session
+    from linkpose.wire.messages import HelloDevice, Status
 
 OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of the drift
 
@@ -41,7 +42,7 @@ def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, 
 
 def _report(session: Session, health: Health) -> dict[str, Any]:
     from linkpose.device.session import firmware_version, reset_causes
-    from linkpose.wire.messages import Sensors
+    from linkpose.sensors import devices
 
     hello, status = session.hello, health.status
     return {
@@ -51,8 +52,8 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "source_revision": f"{hello.source_revision:08x}",
         "reset_cause": reset_causes(hello),
         "sample_rate_hz": hello.sample_rate_hz,
-        "sensors": [s.name.lower() for s in Sensors if hello.sensors & s and s.name],
-        "imu_id": f"{hello.imu_id:#04x}",
+        "sensors": devices.names(hello),
+        "devices": [_device(device) for device in hello.devices],
         "accel_range_g": hello.accel_range_g,
         "gyro_range_deg_s": hello.gyro_range_deg_s,
         "dlpf": hello.dlpf,
@@ -63,17 +64,37 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "frames_corrupt": health.corrupt.total,
         "clock_drift_ppm": _rounded(health.drift_ppm),
         "clock_drift_std_ppm": _rounded(health.drift_std_ppm),
-        "board": None if status is None else {k: v for k, v in status._asdict().items() if k not in ("t_us", "mice")},
+        "board": None if status is None else _counters(status),
+    }
+
+
+def _counters(status: Status) -> dict[str, Any]:
+    """The board's own counters, except those of single devices."""
+    return {name: value for name, value in status._asdict().items() if name not in ("t_us", "devices", "mice")}
+
+
+def _device(device: HelloDevice) -> dict[str, Any]:
+    """A sensor of the board: chip, where and with which id it answers, its state and what that means."""
+    from linkpose.sensors import devices
+
+    described = devices.describe(device)
+    return {
+        "chip": described.chip,
+        "address": f"{device.address:#04x}",
+        "id": f"{device.id:#04x}",
+        "state": described.state,
+        "remark": described.remark,
     }
 
 
 def _self_test(session: Session) -> dict[str, Any]:
     """How far each axis is from the factory's answer, and whether that is within the data sheet's limit."""
-    from linkpose.sensors.mpu6050 import SELF_TEST_LIMIT, self_test_deviation
+    from linkpose.sensors.mpu6050 import self_test_deviation, self_test_limit
 
-    deviations = self_test_deviation(session.self_test())
+    result = session.self_test()
+    deviations = self_test_deviation(result)
     known = [deviation for deviation in deviations.values() if deviation is not None]
-    passed = bool(known) and all(abs(deviation) <= SELF_TEST_LIMIT for deviation in known)
+    passed = bool(known) and all(abs(deviation) <= self_test_limit(result) for deviation in known)
     percent = {axis: None if value is None else round(100 * value, 1) for axis, value in deviations.items()}
     return {"self_test": "passed" if passed else "failed", "self_test_deviation_percent": percent}
 

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import click
 
 from linkpose.device.session import Health, Session
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, printable
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, metadata
 from linkpose.sensors.conversion import BoardSettings
@@ -38,7 +38,7 @@ class Console:
     def say(self, text: str) -> None:
         self.clear()
         if not self._quiet:
-            click.echo(text, err=True)
+            click.echo(printable(text), err=True)
 
     def detail(self, text: str) -> None:
         if self._verbose:
@@ -46,7 +46,7 @@ class Console:
 
     def progress(self, make_text: Callable[[], str]) -> None:
         """Shows a line that replaces the one before, a few times a second."""
-        now = time.monotonic()
+        now = time.perf_counter()
         if self.shows_progress and now - self._shown_at >= PROGRESS_INTERVAL_S:
             self._shown_at = now
             text = make_text()

@@ -136,6 +136,36 @@ def up(function: Function) -> Function:
     )(function)
 
 
+def seeds(what: str) -> Callable[[Function], Function]:
+    """--seeds of an experiment: how many of these simulated runs."""
+    return click.option(
+        "--seeds", type=click.IntRange(min=1), default=5, show_default=True, help=f"Number of simulated {what}."
+    )
+
+
+def plot(what: str) -> Callable[[Function], Function]:
+    """--plot of a command that draws its result."""
+    return click.option(
+        "--plot", "plot_path", type=FILE, metavar="FILE.png", help=f"{what} PNG, SVG or PDF, by the file's ending."
+    )
+
+
+def simulated_outputs(what: str) -> Callable[[Function], Function]:
+    """-o and --truth of a simulator."""
+
+    def decorate(function: Function) -> Function:
+        function = click.option("--truth", type=FILE, required=True, help="Truth to write (CSV).")(function)
+        return click.option("-o", "--output", type=FILE, required=True, help=what)(function)
+
+    return decorate
+
+
+def show_next(quiet: bool, following: str) -> None:
+    """What to type next, on stderr."""
+    if not quiet:
+        click.echo(f"next: linkpose {following}", err=True)
+
+
 def as_json(function: Function) -> Function:
     return click.option("--json", "json_lines", is_flag=True, help="One JSON object a line on stdout.")(function)
 

@@ -41,8 +41,8 @@ class Arrival:
 class Connection:
     """A port that is read all the time, so that nothing is lost while the program is busy elsewhere.
 
-    The clock is the host's monotonic one, or the port's own where a simulated port brings one. `capture`, when given,
-    gets every byte as it came.
+    The clock is `time.perf_counter` (`time.monotonic` steps by 15.6 ms on Windows before Python 3.13), or the port's
+    own where a simulated port brings one. `capture`, when given, gets every byte as it came.
     """
 
     def __init__(self, port: str, capture: BinaryIO | None = None) -> None:
@@ -50,7 +50,7 @@ class Connection:
         self._name = port
         self._port = open_port(port)
         self._capture = capture
-        self.now: Callable[[], float] = getattr(self._port, "clock", time.monotonic)
+        self.now: Callable[[], float] = getattr(self._port, "clock", time.perf_counter)
         self.rig: Rig | None = getattr(self._port, "rig", None)
         self._arrived: queue.SimpleQueue[tuple[float, bytes] | Exception] = queue.SimpleQueue()
         self._closing = False

@@ -12,8 +12,10 @@ from typing import BinaryIO, TypeVar
 
 from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
+from linkpose.device.ports import NoSuchPort, find_again, usb_identity
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import BoardSettings, Converter, Placed
+from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.measurements import Block
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Timeline
@@ -51,6 +53,8 @@ SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
+LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
+RECEIVE_TIMEOUT_S = 0.1
 RETRY_INTERVAL_S = 0.25
 
 FLASH = "type `linkpose flash`"
@@ -90,13 +94,17 @@ class Session:
         self._notify = notify
         self._capture = capture
         self._connection = Connection(port, capture)
+        self._usb = usb_identity(port)
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
         self._started: Arrival | None = None  # what came together with the ACK of START
-        self._heard_at = self._asked_at = self._pinged_at = 0.0  # s, monotonic: last sample, GET_INFO and PING
+        self._pinged_at = 0.0  # s, perf_counter
+        self._silent_s = self._asked_s = (
+            0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
+        )
         self._corrupt_before = Corrupt()
         try:
             self.hello = self._handshake()
@@ -128,12 +136,12 @@ class Session:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
         heard = bytearray()
-        deadline, ask_at = time.monotonic() + HANDSHAKE_TIMEOUT_S, 0.0
-        while time.monotonic() < deadline:
-            if time.monotonic() >= ask_at:
+        deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
+        while time.perf_counter() < deadline:
+            if time.perf_counter() >= ask_at:
                 connection.send(Stop())
                 connection.send(GetInfo())
-                ask_at = time.monotonic() + ASK_INTERVAL_S
+                ask_at = time.perf_counter() + ASK_INTERVAL_S
             arrival = connection.receive(0.05)
             if arrival is None:
                 continue
@@ -157,6 +165,7 @@ class Session:
                 f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
                 f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
             )
+        check_hello(hello)
 
     # ---- commands ----
 
@@ -170,15 +179,15 @@ class Session:
 
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
-        deadline = time.monotonic() + MICE_TIMEOUT_S
-        while BoardSettings.of(self.hello).mouse_ports < count and time.monotonic() < deadline:
+        deadline = time.perf_counter() + MICE_TIMEOUT_S
+        while BoardSettings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
 
-    def self_test(self) -> SelfTestResult:
-        """Runs the sensors' self-tests. Raises LinkposeError when the board refuses."""
-        with_ack = self._command(SelfTest(), Command.SELF_TEST)
+    def self_test(self, device: int = 0) -> SelfTestResult:
+        """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
+        with_ack = self._command(SelfTest(device), Command.SELF_TEST)
         return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
 
     def _command(self, message: Message, command: Command) -> Arrival:
@@ -215,8 +224,8 @@ class Session:
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
-        deadline = time.monotonic() + timeout_s
-        while (left := deadline - time.monotonic()) > 0:
+        deadline = time.perf_counter() + timeout_s
+        while (left := deadline - time.perf_counter()) > 0:
             arrival = self._connection.receive(left)
             if arrival is not None:
                 yield arrival
@@ -251,49 +260,63 @@ class Session:
         """Samples as they arrive, in blocks of those that arrived together, for `duration_s` of the board's time.
 
         The blocks have room for `mouse_ports` mice, or for those found if they are more. A block may be empty: the
-        caller regains control several times a second even if nothing arrives. If the board is reset or unplugged, the
-        stream waits for it and continues in the same timeline with the gap marked.
+        caller regains control several times a second even if nothing arrives. After a reset or
+        an unplugged cable the stream waits for the board and continues in the same timeline, with the gap marked. It
+        ends with the duration in any case.
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         settings = BoardSettings.of(self.hello)
         converter = Converter(settings, max(settings.mouse_ports, mouse_ports))
         nothing = converter.convert_placed((), ())
         self._begin()
-        while True:
+        self._began_s = self._connection.now()
+        while not timeline.is_over:
             try:
                 samples, places = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} is gone ({error.reason}); waiting for the board to come back, Ctrl-C ends")
+                self._notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
                 timeline.interrupted("cable")
                 yield nothing
-                for _ in self._reconnect():
+                for _ in self._reconnect(timeline):
                     yield nothing
                 continue
             yield converter.convert_placed(samples, places) if samples else nothing
-            if timeline.is_over:
-                return
+            if self._silent_s > LATE_S:
+                self._end_when_due(timeline)
+        if timeline.missing_at_end:
+            self._notify(
+                f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
+                "are counted as lost"
+            )
+
+    def _end_when_due(self, timeline: Timeline) -> None:
+        """End the timeline when the duration has passed without a sample that would have ended it."""
+        first_s = timeline.start_s if timeline.samples else self._began_s
+        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
         self._clock = DeviceClock()
         self._tie_clocks()
         self._started = self._command(Start(), Command.START)
-        self._heard_at = self._asked_at = self._pinged_at = time.monotonic()
+        self._pinged_at = time.perf_counter()
+        self._silent_s = self._asked_s = 0.0
 
     def _next(self, timeline: Timeline) -> tuple[list[Sample], list[Placed]]:
         """The samples that arrived next, and their places."""
-        arrival, self._started = self._started or self._connection.receive(0.1), None
-        now = time.monotonic()
+        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
+        now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
         if arrival is None:
-            self._ask_when_silent(now)
+            self._silent_s += RECEIVE_TIMEOUT_S  # not by the clock: a suspended program has not waited
+            self._ask_when_silent()
             return [], []
         samples, places = [], []
         for message in arrival.messages:
             if isinstance(message, Sample):
-                self._heard_at = now
+                self._silent_s = self._asked_s = 0.0
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     samples.append(message)
@@ -302,12 +325,12 @@ class Session:
                 self._hear(message, arrival, timeline)
         return samples, places
 
-    def _ask_when_silent(self, now: float) -> None:
-        """A board that fell silent may have been reset while its HELLO was lost: ask who is there."""
-        if now - self._heard_at > SILENCE_S and now - self._asked_at > SILENCE_S:
-            if self._asked_at <= self._heard_at:
+    def _ask_when_silent(self) -> None:
+        """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
+        if self._silent_s - self._asked_s > SILENCE_S:
+            if self._asked_s == 0.0:
                 self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
-            self._asked_at = now
+            self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
     def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
@@ -326,33 +349,60 @@ class Session:
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
-        if BoardSettings.of(before).bmp180 != BoardSettings.of(hello).bmp180 and before.sensors & hello.sensors & 2:
+        if (
+            BoardSettings.of(before).bmp180 != BoardSettings.of(hello).bmp180
+            and found(before) & found(hello) & Sensors.BMP180
+        ):
             raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))
         self._begin()
 
-    def _reconnect(self) -> Iterator[None]:
-        """Waits until the board can be opened again and streams; yields while it waits. Raises WrongBoard."""
+    def _reconnect(self, timeline: Timeline) -> Iterator[None]:
+        """Wait until the board can be opened again and streams, or the duration is over; yields while it waits.
+
+        Raises WrongBoard for a board with which the recording cannot continue.
+        """
         self._connection.close()
         for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
-        while True:
+        obstacles: set[str] = set()
+        while not timeline.is_over:
             time.sleep(RETRY_INTERVAL_S)
             yield
-            try:
-                self._connection = Connection(self.port, self._capture)
-            except LinkposeError:
-                continue
-            try:
-                self._resume(self._handshake())
-            except WrongBoard:
-                raise
-            except (Disconnected, LinkposeError):
-                self._connection.close()
-                continue
-            self._notify(f"the board is back at {self.port}; going on, the gap is marked")
-            return
+            self._end_when_due(timeline)
+            obstacle = self._open_again()
+            if obstacle is None:
+                return
+            if obstacle and obstacle not in obstacles:
+                obstacles.add(obstacle)
+                self._notify(f"{obstacle}; still waiting")
+
+    def _open_again(self) -> str | None:
+        """Continue with the board that has returned. None: done; otherwise the obstacle, "" while it is absent."""
+        port = find_again(self.port, self._usb)
+        if port is None:
+            return ""
+        try:
+            self._connection = Connection(port, self._capture)
+        except NoSuchPort:
+            return ""
+        except LinkposeError as error:
+            return str(error)
+        self.port = port
+        try:
+            self._resume(self._handshake())
+        except WrongBoard:
+            raise
+        except Disconnected:
+            self._connection.close()
+            return ""
+        except LinkposeError as error:
+            self._connection.close()
+            return str(error)
+        self._usb = usb_identity(port)
+        self._notify(f"the board is back at {port}; continuing, the gap is marked")
+        return None
 
     # ---- health ----
 
@@ -388,15 +438,7 @@ def reset_causes(hello: Hello) -> str:
 
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
-    resolutions = [mouse.counts_per_mm for mouse in hello.mice if mouse.counts_per_mm]
-    return Configure(
-        hello.sample_rate_hz,
-        hello.accel_range_g,
-        hello.gyro_range_deg_s,
-        hello.dlpf,
-        hello.baro_oversampling,
-        max(resolutions, default=8),
-    )
+    return Configure(*(getattr(hello, name) for name in Configure._fields))
 
 
 def _reason(code: int) -> str:

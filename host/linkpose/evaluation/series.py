@@ -16,6 +16,9 @@ LONGEST_HOLE = 3.5
 _CLEARLY_BETTER = 0.7
 _SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter
 _FEWEST = 10  # instants that a fit is judged by
+# Points of the grid on which the lag is searched: 3 h at 100 Hz; longer files on a coarser one. 300 MB at most.
+_LARGEST_GRID = 1 << 20
+_STRAY = 0.01  # share of the stamps at either end that may be far from the others
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -48,13 +51,18 @@ def interval(time_s: Floats) -> float:
     return float(np.median(steps)) if len(steps) else 0.0
 
 
-def paired(estimate: Series, reference: Series, offset_s: float) -> tuple[Floats, Floats]:
-    """Both at the instants of the one that has fewer, (N,), NaN where either has none; angles as they come.
+def is_sparser(one: Series, other: Series) -> bool:
+    """Whether `one` has clearly fewer instants than `other`."""
+    return interval(one.time_s) > _SPARSER * interval(other.time_s)
 
-    `offset_s` is added to the estimate's clock to have the reference's. The denser one is interpolated, for that is
-    nearer to the motion than lines between the other's samples.
+
+def paired(estimate: Series, reference: Series, offset_s: float) -> tuple[Floats, Floats]:
+    """Both at the instants of the sparser one, (N,), NaN where either is unknown; angles not wrapped.
+
+    `offset_s` is added to the estimate's clock to get the reference's. The denser one is interpolated, because lines
+    between its samples are closer to the motion than lines between the other's.
     """
-    if interval(reference.time_s) > _SPARSER * interval(estimate.time_s):
+    if is_sparser(reference, estimate):
         return estimate.at(reference.time_s - offset_s), reference.value
     return estimate.value, reference.at(estimate.time_s + offset_s)
 
@@ -69,16 +77,16 @@ def difference(estimate: Series, reference: Series, offset_s: float) -> Floats:
 
 
 def find_offset(pairs: Sequence[tuple[Series, Series]]) -> tuple[float, float]:
-    """Offset (s) to add to the estimate's clock to have the reference's, and the residual that it leaves.
+    """Offset (s) to add to the estimate's clock to get the reference's, and the residual with it.
 
     `pairs` are (estimate, reference) of one filter. 0 unless another offset fits clearly better. The residual is the
-    RMS of the differences less their means, each over the reference's standard deviation; inf without an overlap.
+    RMS of the differences without their means, each over the reference's standard deviation; inf without an overlap.
     """
     step = max(interval(pairs[0][0].time_s), interval(pairs[0][1].time_s))
     if step == 0.0:
         return 0.0, _residual(pairs, 0.0)
-    coarse = _strongest_lag(pairs, step)
-    offset = _refine(pairs, coarse - 2 * step, coarse + 2 * step)
+    coarse, grid_step = _strongest_lag(pairs, step)
+    offset = _refine(pairs, coarse - 2 * grid_step, coarse + 2 * grid_step)
     if abs(offset) > 0.5 * step and _fits_clearly_better(pairs, offset):
         return offset, _residual(pairs, offset)
     return 0.0, _residual(pairs, 0.0)
@@ -119,11 +127,12 @@ def _residual(
     return float(np.sqrt(np.mean(squares))) if squares else float("inf")
 
 
-def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> float:
-    """The lag (s) with the largest sum of cross-correlations on a common grid."""
-    estimate_from, estimate_to = pairs[0][0].time_s[[0, -1]]
-    reference_from, reference_to = pairs[0][1].time_s[[0, -1]]
-    grid = np.arange(0.0, max(estimate_to - estimate_from, reference_to - reference_from), step)
+def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> tuple[float, float]:
+    """The lag (s) with the largest sum of cross-correlations on a common grid, and the grid's step (s)."""
+    (estimate_from, estimate_to), (reference_from, reference_to) = (_span(series.time_s) for series in pairs[0])
+    length = max(estimate_to - estimate_from, reference_to - reference_from)
+    step = max(step, length / _LARGEST_GRID)
+    grid = np.arange(0.0, length, step)
     size = 1 << (2 * len(grid)).bit_length()
     spectrum: NDArray[np.complex128] = np.zeros(size // 2 + 1, np.complex128)
     for estimate, reference in pairs:
@@ -132,7 +141,16 @@ def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> float
         spectrum += np.fft.rfft(theirs, size) * np.conj(np.fft.rfft(ours, size))
     lag = int(np.argmax(np.fft.irfft(spectrum, size)))
     lag = lag - size if lag > size // 2 else lag
-    return float(reference_from - estimate_from + lag * step)
+    return float(reference_from - estimate_from + lag * step), step
+
+
+def _span(time_s: Floats) -> tuple[float, float]:
+    """From where to where the stamps are, without the few that are far from all others: one late stamp is no hour."""
+    few = int(_STRAY * len(time_s))
+    core = time_s[few : len(time_s) - few]
+    margin = max(10.0, float(core[-1] - core[0]))
+    near = time_s[(time_s >= core[0] - margin) & (time_s <= core[-1] + margin)]
+    return float(near[0]), float(near[-1])
 
 
 def _standard(value: Floats) -> Floats:

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
-from linkpose.wire.messages import Sensors
 
 Floats = NDArray[np.float64]
 

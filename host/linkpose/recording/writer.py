@@ -11,12 +11,13 @@ from typing import Any
 from linkpose import __version__
 from linkpose.recording import columns
 from linkpose.recording.csvfile import CsvFile
+from linkpose.sensors import devices
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.measurements import Block
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.wire.frames import Corrupt
-from linkpose.wire.messages import Hello, Sample, Sensors
+from linkpose.wire.messages import Hello, Sample
 
 
 def metadata(hello: Hello, settings: BoardSettings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
@@ -37,8 +38,8 @@ def metadata(hello: Hello, settings: BoardSettings, device: str, rig: Rig, clock
             "dlpf": settings.dlpf,
             "baro_oversampling": settings.baro_oversampling,
         },
-        "sensors": [sensor.name.lower() for sensor in Sensors if hello.sensors & sensor and sensor.name],
-        "imu_id": hello.imu_id,
+        "sensors": devices.names(hello),
+        "devices": [device._asdict() for device in hello.devices],
         "bmp180": settings.bmp180._asdict(),
         "mice": [mouse._asdict() for mouse in hello.mice],
         "clock": clock,

@@ -34,6 +34,16 @@ class Calibration(NamedTuple):
     mc: int
     md: int
 
+    @staticmethod
+    def of(words: tuple[int, ...]) -> Calibration:
+        """From HELLO's `baro_words`: unsigned, in the order of the EEPROM."""
+        signed = [word - 0x10000 if word & 0x8000 and at not in (3, 4, 5) else word for at, word in enumerate(words)]
+        return Calibration(*signed[:11])
+
+    def words(self) -> tuple[int, ...]:
+        """HELLO's `baro_words`."""
+        return (*(word & 0xFFFF for word in self), 0)
+
 
 def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int) -> tuple[Integers, Integers]:
     """Temperature (0.1 degC) and pressure (Pa) from UT and UP; integers, or int64 arrays of one shape.

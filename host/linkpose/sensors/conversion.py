@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from linkpose.sensors import bmp180, mpu6050
 from linkpose.sensors.measurements import Block, Floats, Measurements
-from linkpose.wire.messages import SCALES, Hello, Sample, SampleFlags
+from linkpose.wire.messages import DeviceFamily, DeviceState, Hello, Sample, SampleFlags
 
 Integers = NDArray[np.int64]
 
@@ -57,8 +57,8 @@ class BoardSettings:
     @staticmethod
     def of(hello: Hello) -> BoardSettings:
         """The settings that a HELLO announces."""
-        words = bmp180.Calibration(*(getattr(hello, name) for name in bmp180.Calibration._fields))
-        found = [port for port, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF]
+        words = bmp180.Calibration.of(hello.baro_words)
+        found = [port for port, mouse in enumerate(hello.mice, 1) if mouse.state != DeviceState.ABSENT]
         return BoardSettings(
             hello.sample_rate_hz,
             hello.accel_range_g,
@@ -105,9 +105,9 @@ class Converter:
         self.settings = settings
         self.mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
         accel, gyro = mpu6050.accel_scale(settings.accel_range_g), mpu6050.gyro_scale(settings.gyro_range_deg_s)
-        temperature = SCALES["SAMPLE.imu_temp"]
-        self._imu_scale = np.array([accel] * 3 + [temperature.scale] + [gyro] * 3)
-        self._imu_offset = np.array([0.0] * 3 + [temperature.offset] + [0.0] * 3)
+        temperature, at_zero = mpu6050.TEMPERATURE[DeviceFamily.MPU6050]
+        self._imu_scale = np.array([accel] * 3 + [temperature] + [gyro] * 3)
+        self._imu_offset = np.array([0.0] * 3 + [at_zero] + [0.0] * 3)
         self._has_baro = bmp180.is_sound(settings.bmp180)
         self._baro_count: int | None = None  # of the last sample; None where that had no valid reading
         self._baro = np.full((1, 2), np.nan)  # last pressure (Pa) and temperature (degC)

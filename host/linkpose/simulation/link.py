@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig, Vector
 from linkpose.simulation import baro, imu
-from linkpose.simulation.motion import HandMotion
-from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
+from linkpose.simulation.motion import HandMotion, SixSides
+from linkpose.wire.frames import sample
+from linkpose.wire.messages import HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -52,6 +54,9 @@ class LinkTruth:
     height_m: Floats  # of the sensor over the joint centre, Z·d
     roll_deg: Floats
     pitch_deg: Floats
+    x_m: Floats  # of the sensor from the joint centre, in n
+    y_m: Floats
+    yaw_deg: Floats  # about the vertical, ±180
     tilt: Floats  # Z, n's Z axis (unit vector)
     accel_m_s2: Floats  # linear acceleration a
     specific_force_m_s2: Floats  # gZ + a
@@ -89,7 +94,7 @@ class RawBlock(NamedTuple):
             strict=True,
         )
         for seq, t_us, (ax, ay, az), temp, (gx, gy, gz), ut, up, count, flags in rows:
-            yield Sample(seq, t_us, ax, ay, az, temp, gx, gy, gz, ut, up, count, flags)
+            yield sample(seq, t_us, flags, (ax, ay, az, temp, gx, gy, gz), baro=(ut, up, count))
 
 
 class LinkRun:
@@ -110,16 +115,24 @@ class LinkRun:
         accel_range_g: int = 8,
         gyro_range_deg_s: int = 1000,
         oversampling: int = 1,
+        rests: bool = False,
     ) -> None:
-        """`duration_s` None never ends (a live board). Raises LinkposeError for a value that cannot be."""
+        """`duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
+        swinging the link, as `calibrate imu` asks for. Raises LinkposeError for a value that cannot be.
+        """
         _check(test, seed, duration_s, rate_hz, errors, j2s_m)
         self.test, self.seed, self.duration_s = test, seed, duration_s
         self.rate_hz, self.errors, self.j2s_m = rate_hz, errors, j2s_m
         self.accel_range_g, self.gyro_range_deg_s, self.oversampling = accel_range_g, gyro_range_deg_s, oversampling
         self._d = np.array(j2s_m, dtype=np.float64)
         paper = TESTS[test]
-        self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
-        self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
+        self.rests = rests
+        self._motion: HandMotion | SixSides
+        if rests:
+            self._motion = SixSides(duration_s or PAPER_DURATION_S)
+        else:
+            self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
+            self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
         self.imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
@@ -128,6 +141,13 @@ class LinkRun:
     def count(self) -> int | None:
         """How many samples the run has, None when it never ends."""
         return None if self.duration_s is None else round(self.duration_s * self.rate_hz)
+
+    @property
+    def description(self) -> str:
+        """What a file of this run names as its device."""
+        if self.rests:
+            return f"simulated link, laid on six sides, seed {self.seed}, errors {self.errors}"
+        return f"sim://link?test={self.test}&seed={self.seed}&errors={self.errors}"
 
     @property
     def rig(self) -> Rig:
@@ -139,12 +159,16 @@ class LinkRun:
         moving = self._motion.at(np.atleast_1d(np.asarray(time_s, dtype=np.float64)))
         accel = moving.acceleration(self._d)
         height = moving.tilt @ self._d
+        horizontal = moving.horizontal(self._d)
         speed = np.linalg.norm(np.cross(moving.rate_rad_s, self._d), axis=1)
         return LinkTruth(
             time_s=np.atleast_1d(np.asarray(time_s, dtype=np.float64)),
             height_m=height,
             roll_deg=np.degrees(np.arctan2(moving.tilt[:, 1], moving.tilt[:, 2])),
             pitch_deg=np.degrees(np.arctan2(-moving.tilt[:, 0], np.hypot(moving.tilt[:, 1], moving.tilt[:, 2]))),
+            x_m=horizontal[:, 0],
+            y_m=horizontal[:, 1],
+            yaw_deg=(np.degrees(moving.yaw_rad) + 180.0) % 360.0 - 180.0,
             tilt=moving.tilt,
             accel_m_s2=accel,
             specific_force_m_s2=STANDARD_GRAVITY * moving.tilt + accel,

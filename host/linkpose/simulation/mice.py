@@ -17,12 +17,14 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError
 from linkpose.sensors import bmp180
 from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation import imu
 from linkpose.simulation.drive import STILL_S, Drive, Manoeuvres, Move, Steady, Track
-from linkpose.wire.messages import HelloMouse, Sample, SampleFlags, Sensors
+from linkpose.wire.frames import sample
+from linkpose.wire.messages import DeviceState, HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -139,6 +141,7 @@ class MiceRun:
         mice = ring(3) if mice is None else mice
         _check(seed, duration_s, rate_hz, len(mice), path, errors, faults, length_m)
         self.seed, self.duration_s, self.rate_hz, self.mice, self.errors = seed, duration_s, rate_hz, mice, errors
+        self.path = path
         self.accel_range_g, self.gyro_range_deg_s, self.faults = accel_range_g, gyro_range_deg_s, faults
         self._mouse_errors = mouse_errors or LEVELS[errors]
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
@@ -160,7 +163,10 @@ class MiceRun:
     @property
     def hello_mice(self) -> tuple[HelloMouse, ...]:
         """What HELLO says of the mice."""
-        return tuple(HelloMouse(0x00, min(255, round(mouse.counts_per_m / 1000)), 100) for mouse in self.mice)
+        return tuple(
+            HelloMouse(DeviceState.OK, 0x00, 0x60, min(255, round(mouse.counts_per_m / 1000)), 200, 0)
+            for mouse in self.mice
+        )
 
     @property
     def count(self) -> int | None:
@@ -284,7 +290,7 @@ class MiceRun:
         stamps = np.rint(time_s[1:] * 1e6).astype(np.int64).tolist()
         own = map(tuple, np.where(there[:, :, None], moved, 0).reshape(count, -1).tolist())
         return [
-            Sample(tick & 0xFFFF, t_us & 0xFFFFFFFF, ax, ay, az, temp, gx, gy, gz, 0, 0, 0, bits, mice)
+            sample(tick & 0xFFFF, t_us & 0xFFFFFFFF, bits, (ax, ay, az, temp, gx, gy, gz), mice=mice)
             for tick, t_us, (ax, ay, az, temp, gx, gy, gz), bits, mice in zip(
                 ticks[1:].tolist(), stamps, counts, flags.tolist(), own, strict=True
             )

@@ -43,7 +43,7 @@ class Serial(serial.SerialBase):
         self.rig = self._board.rig
         self._changed = threading.Condition()
         self._buffer = bytearray()
-        self._began = time.monotonic()
+        self._began = time.perf_counter()
         self._simulated_s = 0.0
         self.is_open = True
 
@@ -52,7 +52,7 @@ class Serial(serial.SerialBase):
 
     def clock(self) -> float:
         """Seconds since the board was switched on."""
-        return (time.monotonic() - self._began) * self._speed if self._speed else self._simulated_s
+        return (time.perf_counter() - self._began) * self._speed if self._speed else self._simulated_s
 
     def _board_us(self) -> int:
         return int(self.clock() * self._drift * 1e6)
@@ -65,7 +65,7 @@ class Serial(serial.SerialBase):
     def read(self, size: int = 1) -> bytes:
         """Up to `size` bytes, waiting no longer than the time-out."""
         self._check_open()
-        deadline = None if self.timeout is None else time.monotonic() + self.timeout
+        deadline = None if self.timeout is None else time.perf_counter() + self.timeout
         while self.is_open:
             with self._changed:
                 self._buffer += self._board.advance(self._board_us())
@@ -75,7 +75,7 @@ class Serial(serial.SerialBase):
                     return data
                 wait = self._until_next_tick()
                 if deadline is not None:
-                    wait = min(wait, deadline - time.monotonic())
+                    wait = min(wait, deadline - time.perf_counter())
                 if wait < 0:
                     break
                 self._changed.wait(wait)  # until the next tick, or until the host says something

@@ -54,7 +54,7 @@ void Bmp180::finish(bool ok, const uint8_t* data, uint32_t now_us) {
       break;
     case State::kCalibrate:
       if (!take_calibration(data)) return lost(now_us);
-      present_ = true;
+      present_ = ever_found_ = true;
       state_ = State::kStart;
       break;
     case State::kStart:

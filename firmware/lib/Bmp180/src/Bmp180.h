@@ -25,6 +25,7 @@ class Bmp180 {
   uint32_t conversion_ahead_us() const;
 
   bool present() const { return present_; }
+  bool ever_found() const { return ever_found_; }
   bool settled() const { return present_ || tried_; }
   // Temperature and pressure were both measured since the sensor last answered, or before with the same calibration.
   bool valid() const { return present_ && pressure_known_; }
@@ -53,6 +54,7 @@ class Bmp180 {
   uint8_t count_ = 0;
   bool present_ = false;
   bool tried_ = false;
+  bool ever_found_ = false;
   bool temperature_known_ = false;
   bool pressure_known_ = false;
   uint16_t temperature_ = 0;

@@ -48,6 +48,7 @@ class Mpu6050 {
   void accept_burst(bool ok, const uint8_t* data, uint32_t now_us, Reading& reading);
 
   bool present() const { return id_ != 0; }
+  bool ever_found() const { return was_running_; }
   // Set up, or found absent: HELLO can be sent.
   bool settled() const { return was_running_ || tried_; }
   uint8_t id() const { return id_; }

@@ -1,4 +1,4 @@
-"""What redundant mice buy, measured: the third paper's Figures 2 and 3, and its claim."""
+"""Figures 2 and 3 of [Mice], and its claim: how much redundant mice reduce the velocity's error."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from linkpose.sensors.measurements import Floats
 from linkpose.simulation.mice import PAPER_ERRORS, PAPER_NOISE_M_S, PAPER_SIDE_M, MiceRun, ring
 
 QUANTITIES = ("vx", "vy", "wz")
-COUNTS_PER_M = 1e6  # the paper's mice give velocities, not counts: fine enough to hide the rounding
+COUNTS_PER_M = 1e6  # the paper's mice give velocities, not counts: fine enough that rounding is negligible
 RADIUS_M = PAPER_SIDE_M / math.sqrt(3)
 DURATION_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Redundancy:
-    """The noise of one quantity with so many mice against that of one mouse: standard deviations in m/s or rad/s."""
+    """The noise of one quantity with several mice and with one: standard deviations in m/s or rad/s."""
 
     quantity: str
     mice: int
@@ -29,24 +29,26 @@ class Redundancy:
 
     @property
     def ratio(self) -> float:
+        """Noise of all mice together over that of one."""
         return self.fused_std / self.single_std
 
 
 @dataclass(frozen=True, slots=True)
 class PaperRun:
-    """The paper's case with one seed: what each mouse says, (N, M, 3), and what the filter makes of it, (N, 3).
+    """The paper's case with one seed.
 
-    A mouse says (v_ix, v_iy, w_i): w_i of (17) is the rate that its velocity across p_i stands for.
+    Each mouse alone gives (v_ix, v_iy, w_i); w_i of equation (17) is the turn rate that its velocity
+    across p_i implies.
     """
 
-    time_s: Floats
-    single: Floats
-    fused: Floats
+    time_s: Floats  # (N,)
+    single: Floats  # (N, mice, 3) of each mouse alone: m/s, m/s, rad/s
+    fused: Floats  # (N, 3) of the filter
     truth: Floats  # (3,)
 
 
 def paper_run(mice: int, seed: int) -> PaperRun:
-    """The robot of the paper's chapter 4 at (1, 1) cm/s, each mouse with noise within ± 0.25 cm/s."""
+    """The robot of the paper's chapter 4 at (1, 1) cm/s, each mouse with an error within ±0.25 cm/s."""
     placed = ring(mice, RADIUS_M, COUNTS_PER_M)
     run = MiceRun(seed, DURATION_S, mice=placed, path="paper", errors="none", mouse_errors=PAPER_ERRORS)
     measurements = run.measurements()
@@ -65,12 +67,13 @@ def paper_run(mice: int, seed: int) -> PaperRun:
 
 
 def redundancy(mice: int, seeds: int) -> list[Redundancy]:
-    """Noise of v_x, v_y, ω with `mice` on a ring against that of each of them alone, over so many seeds.
+    """Noise of v_x, v_y, ω with `mice` on a ring and with each of them alone, over seeds 0 … seeds − 1.
 
-    The theory is that of (12): the square roots of the diagonal of (AᵀA)⁻¹ over those of one mouse by itself.
+    The theoretical ratio follows from equation (12): the square roots of the diagonal of (AᵀA)⁻¹ over those of one
+    mouse alone.
     """
     runs = [paper_run(mice, seed) for seed in range(seeds)]
-    # ω of (17) is that of a robot whose centre stands still; this one's moves, evenly, which the mean takes out.
+    # Equation (17) assumes that the robot's centre is at rest. Here it moves steadily: the mean removes that part.
     single = np.concatenate([run.single - run.single.mean(axis=0) for run in runs])
     fused = np.concatenate([run.fused - run.truth for run in runs])
     theory = _theory(mice)
@@ -81,7 +84,7 @@ def redundancy(mice: int, seeds: int) -> list[Redundancy]:
 
 
 def _theory(mice: int) -> list[float]:
-    """σ(ẋ) over what one mouse gives, for mice of one noise: 1, 1 and 1/d."""
+    """σ(ẋ) over the σ of one mouse (1, 1 and 1/d), for mice of equal noise."""
     rows = [row for m in ring(mice, RADIUS_M) for row in ((1.0, 0.0, -m.y_m), (0.0, 1.0, m.x_m))]
     a = np.array(rows)
     fused = np.sqrt(np.diag(np.linalg.inv(a.T @ a)))
