@@ -11,8 +11,8 @@ from typing import BinaryIO
 from linkpose.device.session import Placement, Session
 from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import create
-from linkpose.recording.writer import RecordingWriter, closing, metadata
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
+from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -26,21 +26,21 @@ class Recorder:
     def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool = False) -> None:
         """`path` None: convert only. Raises FileExists (unless `force`) and CannotWrite."""
         self._session = session
-        settings = Settings.of(session.hello)
+        settings = BoardSettings.of(session.hello)
         mouse_ports = max(settings.mouse_ports, len(rig.mouse))
         self._converter = Converter(settings, mouse_ports)
         self._writer: RecordingWriter | None = None
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
             head = metadata(session.hello, settings, session.port, rig, clock)
-            self._writer = RecordingWriter(path, head, mouse_ports, force)
+            self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force)
 
     def convert(self, placements: list[Placement]) -> Measurements:
         """The samples as a block of measurements. Their rows are with the operating system when this returns."""
-        rows = [self._converter.row(sample, *place) for sample, place in placements]
-        if self._writer is not None and rows:
-            self._writer.write_rows(rows)
-        return Measurements.of(rows)
+        block = self._converter.convert_placed([p.sample for p in placements], [p.place for p in placements])
+        if self._writer is not None and placements:
+            self._writer.write_block(block)
+        return block.measurements
 
     def close(self, ended: str) -> None:
         """Writes the closing line; `ended` is "duration", "interrupted" or "failure"."""

@@ -14,10 +14,10 @@ from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.device.ports import find_again, usb_identity
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
-from linkpose.sensors.conversion import Settings
+from linkpose.sensors.conversion import BoardSettings, Placed
 from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
-from linkpose.sensors.timeline import Gap, Placed, Timeline
+from linkpose.sensors.timeline import Gap, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
@@ -183,7 +183,7 @@ class Session:
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
         deadline = time.perf_counter() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
+        while BoardSettings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
@@ -345,7 +345,7 @@ class Session:
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
         before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
+        if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         if _configured(before) != _configured(hello):
             self.configure(_configured(before))

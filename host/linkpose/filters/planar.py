@@ -190,7 +190,7 @@ def _process(
     time_s: Floats,
     counts: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     is_ukf: bool,
     place: Placement,
     imu: ImuCalibration,

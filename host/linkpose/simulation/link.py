@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.barometer import Barometer
+from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
@@ -24,7 +25,7 @@ from linkpose.simulation import baro, imu
 from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
 from linkpose.wire.frames import sample
-from linkpose.wire.messages import IMU2_OFFSET_US_400_KHZ, IMU_OFFSET_US, HelloMouse, Sample, SampleFlags
+from linkpose.wire.messages import IMU2_OFFSET_US_400_KHZ, IMU_OFFSET_US, DeviceFamily, HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -309,21 +310,24 @@ class LinkRun:
 
     def measurements(self) -> Measurements:
         """The whole run as a recording of it would be read. Only of a run that ends."""
-        settings = Settings(
+        settings = BoardSettings(
             round(self.rate_hz),
             self.accel_range_g,
             self.gyro_range_deg_s,
             dlpf=0,
             baro_oversampling=self.oversampling,
-            bmp180=baro.DATASHEET_WORDS,
+            barometer=Barometer(DeviceFamily.BMP180, baro.DATASHEET_WORDS.words(), self.oversampling),
             mouse_ports=0,
+            imu_families=(DeviceFamily.MPU6050, DeviceFamily.MPU6050 * bool(self.hello_sensors & Sensors.IMU2)),
+            mag_family=DeviceFamily.QMC5883L * bool(self.hello_sensors & Sensors.MAG),
         )
         if self.count is None:
             raise LinkposeError("a run without an end has no whole recording: give it a duration")
         converter = Converter(settings)
-        return Measurements.of(
-            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
-        )
+        samples = list(self.samples())
+        raw = RawSamples.of(samples, converter.mouse_ports)
+        flags = np.array([sample.flags for sample in samples], dtype=np.int64)
+        return converter.convert(raw, np.arange(len(samples)) / self.rate_hz, flags)
 
     def _baro_of(self, tick: Integers, pressures: Integers) -> tuple[Integers, Integers]:
         """UT and UP that the SAMPLEs of these ticks carry: the last ones read."""
