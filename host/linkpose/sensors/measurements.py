@@ -12,7 +12,6 @@ from linkpose.errors import InvalidValue
 from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
-_ABSENT = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +31,20 @@ class Measurements:
     mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where flags say MICE_STALE
     flags: NDArray[np.uint32]  # (N,) wire.messages.SampleFlags
     # A second inertial sensor and a magnetometer; NaN (and False) in all rows if there is none.
-    accel2_m_s2: Floats = _ABSENT  # (N, 3) as the first sensor's, in the second sensor's axes
-    gyro2_rad_s: Floats = _ABSENT  # (N, 3)
-    imu2_temp_degC: Floats = _ABSENT  # (N,)
-    mag_uT: Floats = _ABSENT  # (N, 3) field in the magnetometer's axes, repeated until the next reading
-    mag_fresh: NDArray[np.bool_] = _ABSENT  # type: ignore[assignment]  # (N,) True where a new field arrived
+    accel2_m_s2: Floats = None  # type: ignore[assignment]  # (N, 3) as the first sensor's, in the second sensor's axes
+    gyro2_rad_s: Floats = None  # type: ignore[assignment]  # (N, 3)
+    imu2_temp_degC: Floats = None  # type: ignore[assignment]  # (N,)
+    mag_uT: Floats = None  # type: ignore[assignment]  # (N, 3) field in the magnetometer's axes, repeated until the next reading
+    mag_fresh: NDArray[np.bool_] = None  # type: ignore[assignment]  # (N,) True where a new field arrived
 
     def __post_init__(self) -> None:
         """Absent sensors become rows of NaN, without memory of their own."""
         size = len(self.time_s)
         absent = {"accel2_m_s2": (size, 3), "gyro2_rad_s": (size, 3), "imu2_temp_degC": (size,), "mag_uT": (size, 3)}
         for name, shape in absent.items():
-            if getattr(self, name) is _ABSENT:
+            if getattr(self, name) is None:
                 object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
-        if len(self.mag_fresh) != size:
+        if getattr(self, "mag_fresh") is None:  # noqa: B009
             object.__setattr__(self, "mag_fresh", np.broadcast_to(np.False_, size))
         if self.flags.dtype != np.uint32:  # one type: the filters are compiled for it
             object.__setattr__(self, "flags", self.flags.astype(np.uint32))
