@@ -60,6 +60,10 @@ Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
+class NotResumed(Disconnected):
+    """A board that was reset and could not be started again at once."""
+
+
 class AnotherBoard(BoardError):
     """Another board answers at the port than the one that the recording began with."""
 
@@ -110,7 +114,8 @@ class Session:
         )
         self._corrupt_before = Corrupt()
         try:
-            self.hello = self._handshake()
+            self.hello = self._first_hello = self._handshake()
+            self._wanted = _configured(self.hello)  # the settings that values are scaled by, after a reset too
         except BaseException:
             self._connection.close()
             raise
@@ -173,12 +178,19 @@ class Session:
     # ---- commands ----
 
     def configure(self, settings: Configure) -> Hello:
-        """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
-        self._command(settings, Command.CONFIGURE)
-        time.sleep(SETTLE_S)
-        self._connection.send(GetInfo())
-        self.hello = self._await(Hello, "GET_INFO")
-        return self.hello
+        """Puts settings in force and returns the HELLO that shows them.
+
+        Raises LinkposeError if the board refuses them, or does not keep them because it is reset again and again.
+        """
+        for _ in range(ATTEMPTS):
+            self._command(settings, Command.CONFIGURE)
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            self.hello = self._await(Hello, "GET_INFO")
+            if _configured(self.hello) == settings:
+                self._wanted = settings
+                return self.hello
+        raise LinkposeError("the board loses its settings: it is reset again and again; check its supply and its cable")
 
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
@@ -273,8 +285,10 @@ class Session:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
-                timeline.interrupted("cable")
+                reset = isinstance(error, NotResumed)
+                event = f"{error.reason}" if reset else f"{self.port} disappeared ({error.reason})"
+                self._notify(f"{event}; waiting for the board, Ctrl-C ends")
+                timeline.interrupted("reset" if reset else "cable")
                 yield []
                 yield from self._reconnect(timeline)
                 continue
@@ -294,11 +308,40 @@ class Session:
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
-        self._clock = DeviceClock()
-        self._tie_clocks()
-        self._started = self._command(Start(), Command.START)
+        wanted = self._wanted
+        for _ in range(ATTEMPTS):
+            self._clock = DeviceClock()
+            self._tie_clocks()
+            self._started = self._start(wanted)
+            if self._started is not None:
+                break
+            self._connection.send(Stop())
+            self.configure(wanted)
+        else:
+            raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
         self._pinged_at = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
+
+    def _start(self, wanted: Configure) -> Arrival | None:
+        """Starts the stream and checks that the board streams with the settings that its values are scaled by.
+
+        Returns what arrived behind the ACK; None if the board was reset on the way and has lost its settings.
+        """
+        started = self._command(Start(), Command.START)
+        self._connection.send(GetInfo())
+        messages, arrived_s = list(started.messages), started.time_s
+        for arrival in itertools.chain([started], self._arrivals(ANSWER_TIMEOUT_S)):
+            if arrival is not started:
+                messages += arrival.messages
+                arrived_s = arrival.time_s
+            hellos = [message for message in arrival.messages if isinstance(message, Hello)]
+            if hellos:
+                sound = all(hello.streaming and _configured(hello) == wanted for hello in hellos)
+                rest: list[Message | OtherProtocol] = [
+                    message for message in messages if not isinstance(message, Hello)
+                ]
+                return Arrival(arrived_s, rest, b"") if sound else None
+        return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
         arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
@@ -340,15 +383,20 @@ class Session:
             self._check_versions(message)
             self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
             timeline.interrupted("reset")
-            self._resume(message)
+            try:
+                self._resume(message)
+            except (WrongFirmware, AnotherBoard, Disconnected):
+                raise
+            except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
+                raise NotResumed(self.port, error) from error
 
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
-        before, self.hello = self.hello, hello
+        self.hello, before = hello, self._first_hello
         if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
-        if _configured(before) != _configured(hello):
-            self.configure(_configured(before))
+        if _configured(hello) != self._wanted:
+            self.configure(self._wanted)
         self._begin()
 
     def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:

@@ -26,6 +26,7 @@ from linkpose.sensors.conversion import (
     Converter,
     RawSamples,
 )
+from linkpose.sensors.devices import impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
@@ -194,7 +195,7 @@ def _from_capture(path: Path) -> Recording:
     capture = decode_capture(read_bytes(path))
     hellos = [(before, message) for before, message in capture.others if isinstance(message, Hello)]
     other = next((message for _, message in capture.others if isinstance(message, OtherProtocol)), None)
-    if other is not None:
+    if not hellos and other is not None:
         raise FileFormatError(
             path,
             f"{path} was captured with protocol {other.protocol_major}.{other.protocol_minor}, and this linkpose reads "
@@ -204,6 +205,9 @@ def _from_capture(path: Path) -> Recording:
         raise FileFormatError(path, f"{path} holds no HELLO of a board; it is not a raw capture")
     if not len(capture.samples):
         raise FileFormatError(path, f"{path} holds no sample; the board was never started")
+    for _, hello in hellos:
+        if wrong := impossible(hello):
+            raise FileFormatError(path, f"{path}: its HELLO says {wrong}, which is impossible; the capture is damaged")
     first = [hello for before, hello in hellos if before == 0]
     settings = BoardSettings.of(first[-1] if first else hellos[0][1])
     raw = capture.samples
