@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pty_board import PtyBoard
+from pty_board import PtyBoard, link_run
 from serial.tools import list_ports_common
 
 from linkpose.device import ports
@@ -20,8 +20,9 @@ from linkpose.device.session import Session
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
+from linkpose.simulation.board import DEFAULTS, SimulatedBoard
 from linkpose.wire.frames import encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping
 
 
 @pytest.fixture

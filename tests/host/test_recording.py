@@ -24,6 +24,7 @@ from linkpose.recording.table import read_table
 from linkpose.recording.writer import write_recording
 from linkpose.sensors import bmp180, mpu6050
 from linkpose.sensors.conversion import BoardSettings, Converter, Placed, RawSamples
+from linkpose.sensors.health import HealthMonitor
 from linkpose.sensors.measurements import Block, Measurements
 from linkpose.sensors.rig import Joint, Rig
 from linkpose.simulation import board
@@ -102,6 +103,7 @@ def test_live_csv_and_capture_give_the_same_measurements(tmp_path_factory, raw, 
     (folder / "r.bin").write_bytes(encode(hello) + b"".join(map(encode, raw)))
     converter = Converter(BoardSettings.of(hello))
     live = joined([converter.convert_placed([s], [Placed(0.01 * i, i, s.flags)]) for i, s in enumerate(raw)])
+    live, _ = HealthMonitor(100.0, {"imu": "ok", "baro": "ok"}).check(live)
     from_csv = load_recording(folder / "r.csv")
     from_capture = load_recording(folder / "r.bin").measurements
     assert equal(live, from_csv.measurements)
@@ -353,7 +355,7 @@ def test_a_reader_that_goes_away_is_no_traceback(recording):
     done = subprocess.run(command, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert done.returncode == 1
-    assert done.stderr.strip().splitlines()[-1] == "linkpose: the reader of the estimates has gone; stopped"
+    assert done.stderr.strip().splitlines()[-1] == "linkpose: the reader of the output has gone; stopped"
 
 
 def test_a_recording_ends_well_when_the_reader_of_its_estimates_goes_away(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -104,6 +103,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
+    if recording.unusable and not request.filter_names:
+        raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with while_compiling(console.say):
         measurements = recording.measurements
@@ -168,7 +169,7 @@ def _live(
             if len(block):
                 estimates = estimator.process(block)
                 sink.write(estimates)
-                view.show(estimates[-1], connected.session.health)
+                view.show(estimates[-1], lambda: connected.health)
 
         ended = live.run_board(connected, duration, handle)
         view.close()
@@ -176,6 +177,7 @@ def _live(
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
         _report_j2s(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        connected.check_usable()
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
@@ -251,10 +253,6 @@ class _Sink:
 
 
 def _print(text: str) -> None:
-    """Puts results on stdout at once. Raises LinkposeError when their reader has gone, as in `linkpose ... | head`."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has nowhere to go
-        raise LinkposeError("the reader of the estimates has gone; stopped") from None
+    """Put results on stdout at once."""
+    sys.stdout.write(text)
+    sys.stdout.flush()
