@@ -27,6 +27,7 @@ from linkpose.wire.messages import (
     Ack,
     Command,
     Configure,
+    DeviceState,
     GetInfo,
     Hello,
     Message,
@@ -48,6 +49,7 @@ ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 1.5
+SENSORS_TIMEOUT_S = 1.0  # the slowest sensor is set up 0.3 s after the firmware starts
 SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
@@ -160,9 +162,21 @@ class Session:
                     raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
+                    message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
         raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+
+    def _wait_for_sensors(self, hello: Hello) -> Hello:
+        """Gives sensors that are being set up the time for it; the latest HELLO."""
+        deadline = time.perf_counter() + SENSORS_TIMEOUT_S
+        while any(device.state == DeviceState.STARTING for device in hello.devices):
+            if time.perf_counter() > deadline:
+                break
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            hello = self._await(Hello, "GET_INFO")
+        return hello
 
     def _check_versions(self, hello: Hello) -> None:
         """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
