@@ -251,8 +251,8 @@ void Sampler::send_sample() {
   uint32_t flags = 0;
   uint8_t* end = body + sizeof head;
   if (head.sections & wire::sections::kImu) end = append_imu(0, end, flags);
-  if (head.sections & wire::sections::kImu2) end = append_imu(1, end, flags);
   if (head.sections & wire::sections::kBaro) end = append_baro(end, flags);
+  if (head.sections & wire::sections::kImu2) end = append_imu(1, end, flags);
   if (head.sections & wire::sections::kMag) end = append_mag(end, flags);
   // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
   const bool mice_read = tick_.serves_mice;
