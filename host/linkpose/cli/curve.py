@@ -22,8 +22,9 @@ class Canvas:
         if 0 <= x < self.columns and 0 <= y < self.rows:
             self._cells[y // 4][x // 2] |= _DOTS[y % 4][x % 2]
 
-    def line(self, x0: int, y0: int, x1: int, y1: int) -> None:
-        """Sets the dots from one to another."""
+    def line(self, start: tuple[int, int], end: tuple[int, int]) -> None:
+        """Sets the dots from one (x, y) to another."""
+        (x0, y0), (x1, y1) = start, end
         steps = max(abs(x1 - x0), abs(y1 - y0), 1)
         for step in range(steps + 1):
             self.dot(x0 + round((x1 - x0) * step / steps), y0 + round((y1 - y0) * step / steps))
@@ -60,7 +61,7 @@ def curve(
             continue
         x = round((1 - (end - time) / span_s) * (canvas.columns - 1))
         y = round((high - value) / (high - low) * (canvas.rows - 1))
-        canvas.line(*(before or (x, y)), x, y)
+        canvas.line(before or (x, y), (x, y))
         before = x, y
     return [f"{label:>{margin}}┤{line}" for label, line in zip(labels, canvas.lines(), strict=True)]
 
@@ -79,7 +80,7 @@ def path_map(xs: Sequence[float], ys: Sequence[float], width: int, height: int) 
     before: tuple[int, int] | None = None
     for x, y in known:
         here = round((x - left) / scale), round((top - y) / scale)
-        canvas.line(*(before or here), *here)
+        canvas.line(before or here, here)
         before = here
     lines = canvas.lines()
     if before is not None:

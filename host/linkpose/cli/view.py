@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import click
+
 from linkpose import quantities
 from linkpose.cli.curve import curve, path_map
 from linkpose.device.session import Health
@@ -56,8 +58,11 @@ class View:
         return self._live is not None
 
     def say(self, text: str) -> None:
-        """Prints a line above the view."""
-        self._live.console.print(text, markup=False, highlight=False)
+        """Prints a line above the view, or where the view was."""
+        if self._live is None:
+            click.echo(text, err=True)
+        else:
+            self._live.console.print(text, markup=False, highlight=False)
 
     def show(self, estimates: Floats, health: Callable[[], Health], status: str = "") -> None:
         """Takes the newest row of estimates (columns,), and redraws a few times a second.
