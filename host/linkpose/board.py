@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from linkpose.device import ports
 from linkpose.device.session import Health, Session
+from linkpose.errors import NoUsableData
 from linkpose.sensors.rig import Joint, Rig, as_rig
 from linkpose.wire.messages import Configure, Hello
 
@@ -104,8 +105,15 @@ class Board:
 
     @property
     def health(self) -> Health:
-        """Counts of samples, losses and corrupt frames so far, clock drift, and the board's own counters."""
-        return self.session.health()
+        """Counts of samples, losses and corrupt frames so far, clock drift, the board's own counters, and the state and
+        counts of each sensor."""
+        return replace(self.session.health(), sensors=self._recorder.monitor.as_dict())
+
+    def check_usable(self) -> None:
+        """Raises NoUsableData when no inertial sensor and no mouse has given usable data."""
+        monitor = self._recorder.monitor
+        if not monitor.is_usable:
+            raise NoUsableData(monitor.why_unusable)
 
     def record(self, path: str | PathLike[str], *, force: bool = False) -> None:
         """Writes what `stream` yields to a recording (CSV) too. Raises FileExists (unless `force`) and CannotWrite."""

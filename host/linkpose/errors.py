@@ -208,6 +208,10 @@ class NotPositiveDefinite(LinkposeError):
         self.matrix, self.where = matrix, where
 
 
+class NoUsableData(LinkposeError):
+    """No inertial sensor and no mouse gave usable data."""
+
+
 # ---- values ----
 
 

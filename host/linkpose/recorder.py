@@ -13,6 +13,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, metadata
 from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.health import HealthMonitor, expected_sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -29,6 +30,7 @@ class Recorder:
         settings = Settings.of(session.hello)
         mouse_ports = max(settings.mouse_ports, len(rig.mouse))
         self._converter = Converter(settings, mouse_ports)
+        self.monitor = HealthMonitor(settings.sample_rate_hz, expected_sensors(session.hello, mouse_ports))
         self._writer: RecordingWriter | None = None
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
@@ -36,11 +38,17 @@ class Recorder:
             self._writer = RecordingWriter(path, head, mouse_ports, force)
 
     def convert(self, placements: list[Placement]) -> Measurements:
-        """The samples as a block of measurements. Their rows are with the operating system when this returns."""
+        """The samples as a block of measurements, with NaN for readings that are worth nothing.
+
+        The recording keeps all readings as they came. Its rows are with the operating system when this returns.
+        """
         rows = [self._converter.row(sample, *place) for sample, place in placements]
         if self._writer is not None and rows:
             self._writer.write_rows(rows)
-        return Measurements.of(rows)
+        checked, changes = self.monitor.check(Measurements.of(rows))
+        for change in changes:
+            self._session.notify(str(change))
+        return checked
 
     def close(self, ended: str) -> None:
         """Writes the closing line; `ended` is "duration", "interrupted" or "failure"."""
@@ -51,7 +59,8 @@ class Recorder:
             board = {"frames_dropped": status.frames_dropped, "ticks_missed": status.ticks_missed} if status else None
             timeline = self._session.timeline
             with writer:
-                writer.close(closing(timeline, health.corrupt, health.drift_ppm, board=board, ended=ended))
+                more = {"board": board, "sensors": self.monitor.as_dict(), "ended": ended}
+                writer.close(closing(timeline, health.corrupt, health.drift_ppm, **more))
 
     def __enter__(self) -> Recorder:
         return self

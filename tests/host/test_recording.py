@@ -24,6 +24,7 @@ from linkpose.recording.table import read_table
 from linkpose.recording.writer import write_recording
 from linkpose.sensors import bmp180, mpu6050
 from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.health import HealthMonitor
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Joint, Rig
 from linkpose.simulation import board
@@ -95,6 +96,7 @@ def test_live_csv_and_capture_give_the_same_measurements(tmp_path_factory, raw, 
     (folder / "r.bin").write_bytes(encode(hello) + b"".join(map(encode, raw)))
     converter = Converter(Settings.of(hello))
     live = Measurements.of([converter.row(s, 0.01 * i, i, s.flags) for i, s in enumerate(raw)])
+    live, _ = HealthMonitor(100.0, {"imu": "ok", "baro": "ok"}).check(live)
     from_csv = load_recording(folder / "r.csv")
     from_capture = load_recording(folder / "r.bin").measurements
     assert equal(live, from_csv.measurements)

@@ -17,7 +17,7 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -106,6 +106,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
+    if recording.unusable and not request.filter_names:
+        raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with while_compiling(console.say):
         measurements = recording.measurements
@@ -200,6 +202,7 @@ def _live(
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
         if request.output:
             console.say(f"next: linkpose plot {request.output}")
+        connected.check_usable()
 
 
 def _title(board: Board) -> str:

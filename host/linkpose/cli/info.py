@@ -10,7 +10,8 @@ import click
 from linkpose.cli import options
 
 if TYPE_CHECKING:
-    from linkpose.device.session import Health, Session
+    from linkpose.cli.live import Console
+    from linkpose.device.session import Health, Placement, Session
     from linkpose.wire.messages import HelloDevice, Status
 
 OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of the drift
@@ -29,14 +30,30 @@ def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, 
     console = live.Console(quiet, verbose)
     with open_session(port, console.say) as session:
         tested = _self_test(session) if self_test else {}
-        live.run(session.stream(OBSERVED_S), lambda _: console.progress(lambda: "observing the connection ..."))
-        report = _report(session, session.health()) | tested
+        sensors = _observe(session, console)
+        report = _report(session, session.health()) | {"health": sensors} | tested
     if json_lines:
         click.echo(json.dumps(report))
     else:
         console.clear()
         for name, value in report.items():
             click.echo(f"{name.replace('_', ' '):18} {_text(value)}")
+
+
+def _observe(session: Session, console: Console) -> dict[str, Any]:
+    """Stream for a short time; the state and counts of each sensor."""
+    from linkpose.cli import live
+    from linkpose.recorder import Recorder
+    from linkpose.sensors.rig import Rig
+
+    recorder = Recorder(session, None, Rig())
+
+    def handle(placements: list[Placement]) -> None:
+        recorder.convert(placements)
+        console.progress(lambda: "observing the sensors ...")
+
+    live.run(session.stream(OBSERVED_S), handle)
+    return recorder.monitor.as_dict()
 
 
 def _report(session: Session, health: Health) -> dict[str, Any]:
@@ -106,5 +123,5 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_text(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{key.replace('_', ' ')} {item}" for key, item in value.items())
+        return ", ".join(f"{key.replace('_', ' ')} {_text(item)}" for key, item in value.items()) or "none"
     return "not known" if value is None else str(value)

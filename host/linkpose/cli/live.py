@@ -121,6 +121,11 @@ def health_line(health: Health) -> str:
     text += f", {health.corrupt.total} corrupt"
     if health.gaps:
         text += f", {len(health.gaps)} gaps"
+    faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
+    invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
+    saturated = sum(of.get("saturated", 0) for of in health.sensors.values())
+    text += f", {invalid} invalid" * bool(invalid) + f", {saturated} saturated" * bool(saturated)
+    text += "".join(f", {fault}" for fault in faults)
     if health.status and health.status.frames_dropped:
         text += f", {health.status.frames_dropped} dropped by the board"
     return text

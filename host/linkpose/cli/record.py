@@ -51,3 +51,4 @@ def command(
 
         live.run_board(connected, duration, handle)
         live.show_summary(console, connected.health, json_lines, f": {path}")
+        connected.check_usable()

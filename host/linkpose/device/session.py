@@ -7,7 +7,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
@@ -83,7 +83,8 @@ class Health:
     rate_hz: float
     drift_ppm: float | None
     drift_std_ppm: float | None
-    status: Status | None  # the board's own counters, as it last told them
+    status: Status | None  # the board's own counters, as it last sent them
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts, by sensor (sensors.health)
 
 
 class Session:
@@ -94,7 +95,7 @@ class Session:
 
     def __init__(self, port: str, notify: Notify, capture: BinaryIO | None = None) -> None:
         self.port = port
-        self._notify = notify
+        self.notify = notify
         self._capture = capture
         self._connection = Connection(port, capture)
         self._usb = usb_identity(port)
@@ -164,7 +165,7 @@ class Session:
             raise _other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
             older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
-            self._notify(
+            self.notify(
                 f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
                 f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
@@ -273,7 +274,7 @@ class Session:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
+                self.notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
                 timeline.interrupted("cable")
                 yield []
                 yield from self._reconnect(timeline)
@@ -282,7 +283,7 @@ class Session:
             if self._silent_s > LATE_S:
                 self._end_when_due(timeline)
         if timeline.missing_at_end:
-            self._notify(
+            self.notify(
                 f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
                 "are counted as lost"
             )
@@ -325,7 +326,7 @@ class Session:
         """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
         if self._silent_s - self._asked_s > SILENCE_S:
             if self._asked_s == 0.0:
-                self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
+                self.notify(f"no sample for {SILENCE_S:g} s; asking the board")
             self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
@@ -338,7 +339,7 @@ class Session:
             raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
-            self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
+            self.notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
             timeline.interrupted("reset")
             self._resume(message)
 
@@ -369,7 +370,7 @@ class Session:
                 return
             if obstacle and obstacle not in obstacles:
                 obstacles.add(obstacle)
-                self._notify(f"{obstacle}; still waiting")
+                self.notify(f"{obstacle}; still waiting")
 
     def _open_again(self) -> str | None:
         """Continue with the board that has returned. None: done; otherwise the obstacle, "" while it is absent."""
@@ -394,7 +395,7 @@ class Session:
             self._connection.close()
             return str(error)
         self._usb = usb_identity(port)
-        self._notify(f"the board is back at {port}; continuing, the gap is marked")
+        self.notify(f"the board is back at {port}; continuing, the gap is marked")
         return None
 
     # ---- health ----
@@ -427,6 +428,7 @@ def summary(health: Health) -> dict[str, Any]:
         "gaps": len(health.gaps),
         "duration_s": round(health.duration_s, 6),
         "rate_hz": round(health.rate_hz, 3),
+        "sensors": health.sensors,
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
 from linkpose.wire.messages import Hello, SampleFlags
 
+MOST_CHANGES = 10  # of sensors' states, in the remarks
 _T_WRAP = 1 << 32
 _SEQ_WRAP = 1 << 16
 
@@ -36,7 +37,9 @@ class Recording:
     rig: Rig | None  # the one in force while it was recorded; None of a raw capture
     sample_rate_hz: float
     metadata: dict[str, Any]
-    remarks: list[str]  # what the reader should know: a cut file, corrupt frames
+    remarks: list[str]  # what the reader should know: a cut file, corrupt frames, faulty sensors
+    health: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts by sensor (sensors.health)
+    unusable: str = ""  # why nothing can be estimated from it
 
     @property
     def dlpf(self) -> int | None:
@@ -52,9 +55,35 @@ def load_recording(path: str | PathLike[str]) -> Recording:
     Raises FileError, which names the file, the line and the reason, for anything else.
     """
     path = Path(path)
-    if path.suffix == ".bin":
-        return _from_capture(path)
-    return _from_csv(path)
+    return _checked(_from_capture(path) if path.suffix == ".bin" else _from_csv(path))
+
+
+def _checked(recording: Recording) -> Recording:
+    """The recording with NaN for readings that are worth nothing, and what is wrong with them."""
+    from linkpose.sensors.health import HealthMonitor
+
+    monitor = HealthMonitor(recording.sample_rate_hz, dict.fromkeys(_sensors_in(recording), "ok"))
+    measurements, changes = monitor.check(recording.measurements)
+    remarks = [f"{recording.path}: {change}" for change in changes[:MOST_CHANGES]]
+    if len(changes) > MOST_CHANGES:
+        remarks.append(f"{recording.path}: {len(changes) - MOST_CHANGES} more such changes")
+    return replace(
+        recording,
+        measurements=measurements,
+        remarks=[*recording.remarks, *remarks],
+        health=monitor.as_dict(),
+        unusable="" if monitor.is_usable else monitor.why_unusable,
+    )
+
+
+def _sensors_in(recording: Recording) -> list[str]:
+    """Sensors that the metadata lists, and those that gave a value."""
+    listed, block = recording.metadata.get("sensors"), recording.measurements
+    names = listed if isinstance(listed, list) else []
+    sensors = ["imu"] if "mpu6050" in names or np.isfinite(block.accel_m_s2).any() else []
+    sensors += ["baro"] if "bmp180" in names or np.isfinite(block.pressure_Pa).any() else []
+    counted = np.isfinite(block.mice_counts).any(axis=(0, 2))
+    return sensors + [f"mouse{port + 1}" for port in np.flatnonzero(counted).tolist()]
 
 
 # ---- CSV ----
