@@ -255,7 +255,7 @@ void Sampler::send_sample() {
   if (head.sections & wire::sections::kImu2) end = append_imu(1, end, flags);
   if (head.sections & wire::sections::kMag) end = append_mag(end, flags);
   // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
-  const bool mice_read = tick_.serves_mice;
+  const bool mice_read = tick_.has_mice;
   head.flags = flags | mice_.flags(mice_read);
   const uint8_t count = head.sections / kOneMouse;
   for (uint8_t i = 0; i < count; i++) {

@@ -54,6 +54,22 @@ class CannotWrite(FileError):
         self.reason = reason
 
 
+class TooFewRows(LinkposeError):
+    """Less than half of a filter's estimates have a reference: a score would be that of another run than the user's.
+
+    `rows` of `known` estimates have one, between `common_s` (from, to).
+    """
+
+    def __init__(
+        self, name: str, paths: tuple[object, object], rows: tuple[int, int], common_s: tuple[float, float]
+    ) -> None:
+        self.filter, (self.rows, self.known), self.common_s = name, rows, common_s
+        super().__init__(
+            f"only {self.rows} of {self.known} estimates of {name} in {paths[0]} have a reference in {paths[1]}, "
+            "less than half"
+        )
+
+
 # ---- ports and boards ----
 
 

@@ -1,4 +1,4 @@
-"""Compiles filters in a separate process, so that a board can be read at once.
+"""Compiles filters in separate processes, so that a board can be read at once.
 
 numba holds Python's global interpreter lock while it compiles: in this process, samples would wait. The other process
 (`python -m linkpose.precompile NAME...`) keeps the machine code on disk, from where this process loads it in a moment.
@@ -16,25 +16,36 @@ from linkpose.compiling import TEXT, can_keep_code, is_compiled, mark_compiled
 
 
 class Precompilation:
-    """Filters on their way to being compiled. A context manager: leaving it ends the other process."""
+    """Filters on their way to being compiled. A context manager: leaving it ends the processes."""
 
     def __init__(self, names: Sequence[str]) -> None:
-        """Starts to compile those of `names` that are not compiled yet, in this order."""
+        """Starts to compile those of `names` that are not compiled yet, in two processes.
+
+        One compiles the inertial filters, which share their steps and take longest. The other compiles the rest, those
+        that take least first, so that a first estimate appears soon.
+        """
         self._names = [*names, TEXT]
-        missing = [name for name in self._names if not is_compiled(name)]
-        self._process: subprocess.Popen[bytes] | None = None
-        if missing and can_keep_code():
-            command = [sys.executable, "-m", "linkpose.precompile", *missing]
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter
+        if not can_keep_code():
+            return
+        missing = [name for name in reversed(self._names) if not is_compiled(name)]
+        inertial = [name for name in missing if name.endswith("-inertial")]
+        for group in (inertial, [name for name in missing if name not in inertial]):
+            if not group:
+                continue
+            command = [sys.executable, "-m", "linkpose.precompile", *group]
             with contextlib.suppress(OSError):  # no other process: each filter is compiled here when it is first used
-                self._process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+                process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+                self._processes |= dict.fromkeys(group, process)
 
     def is_ready(self, name: str) -> bool:
         """Whether a filter can run without waiting for the compiler; also if nothing compiles it any more."""
-        return self._process is None or is_compiled(name) or self._process.poll() is not None
+        process = self._processes.get(name)
+        return process is None or is_compiled(name) or process.poll() is not None
 
     @property
     def waiting(self) -> list[str]:
-        """The filters that are not ready, in the order in which they are compiled."""
+        """The filters that are not ready."""
         return [name for name in self._names if not self.is_ready(name)]
 
     @property
@@ -47,17 +58,18 @@ class Precompilation:
         return f"Compiling filters (first run only) {done + 1}/{len(self._names)} {waiting[0]}"
 
     def wait(self) -> None:
-        """Waits until the other process has ended."""
-        if self._process is not None:
-            self._process.wait()
+        """Waits until the other processes have ended."""
+        for process in self._processes.values():
+            process.wait()
 
     def __enter__(self) -> Precompilation:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            self._process.wait()
+        for process in self._processes.values():
+            if process.poll() is None:
+                process.terminate()
+                process.wait()
 
 
 def compile_here(name: str) -> None:

@@ -197,7 +197,7 @@ def test_the_ending_names_the_format_and_force_replaces(tmp_path, estimate, endi
     with pytest.raises(LinkposeError, match="exists already"):
         CliRunner().invoke(plot.command, [estimate, "-o", str(picture)], catch_exceptions=False)
     assert CliRunner().invoke(plot.command, [estimate, "-o", str(picture), "--force"]).exit_code == 0
-    with pytest.raises(LinkposeError, match=r"ends in \.png, \.svg, \.pdf"):
+    with pytest.raises(LinkposeError, match=r"must end in \.png, \.svg, \.pdf"):
         CliRunner().invoke(plot.command, [estimate, "-o", str(tmp_path / "p.gif")], catch_exceptions=False)
 
 

@@ -348,7 +348,7 @@ def test_a_reader_that_goes_away_is_no_traceback(recording):
     done = subprocess.run(command, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert done.returncode == 1
-    assert done.stderr.strip().splitlines()[-1] == "linkpose: the reader of the estimates has gone; stopped"
+    assert done.stderr.strip().splitlines()[-1] == "linkpose: the reader of the output has gone; stopped"
 
 
 def test_a_recording_ends_well_when_the_reader_of_its_estimates_goes_away(tmp_path):

@@ -49,6 +49,10 @@ class MouseCalibration:
     angle_std_deg: float
     residual_mm: float  # rms over all drives
 
+    def as_dict(self) -> dict[str, int | float]:
+        """The object that `calibrate mice --json` prints."""
+        return {name: round(getattr(self, name), 5) for name in self.__slots__}
+
 
 @dataclass(frozen=True, slots=True)
 class _DriveSums:

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from linkpose import __version__
+from linkpose.cli.streams import safe_streams
 from linkpose.errors import LinkposeError, printable
 
 # Command -> what it does.
@@ -64,18 +65,26 @@ def group() -> None:
 
 def main() -> None:
     """Entry point. Every failure a user can cause ends here as one sentence and a status."""
+    with safe_streams():
+        status = _run()
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run the command; its exit status."""
     try:
         status = group.main(prog_name="linkpose", standalone_mode=False)
+        sys.stdout.flush()
     except click.exceptions.Abort:
-        status = 130
+        return 130
     except click.ClickException as error:
         error.show()
-        status = error.exit_code
+        return error.exit_code
     except LinkposeError as error:
         from linkpose.cli.cures import sentence
 
         click.echo(f"linkpose: {printable(sentence(error))}", err=True)
-        status = 1
+        return 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
@@ -83,5 +92,5 @@ def main() -> None:
         click.echo(
             f"linkpose: unexpected {printable(what)}; please report it with what LINKPOSE_DEBUG=1 shows", err=True
         )
-        status = 1
-    sys.exit(status if isinstance(status, int) else 0)
+        return 1
+    return status if isinstance(status, int) else 0

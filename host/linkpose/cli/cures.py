@@ -13,6 +13,9 @@ FLASH = "type `linkpose flash`"
 CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.FileExists: lambda e: "name another file or add --force to replace it",
     errors.CannotWrite: lambda e: "name a file in a folder you may write to",
+    errors.TooFewRows: lambda e: (
+        f"to score the common part alone, add --from {e.common_s[0]:.6g} --to {e.common_s[1]:.6g}"
+    ),
     errors.PortNotFound: lambda e: "`linkpose ports` lists those there are",
     errors.NotASerialPort: lambda e: "`linkpose ports` lists those there are",
     errors.NoBoardFound: lambda e: (

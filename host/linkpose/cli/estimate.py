@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -284,10 +283,6 @@ class _Sink:
 
 
 def _print(text: str) -> None:
-    """Puts results on stdout at once. Raises LinkposeError when their reader has gone, as in `linkpose ... | head`."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has nowhere to go
-        raise LinkposeError("the reader of the estimates has gone; stopped") from None
+    """Put results on stdout at once."""
+    sys.stdout.write(text)
+    sys.stdout.flush()

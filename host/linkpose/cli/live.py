@@ -96,16 +96,22 @@ def run_board(board: Board, duration_s: float | None, handle: Callable[[Measurem
 
 @contextlib.contextmanager
 def ending_well() -> Iterator[None]:
-    """Within this context, SIGTERM ends a run as Ctrl-C does."""
+    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does.
+
+    A signal that is ignored, as `nohup` ignores SIGHUP, stays so.
+    """
 
     def interrupt(*_: int | FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    names = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {each: signal.signal(each, interrupt) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def show_summary(console: Console, health: Health, json_lines: bool, where: str) -> None:

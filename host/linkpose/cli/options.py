@@ -159,6 +159,11 @@ def simulated_outputs(what: str) -> Callable[[Function], Function]:
     return decorate
 
 
+def next_and_quiet(function: Function) -> Function:
+    """-q of a command that ends with what to type next."""
+    return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
+
+
 def show_next(quiet: bool, following: str) -> None:
     """What to type next, on stderr."""
     if not quiet:

@@ -26,7 +26,7 @@ from linkpose.sensors.rig import Vector
 )
 @click.option("--rests", is_flag=True, help="Lay the sensor on its six sides in turn, as `calibrate imu` needs it.")
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Do not print what to type next.")
+@options.next_and_quiet
 def command(
     output: Path,
     truth: Path,

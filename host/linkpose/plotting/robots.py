@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import order_legend, shade_unknown
+from linkpose.plotting.panels import shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.sensors.measurements import Floats
@@ -63,10 +63,11 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
         axes.plot(x[keep], y[keep], label=track.label, **style)
         _mark(axes, track, str(style["color"]))
     axes.set_aspect("equal", "datalim")
+    axes.set_box_aspect(1.0)
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
-    order_legend(axes, [track.label for track in tracks])
+    legend_above(axes, 3, [track.label for track in tracks])
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
@@ -94,7 +95,7 @@ def _mark(axes: Axes, track: Track, colour: str) -> None:
     if HEADING in track.values:
         angle = np.radians(track.values[HEADING][at])
         axes.quiver(
-            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.004, scale=28, zorder=4
+            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.007, scale=20, zorder=4
         )
     if X in track.std and Y in track.std:
         for i in at:
@@ -137,6 +138,7 @@ def _over_time(
     reference = of(sources.reference) if sources.reference is not None else None
     if reference is not None and sources.reference is not None:
         draw(axes, sources.reference.time_s, reference[0], label=sources.reference.label, **TRUTH)
+    view_values(axes, [value for _, (value, _) in drawn])
     shade_unknown(axes, sources.tracks)
     finish(axes, label)
 

@@ -8,14 +8,14 @@ from typing import NamedTuple
 VERSION = "0.1.0"
 PROTOCOL_MAJOR = 2
 PROTOCOL_MINOR = 0
-SCHEMA_CRC = 0xcc40660e
+SCHEMA_CRC = 0x646da189
 BAUD = 250000
 MAX_FRAME = 132
 
 # Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-IMU_OFFSET_US = 13
-IMU2_OFFSET_US_400_KHZ = 540
-IMU2_OFFSET_US_100_KHZ = 1680
+IMU_OFFSET_US = 41
+IMU2_OFFSET_US_400_KHZ = 568
+IMU2_OFFSET_US_100_KHZ = 1708
 
 
 class ResetCause(IntFlag):

@@ -1,5 +1,6 @@
 #include "Clock.h"
 
+#include <Messages.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <util/atomic.h>
@@ -13,14 +14,16 @@ namespace {
 
 constexpr uint32_t kStepsPerSecond = F_CPU / 8;
 
-// The burst begins this many steps after the tick: more than the longest time for which another interrupt or a locked
-// section can hold the tick's interrupt up, so that all bursts begin at the same distance.
-constexpr uint8_t kBurstDelaySteps = 24;
+// The burst begins this many 0.5 us steps after the tick: longer than another interrupt or a locked section can delay the
+// tick's interrupt, so that all bursts begin at the same distance from their ticks. The longest are the pin changes, 24 us
+// when three clocks fall at once, and 10 us for port 4. A larger value delays every burst; wire::kImuOffsetUs follows it.
+constexpr uint8_t kBurstDelaySteps = 80;
+static_assert(kBurstDelaySteps / 2 + 1 == wire::kImuOffsetUs, "the schema states the distance");
 
 volatile uint32_t tick_number;
 volatile uint32_t tick_us;
 volatile uint8_t tick_half_us;  // 0 or 1 step on top of tick_us
-volatile bool tick_serves_mice;
+volatile bool tick_has_mice;
 volatile uint16_t period_steps;
 volatile uint16_t next_period_steps;
 
@@ -49,7 +52,7 @@ Tick tick() {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     latest.number = tick_number;
     latest.t_us = tick_us;
-    latest.serves_mice = tick_serves_mice;
+    latest.has_mice = tick_has_mice;
   }
   return latest;
 }
@@ -87,7 +90,7 @@ ISR(TIMER1_COMPA_vect) {
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
   twi::start_bursts();
-  clock::tick_serves_mice = ps2::start_prepared();
+  clock::tick_has_mice = ps2::start_armed();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
   clock::tick_us += (clock::period_steps >> 1) + (halves >> 1);

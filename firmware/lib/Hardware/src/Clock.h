@@ -10,7 +10,7 @@ namespace clock {
 struct Tick {
   uint32_t number;  // of ticks since boot
   uint32_t t_us;
-  bool serves_mice;  // what the mice were asked at the last such tick is answered, and they are asked anew
+  bool has_mice;  // the SAMPLE of this tick carries the movement of the mice
 };
 
 void begin(uint16_t rate_hz);

@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kProtocolMajor = 2;
 constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0xcc40660e;
+constexpr uint32_t kSchemaCrc = 0x646da189;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -21,9 +21,9 @@ constexpr uint8_t kMaxPayloadToHost = 109;
 constexpr uint8_t kMaxPayloadToBoard = 13;
 
 // Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-constexpr uint16_t kImuOffsetUs = 13;
-constexpr uint16_t kImu2OffsetUs400Khz = 540;
-constexpr uint16_t kImu2OffsetUs100Khz = 1680;
+constexpr uint16_t kImuOffsetUs = 41;
+constexpr uint16_t kImu2OffsetUs400Khz = 568;
+constexpr uint16_t kImu2OffsetUs100Khz = 1708;
 
 // Why the board started: the ATmega328P's MCUSR, and `hung` if the watchdog interrupt stored the program counter.
 namespace reset_cause {
