@@ -166,7 +166,7 @@ def test_other_tools_read_it(recording):
     lines = recording.read_text().splitlines()
     assert lines[0] == "# linkpose recording 1"
     assert json.loads(lines[1][1:])["settings"]["sample_rate_hz"] == 100
-    assert lines[2].split(",") == columns.names(0)
+    assert lines[2].split(",") == columns.names(columns.Layout(0))
     assert json.loads(lines[-1][1:])["samples"] == 300
 
 
@@ -221,7 +221,7 @@ BAD_FILES = {
     ),
     "flags out of range": (
         lambda lines: [*lines[:5], lines[5].rpartition(",")[0] + ",-1\n", *lines[6:]],
-        "line 6: flags must be a number from 0 to 65535",
+        "line 6: flags must be a number from 0 to 4294967295",
     ),
     "an unknown rig key": (
         lambda lines: swap(lines, 1, '"j2s_m"', '"j2s_mm"'),
