@@ -13,6 +13,7 @@ from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
+from linkpose.localization.grid import GridMap
 from linkpose.plotting import lines
 from linkpose.plotting.canvas import COLOURS
 from linkpose.recording.table import read_table
@@ -129,6 +130,23 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
     (bar,) = mice.collections[0].get_paths()
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_map_and_beacons_lie_under_the_path(tmp_path):
+    """A map whose own axes are turned by 90°: its corners are where map_server puts them."""
+    t = np.arange(50) / 100
+    file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
+    grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
+    scene = plotting.Scene(grid, {"A1": (3.0, 4.0, 9.0)})
+    figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
+    (path,) = figure.axes
+    (image,) = path.images
+    corner = (image.get_transform() - path.transData).transform([(4.0, 2.0)])  # 8 × 4 cells of 0.5 m
+    assert np.allclose(corner, [(-1.0, 6.0)])
+    beacon = next(line for line in path.lines if line.get_label() == "beacons")
+    assert (beacon.get_xdata()[0], beacon.get_ydata()[0]) == (3.0, 4.0)
+    assert [text.get_text() for text in path.texts] == ["A1"]
+    assert path.get_ylim()[1] >= 6.0
 
 
 def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):

@@ -129,14 +129,15 @@ class MiceRun:
         *,
         mouse_errors: MouseErrors | None = None,
         faults: tuple[Fault, ...] = (),
+        drive: Drive | None = None,
         length_m: float = 2.0,
         accel_range_g: int = 8,
         gyro_range_deg_s: int = 1000,
     ) -> None:
         """`mice` are what a user would write into a rig file, three on the paper's triangle unless given; what they are
         differs by `errors` ("calibrated", "datasheet", "none") or `mouse_errors`. `path` is "drive", "paper" (its
-        steady (1, 1) cm/s), "line" (of `length_m`) or "turn" (a full one on the spot). `duration_s` None never ends (a
-        live board). Raises LinkposeError for a value that cannot be.
+        steady (1, 1) cm/s), "line" (of `length_m`) or "turn" (a full one on the spot); `drive` takes its place.
+        `duration_s` None never ends (a live board). Raises LinkposeError for a value that cannot be.
         """
         mice = ring(3) if mice is None else mice
         _check(seed, duration_s, rate_hz, len(mice), path, errors, faults, length_m)
@@ -145,7 +146,7 @@ class MiceRun:
         self.accel_range_g, self.gyro_range_deg_s, self.faults = accel_range_g, gyro_range_deg_s, faults
         self._mouse_errors = mouse_errors or LEVELS[errors]
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
-        self._drive = _drive(path, seed, duration_s, length_m)
+        self._drive = drive or _drive(path, seed, duration_s, length_m)
         self._track = Track(self._drive)
         self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
         self._place = np.array([(mouse.x_m, mouse.y_m) for mouse in mice])
