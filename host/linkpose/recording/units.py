@@ -103,16 +103,17 @@ def _rate(gyro_rad_s: Floats) -> str:
 
 
 def _time(median_step_s: float, rate_hz: float | None) -> str:
+    steps = f"time_s goes in steps of {median_step_s:g} s (median)"
+    if median_step_s > _LONGEST_STEP_S:
+        unit, factor = ("milliseconds", 1000) if median_step_s < 1000 * _LONGEST_STEP_S else ("microseconds", 1_000_000)
+        if rate_hz is None or 0.5 < median_step_s * rate_hz / factor < 2.0:
+            return f"{steps}: is it in {unit}? divide it by {factor}"
     if rate_hz and median_step_s > 0 and not 0.5 < median_step_s * rate_hz < 2.0:
-        factor = 1 / (median_step_s * rate_hz)
         return (
-            f"time_s goes in steps of {median_step_s:g} s (median), and the file's rate is {rate_hz:g} Hz: "
-            f"multiply time_s by {factor:.3g}, or correct sample_rate_hz in line 2"
+            f"{steps}, and the file's rate is {rate_hz:g} Hz: multiply time_s by {1 / (median_step_s * rate_hz):.3g}, "
+            "or correct sample_rate_hz in line 2"
         )
-    if not median_step_s > _LONGEST_STEP_S:
-        return ""
-    unit, factor = ("milliseconds", 1000) if median_step_s < 1000 * _LONGEST_STEP_S else ("microseconds", 1_000_000)
-    return f"time_s goes in steps of {median_step_s:g} s (median): is it in {unit}? divide it by {factor}"
+    return ""
 
 
 def _of_usual_size(name: str, median: float, usual: float, units: Sequence[tuple[str, str]]) -> str:
