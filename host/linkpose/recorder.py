@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from linkpose.device.session import Placement, Session
-from linkpose.errors import LinkposeError
+from linkpose.errors import InvalidValue, LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
@@ -26,6 +26,8 @@ class Recorder:
 
     def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool = False) -> None:
         """`path` None: convert only. Raises FileExists (unless `force`) and CannotWrite."""
+        if path is not None and path.suffix == ".bin":
+            raise InvalidValue(str(path), "is not a name for a recording, which is a CSV file: .bin is a raw capture")
         self._session = session
         settings = BoardSettings.of(session.hello)
         mouse_ports = max(settings.mouse_ports, len(rig.mouse))

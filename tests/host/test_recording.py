@@ -374,21 +374,19 @@ def test_a_recording_ends_well_when_the_reader_of_its_estimates_goes_away(tmp_pa
 
 
 def test_kill_9_at_any_moment_leaves_a_readable_file(tmp_path):
+    """What the file held before the signal is still there, and at most one unfinished row behind it is left out."""
     rng = np.random.default_rng(4)
-    for attempt, moment in enumerate(rng.uniform(0.0, 0.5, 8)):
+    for attempt, lines in enumerate(rng.integers(4, 60, 6).tolist()):
         path = tmp_path / f"{attempt}.csv"
         process = subprocess.Popen([*CLI, "record", path, "--port", "sim://link", "-q"], env=ENVIRONMENT)
-        deadline = time.monotonic() + 20
-        while not (path.exists() and path.read_bytes().count(b"\n") > 5):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        began = time.monotonic()
-        time.sleep(moment)
+        while not (path.exists() and path.read_bytes().count(b"\n") >= lines):
+            assert process.poll() is None
+            time.sleep(0.002)
         process.kill()
         process.wait()
         table = read_table(path, "recording")
-        assert table.columns["time_s"][-1] > moment - 1.0
-        assert len(table) <= (time.monotonic() - began) * 100 + 20
+        assert len(table) >= lines - 3  # three lines of head
+        assert len(table) >= path.read_bytes().count(b"\n") - 3
         assert table.closing is None
 
 

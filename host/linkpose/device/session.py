@@ -56,6 +56,9 @@ PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
 LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
 RECEIVE_TIMEOUT_S = 0.1
+MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
+STILL_SAMPLES = 10  # with the same time stamp
+JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
 
 Answer = TypeVar("Answer", bound="Message")
@@ -111,7 +114,11 @@ class Session:
         self._token = 0
         self._status: Status | None = None
         self._started: Arrival | None = None  # what came together with the ACK of START
-        self._pinged_at = 0.0  # s, perf_counter
+        self._pinged_at = self._looked_s = 0.0  # s, perf_counter
+        self._unread_bytes = 0  # since the last sample, that belong to no message
+        self._last_stamp: tuple[int, int] | None = None  # seq and t_us of the last sample
+        self._still = 0  # samples in a row with the same t_us
+        self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
             0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
         )
@@ -334,8 +341,10 @@ class Session:
             self.configure(wanted)
         else:
             raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
-        self._pinged_at = time.perf_counter()
+        self._pinged_at = self._looked_s = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
+        self._unread_bytes = self._still = 0
+        self._last_stamp = None
 
     def _start(self, wanted: Configure) -> Arrival | None:
         """Starts the stream and checks that the board streams with the settings that its values are scaled by.
@@ -364,14 +373,18 @@ class Session:
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
-        if arrival is None:
-            self._silent_s += RECEIVE_TIMEOUT_S  # not by the clock: a suspended program has not waited
+        waited_s, self._looked_s = now - self._looked_s, now
+        if arrival is None or not arrival.messages:
+            self._unread_bytes += len(arrival.data) if arrival else 0
+            self._silent_s += min(waited_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
             self._ask_when_silent()
             return []
         placements = []
         for message in arrival.messages:
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
+                self._unread_bytes = 0
+                self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
@@ -379,11 +392,31 @@ class Session:
                 self._hear(message, arrival, timeline)
         return placements
 
+    def _check_clock(self, sample: Sample, timeline: Timeline) -> None:
+        """Report a board clock that stands still or jumps against its own count of ticks, once each."""
+        seq, t_us = self._last_stamp or (sample.seq, sample.t_us)
+        self._last_stamp = (sample.seq, sample.t_us)
+        ticks = (sample.seq - seq) % (1 << 16)
+        off_s = ((sample.t_us - t_us + (1 << 31)) % (1 << 32) - (1 << 31)) * 1e-6 - ticks / self.hello.sample_rate_hz
+        self._still = self._still + 1 if ticks and sample.t_us == t_us else 0
+        fault = ""
+        if self._still == STILL_SAMPLES:
+            fault = "stands still"
+        elif abs(off_s) > JUMP_S and ticks < JUMP_S * self.hello.sample_rate_hz:
+            fault = f"jumped by {off_s:.2f} s"
+        if fault and fault.split()[0] not in self._clock_faults:
+            self._clock_faults.add(fault.split()[0])
+            self.notify(
+                f"{timeline.duration_s:.2f} s: the board's clock {fault}; the times from here on are doubtful. Replace "
+                "the board if it happens again"
+            )
+
     def _ask_when_silent(self) -> None:
         """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
         if self._silent_s - self._asked_s > SILENCE_S:
             if self._asked_s == 0.0:
-                self.notify(f"no sample for {SILENCE_S:g} s; asking the board")
+                noise = f", only {self._unread_bytes} bytes of noise" if self._unread_bytes > MOST_UNREAD_BYTES else ""
+                self.notify(f"no sample for {SILENCE_S:g} s{noise}; asking the board")
             self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
@@ -410,6 +443,17 @@ class Session:
         self.hello, before = hello, self._first_hello
         if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
+        for old, new in zip(before.devices, hello.devices, strict=True):
+            if old.id and new.id and (old.address, old.id) != (new.address, new.id):
+                raise AnotherBoard(
+                    f"another board answers at {self.port} now (a sensor has the id {new.id:#04x} instead of "
+                    f"{old.id:#04x}); record it into a file of its own"
+                )
+        if before.source_revision != hello.source_revision:
+            self.notify(
+                f"the board's firmware is another one now: source revision {hello.source_revision:08x} instead of "
+                f"{before.source_revision:08x}"
+            )
         if _configured(hello) != self._wanted:
             self.configure(self._wanted)
         self._begin()

@@ -77,6 +77,8 @@ def _checked(recording: Recording) -> Recording:
 
     monitor = HealthMonitor(recording.sample_rate_hz, dict.fromkeys(_sensors_in(recording), "ok"))
     measurements, changes = monitor.check(recording.measurements)
+    if any("pressure_Pa" in remark for remark in recording.remarks):  # another unit, not a faulty sensor
+        changes = [change for change in changes if change.sensor != "baro"]
     remarks = [f"{recording.path}: {change}" for change in changes[:MOST_CHANGES]]
     if len(changes) > MOST_CHANGES:
         remarks.append(f"{recording.path}: {len(changes) - MOST_CHANGES} more such changes")
@@ -105,6 +107,7 @@ def _sensors_in(recording: Recording) -> list[str]:
 def _from_csv(path: Path) -> Recording:
     table = read_table(path, "recording")
     mouse_ports = _check_columns(table)
+    _check_time(table)
     has_imu = all(name in table.columns for name in columns.ACCEL + columns.GYRO)
     if not (has_imu or mouse_ports):
         missing = [name for name in columns.ACCEL + columns.GYRO if name not in table.columns]
@@ -122,7 +125,7 @@ def _from_csv(path: Path) -> Recording:
         **_other_sensors(table),
     )
     remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
-    remarks += suspicions(path, measurements)
+    remarks += suspicions(path, measurements, _stated_rate(table))
     rig = Rig.from_dict(_metadata_object(table, "rig"), f"{path}, line 2") if "rig" in table.metadata else None
     return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
 
@@ -169,7 +172,14 @@ def _vectors(table: Table, names: tuple[str, ...]) -> Floats:
 def _fresh(table: Table) -> NDArray[np.bool_]:
     """As the file says, or where the pressure changes in a file that does not say."""
     if "baro_fresh" in table.columns:
-        return np.asarray(table.columns["baro_fresh"] == 1)
+        fresh = table.columns["baro_fresh"]
+        wrong = np.flatnonzero(~np.isin(fresh, (0, 1)) & ~np.isnan(fresh))
+        if len(wrong):
+            line = table.first_line + int(wrong[0])
+            raise FileFormatError(
+                table.path, f"{table.path}, line {line}: baro_fresh is {fresh[wrong[0]]:g}; it must be 0 or 1", line
+            )
+        return np.asarray(fresh == 1)
     pressure = _column(table, "pressure_Pa")
     return np.asarray(np.isfinite(pressure) & (np.diff(pressure, prepend=np.nan) != 0))
 
@@ -205,14 +215,30 @@ def _metadata_object(table: Table, name: str) -> dict[str, Any]:
     return part
 
 
-def _rate(table: Table) -> float:
-    """The sample rate that the metadata tells, or else the usual interval's."""
+def _stated_rate(table: Table) -> float | None:
+    """The sample rate in the metadata, Hz."""
     rate = _metadata_object(table, "settings").get("sample_rate_hz")
-    if isinstance(rate, int | float) and rate > 0:
-        return float(rate)
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _rate(table: Table) -> float:
+    """The sample rate in the metadata, or else of the usual interval."""
     intervals = np.diff(table.columns["time_s"])
     usual = float(np.median(intervals[intervals > 0])) if np.any(intervals > 0) else 0.01
-    return 1.0 / usual
+    return _stated_rate(table) or 1.0 / usual
+
+
+def _check_time(table: Table) -> None:
+    """Raises FileFormatError when a time is not finite, or all are the same."""
+    time_s = table.columns["time_s"]
+    wrong = np.flatnonzero(~np.isfinite(time_s))
+    if len(wrong):
+        line = table.first_line + int(wrong[0])
+        raise FileFormatError(
+            table.path, f"{table.path}, line {line}: time_s is {time_s[wrong[0]]}; it must be a number of seconds", line
+        )
+    if len(time_s) > 1 and np.all(time_s == time_s[0]):
+        raise FileFormatError(table.path, f"{table.path}: time_s is {time_s[0]:g} in all rows; it must increase")
 
 
 # ---- raw capture ----
