@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.errors import printable
 
 if TYPE_CHECKING:
     from linkpose.plotting import Scene
@@ -50,7 +51,7 @@ def command(
     plotting.save(figure, output, force)
     for remark in [remark for table in tables for remark in table.remarks] + remarks:
         if not quiet:
-            click.echo(remark, err=True)
+            click.echo(printable(remark), err=True)
     click.echo(output)
 
 
