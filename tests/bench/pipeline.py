@@ -16,7 +16,7 @@ from _report import Row, report
 
 from linkpose.estimation import EstimateWriter, Estimator
 from linkpose.filters import ALL_SENSORS
-from linkpose.recording.writer import RecordingWriter, metadata
+from linkpose.recording.writer import RecordingWriter, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.simulation import board
