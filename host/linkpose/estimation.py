@@ -16,7 +16,7 @@ from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeEr
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, load_recording
-from linkpose.sensors.conversion import TIME_DECIMALS, Settings
+from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
@@ -81,7 +81,7 @@ class Estimator:
     @staticmethod
     def for_board(names: Sequence[str], board: Board) -> Estimator:
         """An estimator for a connected board's stream. Raises as the constructor does."""
-        settings = Settings.of(board.hello)
+        settings = BoardSettings.of(board.hello)
         rig = board.rig.with_delay_of(settings.dlpf)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
