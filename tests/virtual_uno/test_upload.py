@@ -1,7 +1,7 @@
 """`linkpose flash` as a user types it, through Optiboot on the emulated board.
 
-The command waits by the wall clock: the emulated bootloader must answer within 1.6 s, for which it needs 0.5 s of its own
-time. Every other test of the upload runs in the board's time (test_bootloader.py).
+The command waits by the wall clock: the emulated bootloader must answer within 1.6 s, for which it needs 0.5 s of its
+own time. Every other test of the upload runs in the board's time (test_bootloader.py).
 """
 
 from __future__ import annotations
