@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from linkpose import filters, quantities
+from linkpose.compiling import TEXT
 from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, load_recording
-from linkpose.sensors.conversion import TIME_DECIMALS, Settings
+from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
@@ -84,7 +85,7 @@ class Estimator:
     @staticmethod
     def for_board(names: Sequence[str], board: Board) -> Estimator:
         """An estimator for a connected board's stream. Raises as the constructor does."""
-        settings = Settings.of(board.hello)
+        settings = BoardSettings.of(board.hello)
         rig = board.rig.with_delay_of(settings.dlpf)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
@@ -156,6 +157,64 @@ class Estimator:
             }
             for row in estimates.tolist()
         ]
+
+
+class LiveEstimator:
+    """An estimator whose filters may become ready while measurements arrive already.
+
+    A filter that is not ready yet catches up from the buffered measurements, so every estimate is the same, to the last
+    digit, as if all filters had run from the first sample on. Rows are complete when all filters have processed them.
+    """
+
+    def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
+        """`is_ready` says of a filter's name, and of compiling.TEXT, whether it can run now; if so, it always can."""
+        self._filters = estimator.filters
+        self._width = [len(f.columns) for f in estimator.filters]
+        self._is_ready = is_ready
+        self._blocks: list[Measurements] = []  # not yet processed by all filters
+        self._results: list[list[Floats]] = [[] for _ in self._filters]  # of these blocks, filter by filter
+
+    def process(self, block: Measurements) -> tuple[Floats, Floats]:
+        """Takes the next block, which may be empty. Returns the rows that are complete now, and the newest row.
+
+        Complete rows come in order, none is left out; the newest row (columns,) has NaN for filters that are not ready,
+        and is empty before the first sample.
+        """
+        if len(block):
+            self._blocks.append(block)
+        for f, results in zip(self._filters, self._results, strict=True):
+            if len(results) < len(self._blocks) and self._is_ready(f.name):
+                results.extend(f.process(waiting) for waiting in self._blocks[len(results) :])
+        return self._complete_rows(), self._newest
+
+    def finish(self) -> Floats:
+        """The rows that were not complete yet. All filters must be ready, or are compiled now."""
+        self._is_ready = lambda _: True
+        rows, _ = self.process(Measurements.from_imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3))))
+        return rows
+
+    def _complete_rows(self) -> Floats:
+        count = min((len(results) for results in self._results), default=0)
+        self._newest = self._newest_row()
+        if not count or not self._is_ready(TEXT):
+            return np.empty((0, 1 + sum(self._width)))
+        rows = [
+            np.column_stack([block.time_s, *(results[i] for results in self._results)])
+            for i, block in enumerate(self._blocks[:count])
+        ]
+        del self._blocks[:count]
+        for results in self._results:
+            del results[:count]
+        return np.concatenate(rows)
+
+    def _newest_row(self) -> Floats:
+        if not self._blocks:
+            return np.empty(0)
+        parts = [self._blocks[-1].time_s[-1:]]
+        for width, results in zip(self._width, self._results, strict=True):
+            caught_up = len(results) == len(self._blocks)
+            parts.append(results[-1][-1] if caught_up else np.full(width, np.nan))
+        return np.concatenate(parts)
 
 
 class EstimateWriter(CsvFile):

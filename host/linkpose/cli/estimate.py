@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from linkpose.errors import LinkposeError, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
+    from linkpose.board import Board
     from linkpose.cli.live import Console
     from linkpose.estimation import EstimateWriter, Estimator
 
@@ -144,8 +146,8 @@ def _live(
     """Estimates as the board measures."""
     from linkpose.board import Board
     from linkpose.cli import live
-    from linkpose.cli.view import View
-    from linkpose.sensors.measurements import Measurements
+    from linkpose.cli.view import Extremes, View, final_table
+    from linkpose.sensors.measurements import Floats, Measurements
 
     with contextlib.ExitStack() as stack:
         connected = stack.enter_context(
@@ -154,32 +156,60 @@ def _live(
                 notify=console.say,
             )
         )  # fmt: skip
-        with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
-            from linkpose.estimation import Estimator
+        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.precompile import Precompilation
 
-            estimator = Estimator.for_board(request.filter_names, connected)
-            _check(estimator, request, console)
-            estimator.warm_up()
+        estimator = Estimator.for_board(request.filter_names, connected)
+        _check(estimator, request, console)
+        names = [f.name for f in estimator.filters]
+        console.say(f"Running: {', '.join(names)}")
+        compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force)
-        head = {"device": connected.port, "filters": [f.name for f in estimator.filters]}
-        sink = stack.enter_context(_Sink(estimator, request, head | {"rig": estimator.rig.as_dict()}))
-        view = stack.enter_context(View(estimator.columns, console.shows_progress))
+        head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
+        sink = stack.enter_context(_Sink(estimator, request, head))
+        view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
+        if view.is_shown:
+            stack.enter_context(console.through(view.say))
+        following = LiveEstimator(estimator, compiling.is_ready)
+        extremes = Extremes(estimator.columns)
+
+        def write(rows: Floats) -> None:
+            if len(rows):
+                sink.write(rows)
+                extremes.add(rows)
 
         def handle(block: Measurements) -> None:
+            rows, newest = following.process(block)
+            write(rows)
             if len(block):
-                estimates = estimator.process(block)
-                sink.write(estimates)
-                view.show(estimates[-1], lambda: connected.health)
+                view.show(newest, lambda: connected.health, compiling.progress)
+            else:
+                view.redraw(lambda: connected.health, compiling.progress)
 
         ended = live.run_board(connected, duration, handle)
         view.close()
+        if compiling.waiting:
+            console.say(f"{compiling.progress}; its estimates follow")
+            compiling.wait()
+        write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
+        if console.shows_progress:
+            for line in final_table(extremes.summary()):
+                console.say(line)
         _report_j2s(estimator, console)
         _report_mice(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        if request.output:
+            console.say(f"next: linkpose plot {request.output}")
         connected.check_usable()
+
+
+def _title(board: Board) -> str:
+    """The port, and the length of J2S where it is known."""
+    j2s = board.rig.joint.known_j2s_m
+    return board.port + ("" if j2s is None else f"  J2S {math.hypot(*j2s):.3f} m")
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:

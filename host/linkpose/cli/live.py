@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import signal
 import sys
@@ -34,11 +35,22 @@ class Console:
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
+        self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
 
     def say(self, text: str) -> None:
+        """Prints a line."""
         self.clear()
         if not self._quiet:
-            click.echo(printable(text), err=True)
+            self._print(printable(text))
+
+    @contextlib.contextmanager
+    def through(self, print_line: Callable[[str], None]) -> Iterator[None]:
+        """Within this context, lines are printed by a live view, which keeps them above itself."""
+        self._print, before = print_line, self._print
+        try:
+            yield
+        finally:
+            self._print = before
 
     def detail(self, text: str) -> None:
         if self._verbose:

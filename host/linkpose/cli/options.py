@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from linkpose.errors import printable
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
@@ -195,5 +196,5 @@ def load_recordings(paths: Sequence[Path]) -> list[Recording]:
 
     loaded = [load_recording(path) for path in paths]
     for remark in (remark for recording in loaded for remark in recording.remarks):
-        click.echo(remark, err=True)
+        click.echo(printable(remark), err=True)
     return loaded

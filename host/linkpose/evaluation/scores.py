@@ -10,7 +10,7 @@ import numpy as np
 
 from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, Errors, errors_of, scored, yaw_drift_deg_per_min
-from linkpose.evaluation.series import Series, find_offset, interval, is_sparser, paired
+from linkpose.evaluation.series import Series, find_offset, is_sparser, paired
 from linkpose.evaluation.statistics import Statistics
 from linkpose.quantities import (
     ANGLE,
@@ -302,6 +302,6 @@ def _known_rows(both: Mapping[Quantity, Pair], window: Window) -> tuple[int, int
     inside = (estimate.time_s >= window[0]) & (estimate.time_s <= window[1])
     if not is_sparser(reference, estimate):
         return int((known & inside).sum()), int((~known & inside).sum())
-    share = interval(estimate.time_s) / interval(reference.time_s)
+    share = estimate.interval_s / reference.interval_s
     stamps, empty = (len(np.unique(estimate.time_s[part & inside])) for part in (known, ~known))
     return round(share * stamps), round(share * empty)

@@ -161,5 +161,5 @@ def _two_samples_at_rest() -> Measurements:
         baro_temp_degC=np.full(2, 25.0),
         baro_fresh=np.ones(2, np.bool_),
         mice_counts=np.zeros((2, 2, 2)),
-        flags=np.zeros(2, np.uint16),
+        flags=np.zeros(2, np.uint32),
     )

@@ -264,7 +264,7 @@ class _Imu:
     def _judge(self, codes: Codes, values: Floats, temp: Floats, flags: NDArray[np.integer[Any]]) -> Codes:
         """Add to `codes` what a sample shows by itself."""
         codes[(temp < TEMPERATURE_RANGE_DEGC[0]) | (temp > TEMPERATURE_RANGE_DEGC[1])] = Cause.OUT_OF_RANGE
-        codes[~values.any(axis=1)] = Cause.BLANK
+        codes[~values[:, :3].any(axis=1)] = Cause.BLANK  # not even gravity
         codes[~np.isfinite(values).all(axis=1)] = Cause.SILENT
         if (flags & self._caused).any():
             for flag, cause in self._flags.causes.items():

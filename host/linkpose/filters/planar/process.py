@@ -248,7 +248,7 @@ def process(
     time_s: Floats,
     counts: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     is_ukf: bool,
     rig: Record,
     place: Record,
