@@ -16,7 +16,7 @@ from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeEr
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, load_recording
-from linkpose.sensors.conversion import TIME_DECIMALS, Settings
+from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
@@ -54,6 +54,10 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+# A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
+_SCALE_Z, _SCALE_LEAST = 3.0, 0.01
+
+
 class Estimator:
     """Runs filters over consecutive blocks of measurements."""
 
@@ -81,7 +85,7 @@ class Estimator:
     @staticmethod
     def for_board(names: Sequence[str], board: Board) -> Estimator:
         """An estimator for a connected board's stream. Raises as the constructor does."""
-        settings = Settings.of(board.hello)
+        settings = BoardSettings.of(board.hello)
         rig = board.rig.with_delay_of(settings.dlpf)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
@@ -124,6 +128,19 @@ class Estimator:
         for f in self.filters:
             if isinstance(f, filters.FindsJ2s):
                 return FoundJ2s.of(*f.j2s_m)
+        return None
+
+    @property
+    def mice_scale(self) -> tuple[float, float] | None:
+        """Counts per metre of the mice relative to the rig file, and its standard deviation, where they differ.
+
+        None where no filter compares the mice with the gyro, or where the difference is not significant.
+        """
+        for f in self.filters:
+            if isinstance(f, filters.FindsMiceScale):
+                factor, std = f.scale_change
+                if abs(factor - 1.0) > max(_SCALE_Z * std, _SCALE_LEAST):
+                    return factor, std
         return None
 
     def text(self, estimates: Floats) -> str:

@@ -11,8 +11,8 @@ from typing import BinaryIO
 from linkpose.device.session import Placement, Session
 from linkpose.errors import InvalidValue, LinkposeError
 from linkpose.recording.csvfile import create
-from linkpose.recording.writer import RecordingWriter, closing, metadata
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
+from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.health import HealthMonitor, expected_sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -29,7 +29,7 @@ class Recorder:
         if path is not None and path.suffix == ".bin":
             raise InvalidValue(str(path), "is not a name for a recording, which is a CSV file: .bin is a raw capture")
         self._session = session
-        settings = Settings.of(session.hello)
+        settings = BoardSettings.of(session.hello)
         mouse_ports = max(settings.mouse_ports, len(rig.mouse))
         self._converter = Converter(settings, mouse_ports)
         self.monitor = HealthMonitor(settings.sample_rate_hz, expected_sensors(session.hello, mouse_ports))
@@ -37,17 +37,17 @@ class Recorder:
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
             head = metadata(session.hello, settings, session.port, rig, clock)
-            self._writer = RecordingWriter(path, head, mouse_ports, force)
+            self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force)
 
     def convert(self, placements: list[Placement]) -> Measurements:
         """The samples as a block of measurements, with NaN for readings that are worth nothing.
 
         The recording keeps all readings as they came. Its rows are with the operating system when this returns.
         """
-        rows = [self._converter.row(sample, *place) for sample, place in placements]
-        if self._writer is not None and rows:
-            self._writer.write_rows(rows)
-        checked, changes = self.monitor.check(Measurements.of(rows))
+        block = self._converter.convert_placed([p.sample for p in placements], [p.place for p in placements])
+        if self._writer is not None and placements:
+            self._writer.write_block(block)
+        checked, changes = self.monitor.check(block.measurements)
         for change in changes:
             self._session.notify(str(change))
         return checked

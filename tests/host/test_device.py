@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pty_board import PtyBoard
+from pty_board import PtyBoard, link_run
 from serial.tools import list_ports_common
 
 from linkpose.device import ports
@@ -24,8 +24,9 @@ from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
 from linkpose.sensors.rig import Rig
+from linkpose.simulation.board import DEFAULTS, SimulatedBoard
 from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello, Sample
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping, Sample
 
 
 @pytest.fixture
@@ -345,6 +346,46 @@ def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_pat
                 time.sleep(1.0)  # a slow disk
             seqs += [p.place.seq for p in placements]
     assert seqs == list(range(150))
+
+
+class Forgetful(SimulatedBoard):
+    """A board that is reset, and whose HELLO gets lost, each time that it has answered a PING after a CONFIGURE."""
+
+    def __init__(self, resets: int) -> None:
+        super().__init__(link_run)
+        self.resets = resets
+        self._configured = False
+
+    def _answer(self, message, now_us):
+        answers = super()._answer(message, now_us)
+        self._configured |= isinstance(message, Configure)
+        if self.resets and self._configured and isinstance(message, Ping):
+            self.resets -= 1
+            self._configured = False
+            self._settings = DEFAULTS
+            self._run = link_run(DEFAULTS)
+        return answers
+
+
+@pytest.mark.parametrize("resets", [1, 2])
+def test_a_reset_between_configure_and_start_is_noticed(tmp_path, monkeypatch, resets):
+    """The values are never scaled by settings that the board does not have: 200 Hz and 16 g are streamed in the end."""
+    board = Forgetful(resets)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200, accel_range_g=16))
+        samples = [p.sample for placements in session.stream(0.2) for p in placements]
+    assert len(samples) == 40
+    assert np.mean([sample.accel_z for sample in samples]) == pytest.approx(2048, rel=0.1)  # 1 g at 16 g
+
+
+def test_a_board_that_is_reset_again_and_again_is_named(tmp_path, monkeypatch):
+    board = Forgetful(1000)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200))
+        with pytest.raises(session_module.LinkposeError, match="reset again and again"):
+            next(iter(session.stream(0.2)))
 
 
 class SpoiledSamples:

@@ -130,6 +130,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_outcome(estimator)})
     _report_j2s(estimator, console)
+    _report_mice(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
 
@@ -205,6 +206,7 @@ def _live(
             for line in final_table(extremes.summary()):
                 console.say(line)
         _report_j2s(estimator, console)
+        _report_mice(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
         if request.output:
             console.say(f"next: linkpose plot {request.output}")
@@ -242,7 +244,20 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     found = estimator.found_j2s
     if found:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    if estimator.mice_scale:
+        outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     return outcome
+
+
+def _report_mice(estimator: Estimator, console: Console) -> None:
+    """The common scale of the mice where it differs from the rig file."""
+    if estimator.mice_scale:
+        factor, std = estimator.mice_scale
+        change = "more" if factor > 1 else "fewer"
+        console.say(
+            f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
+            "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
+        )
 
 
 def _report_j2s(estimator: Estimator, console: Console) -> None:

@@ -14,10 +14,10 @@ from linkpose.device.clock import DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.device.ports import find_again, usb_identity
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
-from linkpose.sensors.conversion import Settings
+from linkpose.sensors.conversion import BoardSettings, Placed
 from linkpose.sensors.devices import Sensors, check_hello, found
 from linkpose.sensors.rig import Rig
-from linkpose.sensors.timeline import Gap, Placed, Timeline
+from linkpose.sensors.timeline import Gap, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
@@ -27,6 +27,7 @@ from linkpose.wire.messages import (
     Ack,
     Command,
     Configure,
+    DeviceState,
     GetInfo,
     Hello,
     Message,
@@ -48,6 +49,7 @@ ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 1.5
+SENSORS_TIMEOUT_S = 1.0  # the slowest sensor is set up 0.3 s after the firmware starts
 SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
@@ -61,6 +63,10 @@ RETRY_INTERVAL_S = 0.25
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
+
+
+class NotResumed(Disconnected):
+    """A board that was reset and could not be started again at once."""
 
 
 class AnotherBoard(BoardError):
@@ -118,7 +124,8 @@ class Session:
         )
         self._corrupt_before = Corrupt()
         try:
-            self.hello = self._handshake()
+            self.hello = self._first_hello = self._handshake()
+            self._wanted = _configured(self.hello)  # the settings that values are scaled by, after a reset too
         except BaseException:
             self._connection.close()
             raise
@@ -162,9 +169,21 @@ class Session:
                     raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
+                    message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
         raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+
+    def _wait_for_sensors(self, hello: Hello) -> Hello:
+        """Gives sensors that are being set up the time for it; the latest HELLO."""
+        deadline = time.perf_counter() + SENSORS_TIMEOUT_S
+        while any(device.state == DeviceState.STARTING for device in hello.devices):
+            if time.perf_counter() > deadline:
+                break
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            hello = self._await(Hello, "GET_INFO")
+        return hello
 
     def _check_versions(self, hello: Hello) -> None:
         """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
@@ -181,17 +200,24 @@ class Session:
     # ---- commands ----
 
     def configure(self, settings: Configure) -> Hello:
-        """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
-        self._command(settings, Command.CONFIGURE)
-        time.sleep(SETTLE_S)
-        self._connection.send(GetInfo())
-        self.hello = self._await(Hello, "GET_INFO")
-        return self.hello
+        """Puts settings in force and returns the HELLO that shows them.
+
+        Raises LinkposeError if the board refuses them, or does not keep them because it is reset again and again.
+        """
+        for _ in range(ATTEMPTS):
+            self._command(settings, Command.CONFIGURE)
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            self.hello = self._await(Hello, "GET_INFO")
+            if _configured(self.hello) == settings:
+                self._wanted = settings
+                return self.hello
+        raise LinkposeError("the board loses its settings: it is reset again and again; check its supply and its cable")
 
     def wait_for_mice(self, count: int) -> None:
         """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
         deadline = time.perf_counter() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
+        while BoardSettings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
@@ -281,8 +307,10 @@ class Session:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self.notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
-                timeline.interrupted("cable")
+                reset = isinstance(error, NotResumed)
+                event = f"{error.reason}" if reset else f"{self.port} disappeared ({error.reason})"
+                self.notify(f"{event}; waiting for the board, Ctrl-C ends")
+                timeline.interrupted("reset" if reset else "cable")
                 yield []
                 yield from self._reconnect(timeline)
                 continue
@@ -302,13 +330,42 @@ class Session:
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
-        self._clock = DeviceClock()
-        self._tie_clocks()
-        self._started = self._command(Start(), Command.START)
+        wanted = self._wanted
+        for _ in range(ATTEMPTS):
+            self._clock = DeviceClock()
+            self._tie_clocks()
+            self._started = self._start(wanted)
+            if self._started is not None:
+                break
+            self._connection.send(Stop())
+            self.configure(wanted)
+        else:
+            raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
         self._pinged_at = self._looked_s = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
         self._unread_bytes = self._still = 0
         self._last_stamp = None
+
+    def _start(self, wanted: Configure) -> Arrival | None:
+        """Starts the stream and checks that the board streams with the settings that its values are scaled by.
+
+        Returns what arrived behind the ACK; None if the board was reset on the way and has lost its settings.
+        """
+        started = self._command(Start(), Command.START)
+        self._connection.send(GetInfo())
+        messages, arrived_s = list(started.messages), started.time_s
+        for arrival in itertools.chain([started], self._arrivals(ANSWER_TIMEOUT_S)):
+            if arrival is not started:
+                messages += arrival.messages
+                arrived_s = arrival.time_s
+            hellos = [message for message in arrival.messages if isinstance(message, Hello)]
+            if hellos:
+                sound = all(hello.streaming and _configured(hello) == wanted for hello in hellos)
+                rest: list[Message | OtherProtocol] = [
+                    message for message in messages if not isinstance(message, Hello)
+                ]
+                return Arrival(arrived_s, rest, b"") if sound else None
+        return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
         arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
@@ -374,12 +431,17 @@ class Session:
             self._check_versions(message)
             self.notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
             timeline.interrupted("reset")
-            self._resume(message)
+            try:
+                self._resume(message)
+            except (WrongFirmware, AnotherBoard, Disconnected):
+                raise
+            except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
+                raise NotResumed(self.port, error) from error
 
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
-        before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
+        self.hello, before = hello, self._first_hello
+        if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         for old, new in zip(before.devices, hello.devices, strict=True):
             if old.id and new.id and (old.address, old.id) != (new.address, new.id):
@@ -392,8 +454,8 @@ class Session:
                 f"the board's firmware is another one now: source revision {hello.source_revision:08x} instead of "
                 f"{before.source_revision:08x}"
             )
-        if _configured(before) != _configured(hello):
-            self.configure(_configured(before))
+        if _configured(hello) != self._wanted:
+            self.configure(self._wanted)
         self._begin()
 
     def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:

@@ -83,6 +83,15 @@ class Filter(Protocol):
 
 
 @runtime_checkable
+class FindsMiceScale(Protocol):
+    """What a filter offers beyond that when it compares the mice with the gyro."""
+
+    @property
+    def scale_change(self) -> tuple[float, float]:
+        """Counts per metre, common to all mice, relative to the rig file, and the standard deviation of this factor."""
+
+
+@runtime_checkable
 class FindsJ2s(Protocol):
     """What a filter offers beyond that when it estimates J2S."""
 
@@ -153,5 +162,5 @@ def _two_samples_at_rest() -> Measurements:
         baro_temp_degC=np.full(2, 25.0),
         baro_fresh=np.ones(2, np.bool_),
         mice_counts=np.zeros((2, 2, 2)),
-        flags=np.zeros(2, np.uint16),
+        flags=np.zeros(2, np.uint32),
     )

@@ -7,7 +7,7 @@ import json
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,25 @@ from linkpose.errors import FileFormatError
 from linkpose.recording import columns
 from linkpose.recording.table import Table, read_bytes, read_table
 from linkpose.recording.units import suspicions
-from linkpose.sensors import bmp180, mpu6050
-from linkpose.sensors.conversion import GAP_BEFORE, MOUSE_VALID, TIME_DECIMALS, Settings
+from linkpose.sensors import mpu6050
+from linkpose.sensors.conversion import (
+    COUNT_FIELDS,
+    GAP_BEFORE,
+    MAX_MICE,
+    TIME_DECIMALS,
+    BoardSettings,
+    Converter,
+    RawSamples,
+)
+from linkpose.sensors.devices import impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
-from linkpose.wire.messages import Hello, SampleFlags
+from linkpose.wire.frames import OtherProtocol
+from linkpose.wire.messages import PROTOCOL_MAJOR, Hello, SampleFlags
+
+if TYPE_CHECKING:
+    from linkpose.wire.capture import Capture
 
 MOST_CHANGES = 10  # of sensors' states, in the remarks
 _T_WRAP = 1 << 32
@@ -109,6 +122,7 @@ def _from_csv(path: Path) -> Recording:
         _fresh(table),
         _mice(table, mouse_ports),
         _flags(table),
+        **_other_sensors(table),
     )
     remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
     remarks += suspicions(path, measurements, _stated_rate(table))
@@ -119,16 +133,32 @@ def _from_csv(path: Path) -> Recording:
 def _check_columns(table: Table) -> int:
     """Number of mouse ports; raises FileFormatError for a column that no recording has, or without time_s."""
     table.require("time_s")
-    known = columns.names(columns.MAX_MICE)
+    known = columns.names(columns.Layout(MAX_MICE, imu2=True, mag=True))
     for name in table.columns:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
             hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
             raise FileFormatError(table.path, f"{table.path}: unknown column {name}; {hint}")
-    ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
+    ports = [p for p in range(1, MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
     for port in ports:
         table.require(*columns.mouse_columns(port))
     return max(ports, default=0)
+
+
+def _other_sensors(table: Table) -> dict[str, Any]:
+    """The measurements of a second inertial sensor and a magnetometer, where the file has their columns."""
+    fields: dict[str, Any] = {}
+    if columns.GYRO2[0] in table.columns:
+        table.require(*columns.ACCEL2, *columns.GYRO2)
+        fields |= {"accel2_m_s2": _vectors(table, columns.ACCEL2), "gyro2_rad_s": _vectors(table, columns.GYRO2)}
+        fields["imu2_temp_degC"] = _column(table, "imu2_temp_degC")
+    if columns.MAG[0] in table.columns:
+        table.require(*columns.MAG)
+        field = fields["mag_uT"] = _vectors(table, columns.MAG)
+        changes = (np.diff(field, axis=0, prepend=np.full((1, 3), np.nan)) != 0).any(axis=1)
+        fresh = table.columns["mag_fresh"] == 1 if "mag_fresh" in table.columns else changes
+        fields["mag_fresh"] = np.asarray(fresh & np.isfinite(field).all(axis=1))
+    return fields
 
 
 def _column(table: Table, name: str) -> Floats:
@@ -159,18 +189,19 @@ def _mice(table: Table, ports: int) -> Floats:
     return np.stack(pairs, axis=1) if pairs else np.empty((len(table), 0, 2))
 
 
-def _flags(table: Table) -> NDArray[np.uint16]:
+def _flags(table: Table) -> NDArray[np.uint32]:
     """As the file says; where it does not, what is there is valid."""
     if "flags" not in table.columns:
         imu = np.isfinite(_vectors(table, columns.ACCEL + columns.GYRO)).all(axis=1)
-        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint16)
+        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint32)
     flags = table.columns["flags"]
-    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFF)))
+    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFFFFFF)))
     if len(wrong):
         raise FileFormatError(
-            table.path, f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 65535"
+            table.path,
+            f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 4294967295",
         )
-    return flags.astype(np.uint16)
+    return flags.astype(np.uint32)
 
 
 def _metadata_object(table: Table, name: str) -> dict[str, Any]:
@@ -218,17 +249,28 @@ def _from_capture(path: Path) -> Recording:
 
     capture = decode_capture(read_bytes(path))
     hellos = [(before, message) for before, message in capture.others if isinstance(message, Hello)]
+    other = next((message for _, message in capture.others if isinstance(message, OtherProtocol)), None)
+    if not hellos and other is not None:
+        raise FileFormatError(
+            path,
+            f"{path} was captured with protocol {other.protocol_major}.{other.protocol_minor}, and this linkpose reads "
+            f"protocol {PROTOCOL_MAJOR}: read it with the linkpose that captured it, or use the CSV recording",
+        )
     if not hellos:
         raise FileFormatError(path, f"{path} holds no HELLO of a board; it is not a raw capture")
     if not len(capture.samples):
         raise FileFormatError(path, f"{path} holds no sample; the board was never started")
+    for _, hello in hellos:
+        if wrong := impossible(hello):
+            raise FileFormatError(path, f"{path}: its HELLO says {wrong}, which is impossible; the capture is damaged")
     first = [hello for before, hello in hellos if before == 0]
-    settings = Settings.of(first[-1] if first else hellos[0][1])
+    settings = BoardSettings.of(first[-1] if first else hellos[0][1])
     raw = capture.samples
     restarts = sorted({before for before, hello in hellos if 0 < before < len(raw) and not hello.streaming})
     time_s, gap_before, gaps = _times(raw, restarts, settings.sample_rate_hz)
     flags = (raw["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
-    measurements = _measurements(raw, capture.mouse_count, time_s, flags, settings)
+    counts = _raw_samples(capture)
+    measurements = Converter(settings, counts.mice.shape[1]).convert(counts, time_s, flags)
     remarks = [f"{path}: times are the board's own, for a raw capture holds no other clock"]
     if capture.corrupt.total:
         remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
@@ -258,50 +300,13 @@ def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[
     return time_s, np.where(marked, GAP_BEFORE, 0), gaps
 
 
-def _measurements(
-    raw: NDArray[np.void], mouse_count: NDArray[np.uint8], time_s: Floats, flags: NDArray[np.int64], settings: Settings
-) -> Measurements:
-    """The same values, to the last bit, as `Converter` gives one by one."""
-    valid = (flags & int(SampleFlags.IMU_VALID) != 0)[:, None]
-    accel = np.column_stack([raw[name] for name in ("accel_x", "accel_y", "accel_z")]).astype(np.float64)
-    gyro = np.column_stack([raw[name] for name in ("gyro_x", "gyro_y", "gyro_z")]).astype(np.float64)
-    accel = np.round(accel * mpu6050.accel_scale(settings.accel_range_g), mpu6050.ACCEL_DECIMALS)
-    gyro = np.round(gyro * mpu6050.gyro_scale(settings.gyro_range_deg_s), mpu6050.GYRO_DECIMALS)
-    temp = np.round(mpu6050.temperature(raw["imu_temp"].astype(np.float64)), mpu6050.TEMPERATURE_DECIMALS)
-    pressure, baro_temp, fresh = _baro(raw, flags, settings)
-    ports = int(mouse_count.max(initial=0))
-    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports].astype(np.float64)
-    mouse_valid = (flags[:, None] & np.array(MOUSE_VALID)[:ports] != 0) & (np.arange(ports) < mouse_count[:, None])
-    return Measurements(
-        time_s,
-        np.where(valid, accel, np.nan),
-        np.where(valid, gyro, np.nan),
-        np.where(valid[:, 0], temp, np.nan),
-        pressure,
-        baro_temp,
-        fresh,
-        np.where(mouse_valid[:, :, None], mice, np.nan),
-        flags.astype(np.uint16),
-    )
-
-
-def _baro(
-    raw: NDArray[np.void], flags: NDArray[np.int64], settings: Settings
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Pressure and temperature, each reading repeated until the next; where a new one came."""
-    valid = flags & int(SampleFlags.BARO_VALID) != 0
-    if not bmp180.is_sound(settings.bmp180):
-        nothing = np.full(len(raw), np.nan)
-        return nothing, nothing, np.zeros(len(raw), np.bool_)
-    count = raw["baro_count"].astype(np.int64)
-    again = np.concatenate([[True], ~valid[:-1]])  # the first reading, or the first after the sensor was away
-    fresh = valid & (again | (np.diff(count, prepend=-1) != 0))
-    ut, up = raw["baro_ut"].astype(np.int64), raw["baro_up"].astype(np.int64)
-    with np.errstate(divide="ignore"):
-        temp, pressure = bmp180.compensate(ut, up, settings.bmp180, settings.baro_oversampling)
-    latest = np.maximum.accumulate(np.where(fresh, np.arange(len(raw)), 0))
-    return (
-        np.where(valid, pressure[latest].astype(np.float64), np.nan),
-        np.where(valid, temp[latest] / 10, np.nan),
-        fresh,
+def _raw_samples(capture: Capture) -> RawSamples:
+    """The capture's samples, with the mouse ports that any of them carries."""
+    raw = capture.samples
+    ports = int(capture.mouse_count.max(initial=0))
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports]
+    return RawSamples(
+        np.stack([raw[name].astype(np.int64) for name in COUNT_FIELDS], axis=1),
+        mice.astype(np.int64),
+        capture.mouse_count.astype(np.int64),
     )

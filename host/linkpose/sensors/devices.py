@@ -117,12 +117,16 @@ def _chip(device: HelloDevice) -> str:
 
 def check_hello(hello: Hello) -> None:
     """Raises LinkposeError that names a value which no board has: nothing may be scaled by it."""
-    wrong = next(_impossible(hello), None)
-    if wrong:
+    if wrong := impossible(hello):
         raise LinkposeError(
             f"the board's HELLO says {wrong}, which is impossible; its firmware is damaged or not linkpose's: "
             "type `linkpose flash`"
         )
+
+
+def impossible(hello: Hello) -> str | None:
+    """The first value of a HELLO that no board has, such as "dlpf = 7"; None if all are possible."""
+    return next(_impossible(hello), None)
 
 
 def _impossible(hello: Hello) -> Iterator[str]:

@@ -58,7 +58,9 @@ def write_link(run: LinkRun, recording: Path, truth: Path, force: bool) -> None:
     check_outputs((recording, truth), force)
     write_truth_blocks(truth, _link_truth(run), {"device": run.description, "j2s_m": run.j2s_m}, force)
     settings: Configure = board.DEFAULTS._replace(sample_rate_hz=round(run.rate_hz))
-    write_recording(recording, board.hello(settings), run.samples(), run.description, run.rig, force)
+    write_recording(
+        recording, board.hello(settings, sensors=run.hello_sensors), run.samples(), run.description, run.rig, force
+    )
 
 
 def _link_truth(run: LinkRun) -> Iterator[Mapping[str, Floats]]:

@@ -168,7 +168,7 @@ def _process(
     time_s: Floats,
     counts: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     place: Record,
     imu: ImuCalibration,
     p: Record,
