@@ -70,7 +70,7 @@ class Estimator:
         self._rig = rig
         self.left_out: dict[str, CannotRun] = {}
         self.filters: list[filters.Filter] = []
-        for name in dict.fromkeys(names or filters.NAMES):
+        for name in dict.fromkeys(name.replace("_", "-") for name in names or filters.NAMES):
             try:
                 self.filters.append(filters.create(name, rig, sensors, mice))
             except CannotRun as reason:

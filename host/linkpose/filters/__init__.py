@@ -105,6 +105,7 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST
 
     Raises CannotRun where the rig or the sensors do not allow it, UnknownFilter for no such name.
     """
+    name = name.replace("_", "-")
     if name not in REGISTRY:
         raise UnknownFilter(name, NAMES)
     needs = REGISTRY[name]
