@@ -6,6 +6,7 @@ Python program has no flags.
 
 from __future__ import annotations
 
+import difflib
 import unicodedata
 from collections.abc import Sequence
 from typing import Any
@@ -167,7 +168,9 @@ class UnknownFilter(LinkposeError):
     """No filter has this `name`; `known` are the names there are."""
 
     def __init__(self, name: str, known: Sequence[str]) -> None:
-        super().__init__(f"there is no filter {name!r}; the filters are {', '.join(known)}")
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"the filters are {', '.join(known)}"
+        super().__init__(f"there is no filter {name!r}; {hint}")
         self.name, self.known = name, tuple(known)
 
 

@@ -54,6 +54,10 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+# A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
+_SCALE_Z, _SCALE_LEAST = 3.0, 0.01
+
+
 class Estimator:
     """Runs filters over consecutive blocks of measurements."""
 
@@ -66,7 +70,7 @@ class Estimator:
         self._rig = rig
         self.left_out: dict[str, CannotRun] = {}
         self.filters: list[filters.Filter] = []
-        for name in dict.fromkeys(names or filters.NAMES):
+        for name in dict.fromkeys(name.replace("_", "-") for name in names or filters.NAMES):
             try:
                 self.filters.append(filters.create(name, rig, sensors, mice))
             except CannotRun as reason:
@@ -124,6 +128,19 @@ class Estimator:
         for f in self.filters:
             if isinstance(f, filters.FindsJ2s):
                 return FoundJ2s.of(*f.j2s_m)
+        return None
+
+    @property
+    def mice_scale(self) -> tuple[float, float] | None:
+        """Counts per metre of the mice relative to the rig file, and its standard deviation, where they differ.
+
+        None where no filter compares the mice with the gyro, or where the difference is not significant.
+        """
+        for f in self.filters:
+            if isinstance(f, filters.FindsMiceScale):
+                factor, std = f.scale_change
+                if abs(factor - 1.0) > max(_SCALE_Z * std, _SCALE_LEAST):
+                    return factor, std
         return None
 
     def text(self, estimates: Floats) -> str:

@@ -16,7 +16,7 @@ from _report import Row, report
 
 from linkpose.estimation import EstimateWriter, Estimator
 from linkpose.filters import ALL_SENSORS
-from linkpose.recording.writer import RecordingWriter, metadata
+from linkpose.recording.writer import RecordingWriter, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.simulation import board
@@ -36,7 +36,7 @@ def main() -> None:
         converter, estimator = Converter(settings), Estimator([], run.rig, ALL_SENSORS)
         estimator.warm_up()
         head = metadata(hello, settings, "bench", run.rig, {})
-        recording = RecordingWriter(Path(folder, "r.csv"), head, 0, force=False)
+        recording = RecordingWriter(Path(folder, "r.csv"), head, layout_of(settings), force=False)
         estimates = EstimateWriter(Path(folder, "e.csv"), head, estimator.columns, force=False)
         took = []
         for frame in frames:

@@ -16,7 +16,7 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
-from linkpose.errors import LinkposeError, NoUsableData
+from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -48,7 +48,14 @@ class Request:
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimates here.")
 @click.option("--record", type=options.FILE, metavar="REC.csv", help="Keep the live measurements as a recording.")
 @click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
-@click.option("--filter", "filter_names", multiple=True, metavar="NAME", help="Run this filter; may be repeated.")
+@click.option(
+    "--filter",
+    "filter_names",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=options.complete_filter,
+    help="Run this filter; may be repeated. Default: all that the sensors and the rig support.",
+)
 @click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
 @board_settings
@@ -82,7 +89,8 @@ def command(
     from linkpose.cli.live import Console, refuse_same_file
 
     if is_live == (recording is not None):
-        raise click.UsageError("name a RECORDING, or add --live to estimate from the board")
+        both = f"--live estimates from the board: leave out {recording}, or leave out --live"
+        raise click.UsageError(both if is_live else "name a RECORDING, or add --live to estimate from the board")
     if recording is not None and (port or duration or record or raw or board):
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     if smooth and is_live:
@@ -122,6 +130,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_outcome(estimator)})
     _report_j2s(estimator, console)
+    _report_mice(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
 
@@ -161,7 +170,6 @@ def _live(
         estimator = Estimator.for_board(request.filter_names, connected)
         _check(estimator, request, console)
         names = [f.name for f in estimator.filters]
-        console.say(f"Running: {', '.join(names)}")
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force)
@@ -198,6 +206,7 @@ def _live(
             for line in final_table(extremes.summary()):
                 console.say(line)
         _report_j2s(estimator, console)
+        _report_mice(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
         if request.output:
             console.say(f"next: linkpose plot {request.output}")
@@ -213,6 +222,7 @@ def _title(board: Board) -> str:
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
     """Names the filters that cannot run. Raises LinkposeError when J2S is to be estimated and no filter does it."""
     from linkpose import filters
+    from linkpose.filters import REGISTRY
 
     if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
         name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
@@ -220,7 +230,12 @@ def _check(estimator: Estimator, request: Request, console: Console) -> None:
     left_out = {name: sentence(reason) for name, reason in estimator.left_out.items()}
     for reason in dict.fromkeys(left_out.values()):
         names = ", ".join(name for name, why in left_out.items() if why == reason)
-        console.say(f"without {names}: {reason}")
+        console.detail(f"not running: {names}: {reason}")
+    missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
+    if missing and any(REGISTRY[f.name].sensors for f in estimator.filters):
+        console.say(f"{missing[0]}: {left_out[missing[0]]}")
+    others = " (-v: why not others)" if left_out else ""
+    console.say(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
 
 
 def _outcome(estimator: Estimator) -> dict[str, Any]:
@@ -229,7 +244,20 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     found = estimator.found_j2s
     if found:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    if estimator.mice_scale:
+        outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     return outcome
+
+
+def _report_mice(estimator: Estimator, console: Console) -> None:
+    """The common scale of the mice where it differs from the rig file."""
+    if estimator.mice_scale:
+        factor, std = estimator.mice_scale
+        change = "more" if factor > 1 else "fewer"
+        console.say(
+            f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
+            "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
+        )
 
 
 def _report_j2s(estimator: Estimator, console: Console) -> None:

@@ -85,8 +85,24 @@ def port(function: Function) -> Function:
     return click.option(
         "--port",
         metavar="PORT",
+        shell_complete=complete_port,
         help="Device, pyserial URL or sim://link. Default: $LINKPOSE_PORT, otherwise the only UNO connected.",
     )(function)
+
+
+def complete_filter(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of filters for the shell's completion."""
+    from linkpose.filters import NAMES
+
+    return [name for name in NAMES if name.startswith(incomplete)]
+
+
+def complete_port(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of ports for the shell's completion."""
+    from linkpose.device.ports import find_ports
+
+    names = [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
+    return [name for name in names if name.startswith(incomplete)]
 
 
 def duration(function: Function) -> Function:

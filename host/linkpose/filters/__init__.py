@@ -83,6 +83,15 @@ class Filter(Protocol):
 
 
 @runtime_checkable
+class FindsMiceScale(Protocol):
+    """What a filter offers beyond that when it compares the mice with the gyro."""
+
+    @property
+    def scale_change(self) -> tuple[float, float]:
+        """Counts per metre, common to all mice, relative to the rig file, and the standard deviation of this factor."""
+
+
+@runtime_checkable
 class FindsJ2s(Protocol):
     """What a filter offers beyond that when it estimates J2S."""
 
@@ -96,6 +105,7 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST
 
     Raises CannotRun where the rig or the sensors do not allow it, UnknownFilter for no such name.
     """
+    name = name.replace("_", "-")
     if name not in REGISTRY:
         raise UnknownFilter(name, NAMES)
     needs = REGISTRY[name]

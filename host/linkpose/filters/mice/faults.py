@@ -124,6 +124,9 @@ def find_fault(state: Record, place: Record, candidates: int, span: float, turn:
     freedom = 2 * count - (2 if math.isfinite(turn) else 3)
     if not _cost(state, place, candidates, 0, span, turn) > fault_limit(freedom):
         return 0, False
+    # Three mice that agree with each other and not with the gyro share one cause: the robot slips or is lifted.
+    if count > 2 and not _cost(state, place, candidates, 0, span, math.nan) > fault_limit(2 * count - 3):
+        return candidates, True
     best, second, worst = math.inf, math.inf, 0
     for left_out in range(1, 1 << place.count):
         if left_out & ~candidates or (left_out == candidates and not math.isfinite(turn)):
@@ -182,11 +185,12 @@ def readmit(state: Record, place: Record, step: float, noise_m_s: float, mismatc
     """Update the reference from the mice that agree, and readmit excluded mice that have agreed for long enough."""
     turn = _load_window(state, place, step, noise_m_s, mismatch)
     judges = trusted(state)
-    if judges == 0:  # excluded mice that agree with each other and with the gyro are sound
+    if judges == 0:  # excluded mice that agree with each other and with the gyro are sound, and one that moves alone
         faulty, _ = find_fault(state, place, state.sound, state.window_s, turn)
         judges = state.sound & ~faulty
-        if number(judges) < min(2, place.count):
-            judges = 0
+        for i in range(place.count):
+            if judges == 1 << i and state.silent_s[i] > 0.0:
+                judges = 0
     if judges == 0:
         _forget_agreement(state, state.distrusted)
         return

@@ -99,21 +99,21 @@ class _PlanarFilter:
         """Common factor of the mice's counts per metre relative to the rig, and its standard deviation."""
         state, mice = self.state[0], len(self._rig.mouse)
         at = [int(MICE + OF_MOUSE * i + SCALE) for i in range(mice)]
-        mean = float(np.mean(state.mean[at]))
-        return math.exp(-mean), math.sqrt(float(np.mean(state.covariance[np.ix_(at, at)])))
+        mean = float(np.mean(state["mean"][at]))
+        return math.exp(-mean), math.sqrt(float(np.mean(state["covariance"][np.ix_(at, at)])))
 
     def _found(self, i: int) -> FoundMouse:
         state, mouse, at = self.state[0], self._rig.mouse[i], int(MICE + OF_MOUSE * i)
-        std = np.sqrt(np.diag(state.covariance))
-        per_m = mouse.counts_per_m * math.exp(-state.mean[at + SCALE])
+        std = np.sqrt(np.diag(state["covariance"]))
+        per_m = mouse.counts_per_m * math.exp(-state["mean"][at + SCALE])
         return FoundMouse(
             mouse=i + 1,
             counts_per_m=per_m,
             counts_per_m_std=float(per_m * std[at + SCALE]),
-            angle_deg=mouse.angle_deg + math.degrees(state.mean[at + ANGLE]),
+            angle_deg=mouse.angle_deg + math.degrees(state["mean"][at + ANGLE]),
             angle_std_deg=math.degrees(std[at + ANGLE]),
-            x_m=float(mouse.x_m + state.mean[at + POSITION]),
-            y_m=float(mouse.y_m + state.mean[at + POSITION + 1]),
+            x_m=float(mouse.x_m + state["mean"][at + POSITION]),
+            y_m=float(mouse.y_m + state["mean"][at + POSITION + 1]),
             position_std_m=float(std[at + POSITION]),
         )
 

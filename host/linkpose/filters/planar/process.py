@@ -109,8 +109,20 @@ def _watch_floor(state: Record, mice: Record, p: Record, dt: float, step: float)
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
             state.covariance[a, b] += p.floor_scale**2
+    _forget_positions(state)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.floors += 1
+
+
+@inner
+def _forget_positions(state: Record) -> None:
+    """Return the positions of the mice to the rig's: they have taken up part of the scale error."""
+    for i in range(MICE, state.size, OF_MOUSE):
+        for at in range(i + POSITION, i + OF_MOUSE):
+            state.mean[at] = 0.0
+            for k in range(state.size):
+                state.covariance[at, k] = state.covariance[k, at] = 0.0
+            state.covariance[at, at] = state.start[at] ** 2
 
 
 @inner

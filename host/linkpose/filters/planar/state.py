@@ -89,9 +89,9 @@ class PlanarParameters(NamedTuple):
     # MPU-6050 had 0.003, 0.0013 and 0.0007 °/s. Doubled: a rest is trusted a quarter as long.
     bias_rad_s: float = 0.35  # never calibrated: ±20 °/s (data sheet)
     bias_walk: float = math.radians(4e-4)
-    # Mice: what `calibrate mice` leaves common to all mice (length and direction of its line) ...
-    common_scale: float = 0.002
-    common_angle_rad: float = math.radians(0.1)
+    # Mice: what `calibrate mice` leaves common to all mice: its line of 2 m, measured and driven straight to 2 mm ...
+    common_scale: float = 0.0012
+    common_angle_rad: float = math.radians(0.06)
     # ... what may set them apart, as bought and mounted by eye: the drive determines it ...
     own_scale: float = 0.03
     own_angle_rad: float = math.radians(3.0)
