@@ -94,7 +94,7 @@ def working_sensors(health: Health) -> list[str]:
 
 def signed_angle(value_deg: float) -> str:
     """An angle with its sign: +13.1°."""
-    return f"{value_deg:+.1f}°" if math.isfinite(value_deg) else "not known yet"
+    return f"{value_deg:+.1f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
 
 
 def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
