@@ -8,8 +8,9 @@ import pytest
 
 from linkpose.localization.carmen import read_carmen
 from linkpose.localization.ekf import ekf_step
-from linkpose.localization.grid import load_map
-from linkpose.localization.localizer import Settings, localize, warm_up
+from linkpose.localization.localizer import localize, warm_up
+from linkpose.localization.maps import load_map
+from linkpose.localization.settings import Settings
 from linkpose.localization.ukf import ukf_step
 from linkpose.recording.table import read_table
 
@@ -73,7 +74,8 @@ def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
     """What is told as a compiler at work is one: nothing is left to compile after it."""
     log, grid, _ = indoor
     warm_up(["ekf", "ukf"])
-    events, start = read_carmen(log)
+    read = read_carmen(log)
+    events, start = read.events, read.start
     for name, step in (("ekf", ekf_step), ("ukf", ukf_step)):
         localize(events[:50], name, Settings(start=start), load_map(grid))
         assert len(step.signatures) == 1
@@ -86,7 +88,7 @@ def test_underwater_with_every_noise(dive, linkpose, noise):
         "localize", log, "--beacons", beacons, "--truth", truth, "--range-std", 0.25, "--noise", noise, "--json"
     )
     (row,) = [json.loads(line) for line in result.out.splitlines()]
-    assert row["filter"] == "ukf"
+    assert row["filter"] == "ekf"
     assert row["position_rmse_m"] < 0.3
 
 

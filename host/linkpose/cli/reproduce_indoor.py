@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
     from linkpose.localization.events import Log
     from linkpose.localization.kalman import FilterName
-    from linkpose.localization.localizer import Settings
+    from linkpose.localization.settings import Settings
 
 FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")
 GATE = 0.997
@@ -97,8 +97,8 @@ def _settings(variant: Variant, log: Log, std_m: float, growth: float, start: tu
 
     from linkpose.localization.events import Scan
     from linkpose.localization.kalman import Transform
-    from linkpose.localization.localizer import Settings
     from linkpose.localization.noise import NoiseModel, RangeNoise
+    from linkpose.localization.settings import Settings
 
     model: NoiseModel = "fixed" if variant.noise == "fixed" else "adaptive" if variant.noise == "adaptive" else "affine"
     ranges = np.concatenate([event.ranges_m for event in log if isinstance(event, Scan)])

@@ -18,7 +18,8 @@ from linkpose.cli.patience import while_compiling
 if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
     from linkpose.localization.kalman import FilterName
-    from linkpose.localization.localizer import Settings, Track
+    from linkpose.localization.settings import Settings
+    from linkpose.localization.track import Track
     from linkpose.simulation.underwater import UnderwaterErrors, UnderwaterRun
 
 FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")
@@ -138,8 +139,8 @@ def _dive(case: Case, seed: int) -> None:
 
 def _settings(errors: UnderwaterErrors, variant: Variant) -> Settings:
     """The filter knows the sensors' errors, the common one as part of each range's variance."""
-    from linkpose.localization.localizer import Settings
     from linkpose.localization.noise import RangeNoise
+    from linkpose.localization.settings import Settings
 
     return Settings(
         ranges=RangeNoise("fixed", math.hypot(errors.range_m, errors.correlation_m), correlation=variant.correlation),

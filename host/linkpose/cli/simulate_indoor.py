@@ -46,7 +46,7 @@ def command(
     """Make a log of a robot with odometry and a laser scanner in a floor of 100 x 40 m, its map and its truth."""
     from linkpose.localization.carmen import format_reading
     from linkpose.localization.events import write_lines
-    from linkpose.localization.grid import save_map
+    from linkpose.localization.maps import save_map
     from linkpose.recording.truth import write_truth
     from linkpose.simulation.indoor import CELL_M, IndoorErrors, office_floor, simulate_indoor
 
