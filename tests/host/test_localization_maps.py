@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap, cast_ray
+from linkpose.localization.grid import FREE, OCCUPIED, UNKNOWN, GridMap, cast_ray
 from linkpose.localization.maps import load_map, save_map
 
 YAML = (

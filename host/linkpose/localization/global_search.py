@@ -61,7 +61,7 @@ def score_poses(
             for k in range(points.shape[0]):
                 px, py = points[k, 0], points[k, 1]
                 distance_at(counts, geometry, places[i, 0] + c * px - s * py, places[i, 1] + s * px + c * py, at)
-                total += min(at[0], CUT_M)
+                total += min(abs(at[0]), CUT_M)
             scores[i, j] = total / max(points.shape[0], 1)
 
 

@@ -2,8 +2,8 @@
 
 Models as published: `sample_motion_model_odometry` and `likelihood_field_range_finder_model` of Thrun, Burgard and Fox,
 Probabilistic Robotics, MIT Press 2005, Tables 5.6 and 6.3 (`likelihood_field_prob` in ROS's AMCL), low-variance
-resampling from Table 4.4, with AMCL's default parameters. All draws come from one seeded generator: the same seed gives the same
-path.
+resampling from Table 4.4, with AMCL's default parameters. All draws come from one seeded generator: the
+same seed gives the same path.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def weigh(counts: Field, geometry: Floats, points: Floats, particles: Floats, we
         for k in range(points.shape[0]):
             px, py = points[k, 0], points[k, 1]
             distance_at(counts, geometry, particles[i, 0] + c * px - s * py, particles[i, 1] + s * px + c * py, at)
-            distance = min(at[0], LONGEST_DISTANCE_M)
+            distance = min(abs(at[0]), LONGEST_DISTANCE_M)
             p = Z_HIT * math.exp(-0.5 * (distance / SIGMA_HIT_M) ** 2) + Z_RAND / 80.0
             likelihood += math.log(p)
         weights[i] *= math.exp(likelihood)

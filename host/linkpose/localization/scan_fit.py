@@ -2,12 +2,11 @@
 
 The fitted pose minimises
 
-    κ Σ c²/(2 σ²) ln(1 + d(p_i)²/c²)  +  ½ (x − x̄)ᵀ P⁻¹ (x − x̄)
+    Σ c²/(2 σ²) ln(1 + d(p_i)²/c²)  +  ½ (x − x̄)ᵀ P⁻¹ (x − x̄)
 
 where d(p_i) is the distance from the end of beam i to the nearest wall, σ the deviation of a beam's end, and c the
 scale of the Cauchy loss (Zhang, "Parameter estimation techniques", Image and Vision Computing 15, 1997, Table 1). The
-second term is the prediction of the Kalman filter. κ < 1 widens the measurement: the errors of a map are the same for
-neighbouring beams, so n beams carry the information of κ n independent ones.
+second term is the prediction of the Kalman filter.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ LONGEST_TURN_RAD = 0.2
 
 @compiled
 def scan_cost(counts: Field, geometry: Floats, points: Floats, pose: Floats, scale: float) -> float:
-    """Σ c² ln(1 + d²/c²) / 2 (m²) of beam ends `points` (n, 2) in the robot's axes, seen from `pose` (x, y, θ)."""
+    """Σ c² ln(1 + d²/c²) / 2 (m²) of beam ends `points` (n, 2) in the robot's axes, seen from `pose`."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at = np.empty(3)
     total = 0.0
@@ -75,7 +74,7 @@ def fit_scan(
 ) -> float:
     """Improves `pose` (3,) in place and fills `hessian` (3, 3) with Σ w J Jᵀ there; returns the cost.
 
-    `information` is κ/σ² (1/m²); `mean` (3,) and `prior` (3, 3) are the prediction and its information P⁻¹. The cost is
+    `information` is 1/σ² (1/m²); `mean` (3,) and `prior` (3, 3) are the prediction and its information P⁻¹. The cost is
     the function above.
     """
     slope, step, trial = np.empty(3), np.empty(3), np.empty(3)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import DistanceField, distance_at
+from linkpose.localization.distance_field import DistanceField, Field, distance_at
 from linkpose.localization.events import Scan
 from linkpose.localization.global_search import likely_poses, nearby_poses
 from linkpose.localization.grid import GridMap
@@ -69,7 +69,8 @@ def beam_ends(scan: Scan) -> Floats:
     echo = echo[:: max(1, math.ceil(len(echo) / MOST_BEAMS))]
     angles = scan.angles_rad[echo] + scan.mount[2]
     ranges = scan.ranges_m[echo]
-    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles)))
+    weights = 1.0 / (1.0 + (growth * ranges / BEAM_STD_M) ** 2)
+    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles), weights))
 
 
 class ScanMatcher:
@@ -133,7 +134,7 @@ class ScanMatcher:
 
 
 @compiled
-def hits(counts: NDArray[np.uint16], geometry: Floats, points: Floats, pose: Floats) -> tuple[float, float]:
+def hits(counts: Field, geometry: Floats, points: Floats, pose: Floats) -> tuple[float, float]:
     """Share of beam ends within HIT_M of a wall, and COMPARED_BEAMS times the mean of ln((1 − ε) exp(−d²/2s²) + ε)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at = np.empty(3)
@@ -141,7 +142,7 @@ def hits(counts: NDArray[np.uint16], geometry: Floats, points: Floats, pose: Flo
     for i in range(points.shape[0]):
         px, py = points[i, 0], points[i, 1]
         distance_at(counts, geometry, pose[0] + c * px - s * py, pose[1] + s * px + c * py, at)
-        count += at[0] < HIT_M
+        count += abs(at[0]) < HIT_M
         ratio = at[0] / HIT_M
         total += math.log((1.0 - NO_WALL) * math.exp(-0.5 * ratio * ratio) + NO_WALL)
     n = max(points.shape[0], 1)
