@@ -36,6 +36,15 @@ const Identity kIdentity PROGMEM = {
     LINKPOSE_SOURCE_REVISION,
 };
 
+wire::DeviceState state_of(Ps2Mouse::Presence presence) {
+  switch (presence) {
+    case Ps2Mouse::Presence::kStarting: return wire::DeviceState::kStarting;
+    case Ps2Mouse::Presence::kRunning: return wire::DeviceState::kOk;
+    case Ps2Mouse::Presence::kLost: return wire::DeviceState::kFailed;
+    default: return wire::DeviceState::kAbsent;
+  }
+}
+
 }  // namespace
 
 void Link::note_pass(uint32_t us) {
@@ -50,7 +59,7 @@ void Link::run() {
 
 void Link::configure(const wire::Configure& settings) {
   sampler_.configure(settings);
-  mice_.configure(settings.sample_rate_hz, settings.mouse_counts_per_mm);
+  mice_.configure(settings.mouse_counts_per_mm);
 }
 
 void Link::receive() {
@@ -67,32 +76,33 @@ void Link::receive() {
 }
 
 void Link::greet() {
-  if (greeted_ || !((sampler_.sensors_settled() && mice_.settled()) || clock::now_us() > kGreetUs)) return;
+  if (greeted_ || !((sampler_.sensors_settled() && mice_.probed()) || clock::now_us() > kGreetUs)) return;
   greeted_ = true;
   send_hello();
 }
 
 void Link::send_hello() {
   const wire::Configure& settings = sampler_.settings();
-  const uint16_t* const words = sampler_.baro().calibration();
   wire::Hello hello;
   memcpy_P(&hello, &kIdentity.protocol_major, kIdentityInHello);
   hello.reset_cause = board::reset_cause();
+  hello.hung_at = board::hung_at();
   hello.streaming = sampler_.streaming();
+  hello.sections = sampler_.sections();
   hello.sample_rate_hz = settings.sample_rate_hz;
-  hello.sensors = (sampler_.imu().present() ? wire::sensors::kMpu6050 : 0) |
-                  (sampler_.baro().present() ? wire::sensors::kBmp180 : 0);
-  hello.imu_id = sampler_.imu().id();
   hello.accel_range_g = settings.accel_range_g;
   hello.gyro_range_deg_s = settings.gyro_range_deg_s;
   hello.dlpf = settings.dlpf;
   hello.baro_oversampling = settings.baro_oversampling;
-  static_assert(sizeof(wire::Hello) - sizeof hello.mice - offsetof(wire::Hello, ac1) == 2 * Bmp180::kCalibrationWords,
-                "AC1 to MD stand side by side");
-  memcpy(&hello.ac1, words, 2 * Bmp180::kCalibrationWords);
+  hello.mouse_counts_per_mm = settings.mouse_counts_per_mm;
+  hello.i2c_khz = settings.i2c_khz;
+  sampler_.describe(hello.devices);
+  static_assert(sizeof hello.baro_words == 2 * Barometer::kWords, "all words");
+  memcpy(hello.baro_words, sampler_.baro().calibration(), sizeof hello.baro_words);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    hello.mice[i] = {mouse.id(), mouse.counts_per_mm(), mouse.report_rate_hz()};
+    hello.mice[i] = {static_cast<uint8_t>(state_of(mouse.presence())), mouse.id(), mouse.status(),
+                     mouse.counts_per_mm(), mouse.report_rate_hz(), mouse.lacks()};
   }
   uart::put(wire::Hello::kType, &hello, wire::Hello::size(Mice::kPorts));
 }
@@ -116,14 +126,14 @@ void Link::send_status() {
   status.rx_overruns = uart::overruns();
   status.i2c_errors = twi::errors();
   status.i2c_recoveries = twi::recoveries();
-  status.imu_restarts = sampler_.imu().restarts();
-  status.baro_restarts = sampler_.baro().restarts();
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
   status.cpu_load = static_cast<uint16_t>(awake_us / (elapsed_us / 1000));
+  status.vcc_mv = board::supply_mv();
+  sampler_.count(status.devices);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets()};
+    status.mice[i] = {mouse.parity_errors(), mouse.resyncs(), mouse.resets(), mice_.take_poll_us(i)};
   }
   uart::put(wire::Status::kType, &status, wire::Status::size(Mice::kPorts));
 }

@@ -16,9 +16,9 @@ class Link : public commands::Board {
 
   bool streaming() const override { return sampler_.streaming(); }
   uint16_t sample_rate_hz() const override { return sampler_.settings().sample_rate_hz; }
-  bool imu_present() const override { return sampler_.imu().present(); }
+  bool imu_present(uint8_t device) const override { return sampler_.imu(device).present(); }
   uint8_t mouse_ports() const override { return Mice::kPorts; }
-  uint8_t mice_in_sample() const override { return mice_.in_sample(); }
+  uint8_t sample_size() const override { return sampler_.sample_size(); }
   void send_hello() override;
   void send_pong(uint32_t token) override;
   void acknowledge(uint8_t command) override;
@@ -27,7 +27,7 @@ class Link : public commands::Board {
   void start() override { sampler_.start(); }
   void stop() override { sampler_.stop(); }
   void reset_mice(uint8_t ports) override { mice_.reset(ports); }
-  void self_test() override { sampler_.self_test(); }
+  void self_test(uint8_t device) override { sampler_.self_test(device); }
 
  private:
   void receive();

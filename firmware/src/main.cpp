@@ -11,8 +11,8 @@
 #include "Mice.h"
 #include "Sampler.h"
 
-// In force until the host says otherwise: 100 Hz, 8 g, 1000 deg/s, DLPF 3, oversampling 1, 8 counts/mm.
-static constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8};
+// In force until the host says otherwise: 100 Hz, 8 g, 1000 deg/s, DLPF 3, oversampling 1, 8 counts/mm, I2C at 400 kHz.
+static constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8, 400};
 
 static Mice mice(kDefaults.mouse_counts_per_mm);
 static Sampler sampler(kDefaults, mice);
@@ -23,18 +23,19 @@ void setup() {
   board::power_down_unused();
   board::start_watchdog();
   board::begin_led();
+  board::begin_supply();
   idle::begin();
   twi::begin();
   uart::begin();
-  mice.begin(kDefaults.sample_rate_hz);
+  mice.begin();
   clock::begin(kDefaults.sample_rate_hz);
 }
 
 void loop() {
   const uint32_t woken_us = clock::now_us();
   board::feed_watchdog();
+  mice.run();  // before the SAMPLE of this tick is made
   sampler.run();
-  mice.run();
   host.run();
   led.run();
   board::scan_stack();

@@ -134,13 +134,13 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
 _the_folder = functools.cache(cache_folder)
 
 
-def _decorator(**options: Any) -> Callable[[Function], Function]:
+def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     # Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
     options = {"error_model": "numpy", **options}
 
     def decorate(function: Function) -> Function:
         made: Any = numba.njit(**options)(function)
-        folder = _the_folder()
+        folder = _the_folder() if keep else None
         if folder is not None:
             made._cache = _kept(function, folder)
         return cast(Function, made)
@@ -157,7 +157,30 @@ def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
         _config.CACHE_DIR = asked
 
 
-compiled = _decorator()
-inlined = _decorator(inline="always")
-# Without the wrappers for Python, which take a quarter of the time to compile.
-inner = _decorator(no_cpython_wrapper=True, no_cfunc_wrapper=True)
+compiled = _decorator(True)
+inlined = _decorator(False, inline="always")
+# Without wrappers for Python and without a file of its own: both cost half of the time to compile.
+inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+# The name under which the writer of estimates as text is marked: every run needs it, whatever its filters.
+TEXT = "text"
+
+
+def mark_compiled(name: str) -> None:
+    """Notes that all machine code of a filter is kept, so that later runs load it."""
+    folder = _the_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            (folder / f"{name}.compiled").touch()
+
+
+def is_compiled(name: str) -> bool:
+    """Whether the machine code of a filter is kept, and loading it takes a moment only."""
+    folder = _the_folder()
+    return folder is not None and (folder / f"{name}.compiled").exists()
+
+
+def can_keep_code() -> bool:
+    """Whether there is a folder for machine code: without one, another process cannot compile for this one."""
+    return _the_folder() is not None

@@ -38,6 +38,7 @@ class Quantity:
     period: float | None = None  # of an angle, in the column's unit: 360 or 2π
     decimals: int = 6  # that a file keeps: a micrometre, a microdegree
     std: str = ""  # column of σ where it does not follow the rule
+    is_reading: bool = False  # measured by a sensor rather than estimated by a filter
 
     @property
     def column(self) -> str:
@@ -109,7 +110,7 @@ def _rate(name: str, label: str) -> Quantity:
 
 def _reading(name: str, unit: str, label: str, shown: Shown, panel: str) -> Quantity:
     """A column of a recording: no filter estimates it."""
-    return Quantity(name, unit, label, shown, Shown(unit, shown.scale), panel)
+    return Quantity(name, unit, label, shown, Shown(unit, shown.scale), panel, is_reading=True)
 
 
 def _part_of_rotation(axis: str) -> Quantity:
@@ -129,8 +130,8 @@ ANGLE = _degrees("angle", "joint angle")
 QW, QX, QY, QZ = (_part_of_rotation(axis) for axis in "wxyz")
 # σ of the whole rotation of a chain's joint, the only figure that says how sure the quaternion is.
 ROTATION = _degrees("rotation", "joint rotation")
-HEIGHT1 = _length("height1", "height of sensor 1 over the fixed joint", "height")
-HEIGHT2 = _length("height2", "height of sensor 2 over the fixed joint", "height")
+HEIGHT1 = _length("height1", "height of sensor 1", "height")
+HEIGHT2 = _length("height2", "height of sensor 2", "height")
 
 _AXES = ("x", "y", "z")
 _READINGS = (
@@ -170,6 +171,11 @@ def split(column: str) -> Column | None:
     return None
 
 
+def unit_text(unit: str) -> str:
+    """A unit as columns write it, for people: m/s for m_s, ° for deg."""
+    return {"deg": "°", "m_s": "m/s", "rad_s": "rad/s", "m_s2": "m/s²"}.get(unit, unit)
+
+
 def decimals(column: str) -> int:
     """Decimals that an estimate's file keeps of this column."""
     found = split(column)
@@ -177,11 +183,13 @@ def decimals(column: str) -> int:
 
 
 def by_filter(columns: Iterable[str]) -> dict[str, dict[Quantity, str]]:
-    """Filter -> quantity -> column of its value, in the order of the columns; columns without prefix are left out."""
+    """Filter -> quantity -> column of its value, in the order of the columns. Readings, and columns without a prefix,
+    belong to no filter.
+    """
     found: dict[str, dict[Quantity, str]] = {}
     for column in columns:
         part = split(column)
-        if part is not None and part.prefix and not part.is_std:
+        if part is not None and part.prefix and not (part.is_std or part.quantity.is_reading):
             found.setdefault(part.filter, {})[part.quantity] = column
     return found
 

@@ -35,6 +35,8 @@ class PtyBoard:
         self.path = path
         self.spoil = spoil
         self.chatter = chatter
+        self.heard = threading.Event()  # the host has sent something
+        self.streams = threading.Event()  # the board has sent samples
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -45,12 +47,14 @@ class PtyBoard:
     def __exit__(self, *_: object) -> None:
         self.pull()
 
-    def plug(self) -> None:
-        """Switches a fresh board on and puts it at the path."""
+    def plug(self, path: Path | None = None) -> None:
+        """Switches a fresh board on and puts it at the path, or at another one from now on."""
+        self.path = path or self.path
+        self.heard.clear()
         self._master, self._slave = os.openpty()
         tty.setraw(self._master)
         tty.setraw(self._slave)
-        self._board, self._began = SimulatedBoard(link_run), time.monotonic()
+        self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
         self.path.symlink_to(os.ttyname(self._slave))
         self._stop.clear()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -72,7 +76,7 @@ class PtyBoard:
         from linkpose.simulation import board as simulated
         from linkpose.wire.frames import encode
 
-        self._board, self._began = SimulatedBoard(link_run), time.monotonic()
+        self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
         if says_hello:
             os.write(self._master, encode(simulated.hello(simulated.DEFAULTS)))
 
@@ -82,9 +86,13 @@ class PtyBoard:
             if select.select([self._master], [], [], 0.004)[0]:
                 with contextlib.suppress(OSError):
                     heard = os.read(self._master, 4096)
-            now_us = int((time.monotonic() - self._began) * 1e6)
-            said = self._board.advance(now_us) + self._board.receive(heard, now_us)
+                self.heard.set()
+            now_us = int((time.perf_counter() - self._began) * 1e6)
+            streamed = self._board.advance(now_us)
+            said = streamed + self._board.receive(heard, now_us)
             if said:
                 os.write(self._master, self.spoil(said))
+            if streamed:
+                self.streams.set()
             if self.chatter:
                 os.write(self._master, self.chatter)

@@ -15,13 +15,13 @@ from linkpose import compiling
 
 HOST = Path(__file__).parents[2] / "host"
 
-# A compiled function whose machine code has in it what it calls in another file, and a class in its signature.
+# A compiled function whose machine code includes what it calls in another file, and a class in its signature.
 HEIGHT = """
-import numpy as np
+from linkpose import filters
 from linkpose.filters import baro
-state = baro.StartState.fresh()
-state.force[2] = 9.8
-print(baro.start_height(state, (0.0, 0.0, 1.5)), sum(baro.start_height.stats.cache_hits.values()))
+from linkpose.sensors.rig import Rig
+estimate = baro.BaroFilter(Rig().with_j2s((0.0, 0.0, 1.5))).process(filters._two_samples_at_rest())
+print(round(estimate[0, 0] * 9.8 / 9.8, 9), sum(baro._process.stats.cache_hits.values()))
 """
 
 
@@ -173,9 +173,12 @@ def test_a_damaged_file_is_compiled_and_kept_anew(ending, package, tmp_path):
 
 def test_code_of_other_arguments_is_not_taken(tmp_path):
     """As processes leave it that keep code of one function at once: each names its file by what it has found."""
+    (tmp_path / "sums.py").write_text(
+        "from linkpose.compiling import compiled\n@compiled\ndef total(a, b):\n    return a[0] * b[0] + a[1] * b[1]\n"
+    )
     code = (
-        "from linkpose.filters import _vector as vec\n"
-        "print(vec.dot((1.5, 2.0, 0.0), (2.0, 2.0, 0.0)), vec.dot((1, 2, 0), (2, 2, 0)), vec.dot.stats.cache_hits)"
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\nfrom sums import total\n"
+        "print(total((1.5, 2.0), (2.0, 2.0)), total((1, 2), (2, 2)), total.stats.cache_hits)"
     )
     assert run(code, HOST, NUMBA_CACHE_DIR=tmp_path).startswith("7.0 6 Counter()")
     floats, integers = sorted(tmp_path.rglob("*.nbc"))

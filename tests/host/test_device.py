@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pty_board import PtyBoard
+from pty_board import PtyBoard, link_run
+from serial.tools import list_ports_common
 
+from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
+from linkpose.errors import CannotWrite
+from linkpose.recorder import Recorder
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
-from linkpose.wire.frames import encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello
+from linkpose.sensors.rig import Rig
+from linkpose.simulation.board import DEFAULTS, SimulatedBoard
+from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping, Sample
 
 
 @pytest.fixture
@@ -34,7 +42,7 @@ def stranger(path: Path, chatter: bytes) -> PtyBoard:
 
 
 OLD_HELLO = bytes.fromhex("01") + bytes([0, 9]) + b"\x11\x22\x33\x44" + b"whatever followed then"
-NEW_HELLO = bytes.fromhex("01") + bytes([2, 0]) + b"\x11\x22\x33\x44" + bytes(60)
+NEW_HELLO = bytes.fromhex("01") + bytes([3, 0]) + b"\x11\x22\x33\x44" + bytes(60)
 
 
 def framed(payload: bytes) -> bytes:
@@ -50,10 +58,10 @@ def framed(payload: bytes) -> bytes:
     [
         (b"", "the board is silent"),
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
-        (random.Random(3).randbytes(60), "only noise came"),
-        (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 1.1"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 1.1, the board's firmware 2.0"),
+        (random.Random(3).randbytes(60), "only noise was received"),
+        (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -78,7 +86,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
     assert "there is no port /dev/ttyNONE" in refused("info", "--port", "/dev/ttyNONE")
     (tmp_path / "file").write_text("no port")
     assert "is not a serial port" in refused("info", "--port", tmp_path / "file")
-    assert "is no port that can be opened" in refused("info", "--port", "nonsense://x")
+    assert "nonsense://x is not a port" in refused("info", "--port", "nonsense://x")
     assert "no simulated board 'nothing'" in refused("info", "--port", "sim://nothing")
     assert "no option tset" in refused("info", "--port", "sim://link?tset=1")
     with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print):
@@ -87,7 +95,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
 
 def test_settings_are_put_in_force_or_refused_with_the_reason():
     with Session("sim://link", print) as session:
-        settings = Configure(200, 4, 500, 2, 0, 8)
+        settings = Configure(200, 4, 500, 2, 0, 8, 400)
         hello = session.configure(settings)
         assert (hello.sample_rate_hz, hello.accel_range_g, hello.gyro_range_deg_s) == (200, 4, 500)
         with pytest.raises(session_module.LinkposeError, match="gyro range out of range"):
@@ -101,28 +109,48 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     with PtyBoard(tmp_path / "port"):
         first = Session(str(tmp_path / "port"), print)
         next(iter(first.stream()))
-        first._link.close()  # as a killed program leaves it: no STOP
+        first._connection.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
             seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]
     assert seqs == list(range(30))
 
 
-def record_through(port: Path, out: Path, duration: float, *happenings) -> tuple[list[str], Session]:
-    """Records for a time of the board; each happening (after s, what) is done on the way."""
-    from linkpose.cli.live import Recorder
+def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple[list[str], Session]:
+    """Records until `after` samples have come behind a gap.
+
+    Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
+    how long anything takes.
+    """
+    from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
     said: list[str] = []
+    waiting = list(happenings)
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
-        waiting = list(happenings)
-        for placements in session.stream(duration):
-            recorder.take(placements)
-            if waiting and session.timeline.duration_s >= waiting[0][0]:
+        behind = None
+        for placements in session.stream():
+            recorder.convert(placements)
+            timeline = session.timeline
+            if waiting and waiting[0][0](said, timeline.samples):
                 waiting.pop(0)[1]()
-        recorder.close("duration")
+            if behind is None and timeline.gaps and not waiting:
+                behind = timeline.samples
+            if behind is not None and timeline.samples >= behind + after:
+                break
+        recorder.close("interrupted")
     assert not waiting
     return said, session
+
+
+def samples(count: int):
+    """The condition that so many samples have come."""
+    return lambda _said, number: number >= count
+
+
+def said_that(words: str):
+    """The condition that a message contains these words."""
+    return lambda said, _number: any(words in line for line in said)
 
 
 def check_one_gap(out: Path, cause: str) -> None:
@@ -143,36 +171,138 @@ def check_one_gap(out: Path, cause: str) -> None:
 
 def test_a_pulled_cable_is_waited_for_and_the_gap_is_marked(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        put_back = threading.Timer(0.6, board.plug)
-
-        def pull() -> None:
-            board.pull()
-            put_back.start()
-
-        said, session = record_through(tmp_path / "port", tmp_path / "r.csv", 2.0, (0.5, pull))
-    assert "is gone" in said[0] and "is back" in said[1]
+        said, session = record_through(
+            tmp_path / "port", tmp_path / "r.csv", (samples(50), board.pull), (said_that("disappeared"), board.plug)
+        )
+    assert "disappeared" in said[0] and "is back" in said[1]
     assert len(session.health().gaps) == 1
     check_one_gap(tmp_path / "r.csv", "cable")
 
 
+class UsbPorts:
+    """The system's list of ports: the boards that are plugged in, with their serial numbers."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.boards: list[tuple[PtyBoard, str | None]] = []
+        monkeypatch.setattr(ports.list_ports, "comports", self.comports)
+
+    def comports(self) -> list[list_ports_common.ListPortInfo]:
+        found = []
+        for board, number in self.boards:
+            if board.path.exists():
+                port = list_ports_common.ListPortInfo(str(board.path))
+                port.vid, port.pid, port.serial_number = 0x2341, 0x0043, number
+                found.append(port)
+        return found
+
+
+@pytest.mark.parametrize("number", ["75735", None], ids=["by its serial number", "as the only one of its kind"])
+def test_a_board_that_returns_under_another_name_is_found(tmp_path, monkeypatch, number):
+    usb = UsbPorts(monkeypatch)
+    with PtyBoard(tmp_path / "ttyACM0") as board:
+        usb.boards.append((board, number))
+        said, session = record_through(
+            tmp_path / "ttyACM0",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), lambda: board.plug(tmp_path / "ttyACM1")),
+            after=20,
+        )
+    assert f"the board is back at {tmp_path / 'ttyACM1'}" in said[1]
+    assert session.port == str(tmp_path / "ttyACM1")
+    check_one_gap(tmp_path / "r.csv", "cable")
+
+
+def test_another_board_at_the_old_name_is_not_opened(tmp_path, monkeypatch):
+    usb = UsbPorts(monkeypatch)
+    with PtyBoard(tmp_path / "ttyACM0") as board, PtyBoard(tmp_path / "other") as other:
+        usb.boards += [(board, "1"), (other, "2")]
+
+        def swap() -> None:
+            other.pull()
+            other.plug(tmp_path / "ttyACM0")
+            board.plug(tmp_path / "ttyACM1")
+
+        said, session = record_through(
+            tmp_path / "ttyACM0",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), swap),
+            after=20,
+        )
+        assert not other.heard.is_set()
+    assert session.port == str(tmp_path / "ttyACM1"), said
+
+
+def test_an_obstacle_at_the_port_is_reported_once(tmp_path, monkeypatch):
+    attempts = []
+
+    def busy(name: str) -> str | None:
+        attempts.append(name)
+        return "modem-manager (process 7)" if 1 < len(attempts) < 6 else None  # the first time is the session's own
+
+    monkeypatch.setattr(ports, "holder", busy)
+    with PtyBoard(tmp_path / "port") as board:
+        said, _ = record_through(
+            tmp_path / "port",
+            tmp_path / "r.csv",
+            (samples(20), board.pull),
+            (said_that("disappeared"), board.plug),
+            after=20,
+        )
+    assert len(attempts) == 6
+    assert sum("is in use by modem-manager (process 7). Close it" in line for line in said) == 1
+
+
+def test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts(tmp_path, linkpose):
+    with PtyBoard(tmp_path / "port") as board:
+        pull = threading.Thread(target=lambda: (board.streams.wait(), board.pull()))
+        pull.start()
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 2, "--json")
+        pull.join()
+    table = read_table(tmp_path / "r.csv", "recording")
+    summary = json.loads(result.out.splitlines()[-1])
+    assert result.status == 0
+    assert summary["lost"] + summary["samples"] == 200
+    assert summary["duration_s"] == 2.0
+    assert summary["gaps"] == table.closing["gap_count"] == 1
+    assert table.closing["gaps"][0]["cause"] == "cable"
+    assert f"{summary['lost']} samples are counted as lost" in result.err
+
+
 def test_a_reset_board_goes_on_with_the_settings_of_before(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 1.0, (0.4, board.reset))
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", (samples(40), board.reset))
     assert "was reset (power on)" in said[0]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
 def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        reset = (0.3, lambda: board.reset(says_hello=False))
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", 2.5, reset)
+        reset = (samples(30), lambda: board.reset(says_hello=False))
+        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", reset)
     assert "no sample for 1.5 s" in said[0] and "was reset" in said[1]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
-def test_a_port_that_goes_during_the_handshake_is_a_sentence(impatient, refused, tmp_path):
+def test_a_suspended_program_does_not_report_a_silent_board(tmp_path):
+    """After SIGSTOP the clock has run on, but nothing was waited for."""
+    said: list[str] = []
+    ahead_s = 0.0
+    clock = types.SimpleNamespace(perf_counter=lambda: time.perf_counter() + ahead_s, sleep=time.sleep)
+    port = tmp_path / "port"
+    with PtyBoard(port), Session(str(port), said.append) as session, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(session_module, "time", clock)
+        for _ in session.stream():
+            ahead_s += 10.0
+            if session.timeline.samples > 40:
+                break
+    assert not said
+
+
+def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
     with stranger(tmp_path / "port", b"") as board:
-        pull = threading.Timer(0.3, board.pull)
+        pull = threading.Thread(target=lambda: (board.heard.wait(), board.pull()))
         pull.start()
         said = refused("info", "--port", tmp_path / "port")
         pull.join()
@@ -216,3 +346,126 @@ def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_pat
                 time.sleep(1.0)  # a slow disk
             seqs += [p.place.seq for p in placements]
     assert seqs == list(range(150))
+
+
+class Forgetful(SimulatedBoard):
+    """A board that is reset, and whose HELLO gets lost, each time that it has answered a PING after a CONFIGURE."""
+
+    def __init__(self, resets: int) -> None:
+        super().__init__(link_run)
+        self.resets = resets
+        self._configured = False
+
+    def _answer(self, message, now_us):
+        answers = super()._answer(message, now_us)
+        self._configured |= isinstance(message, Configure)
+        if self.resets and self._configured and isinstance(message, Ping):
+            self.resets -= 1
+            self._configured = False
+            self._settings = DEFAULTS
+            self._run = link_run(DEFAULTS)
+        return answers
+
+
+@pytest.mark.parametrize("resets", [1, 2])
+def test_a_reset_between_configure_and_start_is_noticed(tmp_path, monkeypatch, resets):
+    """The values are never scaled by settings that the board does not have: 200 Hz and 16 g are streamed in the end."""
+    board = Forgetful(resets)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200, accel_range_g=16))
+        samples = [p.sample for placements in session.stream(0.2) for p in placements]
+    assert len(samples) == 40
+    assert np.mean([sample.accel_z for sample in samples]) == pytest.approx(2048, rel=0.1)  # 1 g at 16 g
+
+
+def test_a_board_that_is_reset_again_and_again_is_named(tmp_path, monkeypatch):
+    board = Forgetful(1000)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200))
+        with pytest.raises(session_module.LinkposeError, match="reset again and again"):
+            next(iter(session.stream(0.2)))
+
+
+class SpoiledSamples:
+    """Changes samples on their way to the host, from the n-th on."""
+
+    def __init__(self, first: int, change) -> None:
+        self._first, self._change, self._count = first, change, 0
+        self._decoder = StreamDecoder()
+
+    def __call__(self, data: bytes) -> bytes:
+        return b"".join(self._pass_on(message) for message in self._decoder.feed(data))
+
+    def _pass_on(self, message) -> bytes:
+        if isinstance(message, Sample):
+            self._count += 1
+            if self._count > self._first:
+                return self._change(message, self._count)
+        return encode(message)
+
+
+def lines_of(port: Path, words: str, most: int = 400) -> list[str]:
+    """Messages of a session up to the first with these words."""
+    said: list[str] = []
+    with Session(str(port), said.append) as session:
+        for _ in session.stream():
+            if any(words in line for line in said) or session.timeline.samples > most:
+                break
+    return said
+
+
+def test_a_stream_that_turns_to_noise_is_reported(tmp_path):
+    noise = random.Random(1).randbytes(30)
+    with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, lambda message, count: noise)):
+        said = lines_of(tmp_path / "port", "noise")
+    assert re.fullmatch(r"no sample for 1.5 s, only \d+ bytes of noise; asking the board", said[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda message, count: encode(message._replace(t_us=5_000_000)), "stands still"),
+        (lambda message, count: encode(message._replace(t_us=message.t_us + 3_000_000)), "jumped by 3.00 s"),
+    ],
+    ids=["frozen", "jumping"],
+)
+def test_a_board_clock_that_stands_still_or_jumps_is_reported_once(tmp_path, change, words):
+    with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, change)):
+        said = lines_of(tmp_path / "port", words)
+    assert sum(words in line for line in said) == 1
+
+
+def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
+    from linkpose.simulation import board as simulated
+
+    ours = simulated.hello(simulated.DEFAULTS)
+    other = ours._replace(devices=(ours.devices[0]._replace(id=0x70), *ours.devices[1:]))
+    changed = threading.Event()
+
+    def spoil(data: bytes) -> bytes:
+        return data.replace(encode(ours), encode(other)) if changed.is_set() else data
+
+    port = tmp_path / "port"
+    refusal = pytest.raises(session_module.AnotherBoard, match="0x70 instead of 0x68")
+    with PtyBoard(port, spoil=spoil) as board, Session(str(port), print) as session, refusal:
+        for _ in session.stream():
+            if session.timeline.samples > 10 and not changed.is_set():
+                changed.set()
+                board.reset(says_hello=False)
+
+
+def test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence(tmp_path):
+    out = tmp_path / "r.csv"
+    refusal = pytest.raises(CannotWrite, match="it was removed while it was being written")
+    with Session("sim://link?speed=20", print) as session, Recorder(session, out, Rig()) as recorder, refusal:
+        for placements in session.stream(20):
+            recorder.convert(placements)
+            if session.timeline.samples > 10:
+                Recorder(session, out, Rig(), force=True).close("duration")  # a second program, with --force
+
+
+def test_a_recording_is_not_called_a_raw_capture(refused, tmp_path):
+    assert "is not a name for a recording" in refused("record", tmp_path / "x.bin", "--port", "sim://link")
+    assert not (tmp_path / "x.bin").exists()

@@ -13,12 +13,14 @@ from scipy.stats import chi2
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.mice import redundancy
-from linkpose.filters.mice import MiceFilter, MiceParameters, fault_limit
+from linkpose.experiments.mice import redundancy
+from linkpose.filters.mice import MiceFilter, MiceParameters
+from linkpose.filters.mice.faults import fault_limit
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation.mice import Fault, MiceRun, ring
-from linkpose.wire.messages import SampleFlags, Sensors
+from linkpose.wire.messages import SampleFlags
 
 VELOCITY = slice(0, 3)
 STD = slice(3, 6)

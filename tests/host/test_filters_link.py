@@ -10,11 +10,12 @@ import pytest
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig
 from linkpose.simulation.link import LinkRun
-from linkpose.wire.messages import SampleFlags, Sensors
+from linkpose.wire.messages import SampleFlags
 
 PAPER = ("joint", "tilt", "imu-baro", "baro")
 INERTIAL = ("joint", "tilt")
@@ -330,8 +331,10 @@ def test_missing_and_saturated_readings_are_passed_by_prediction_and_counted(nam
     accel[rng.random(len(block)) < 0.05, 1] = np.nan
     gyro[rng.random(len(block)) < 0.02] = np.inf
     pressure[rng.random(len(block)) < 0.05] = np.nan
-    full = rng.random(len(block)) < 0.03
-    accel[full] = 78.4
+    largest = np.abs(block.accel_m_s2).max(axis=1)
+    most = np.quantile(largest, 0.97)
+    full = largest > most
+    accel = np.clip(accel, -most, most)
     flags[full] |= int(SampleFlags.ACCEL_SATURATED)
     damaged = replace(block, accel_m_s2=accel, gyro_rad_s=gyro, pressure_Pa=pressure, flags=flags)
     estimate = assert_sane(name, run.rig, damaged)
@@ -387,7 +390,7 @@ def test_half_a_sample_does_not_end_a_gap(name, lost, gap_s):
     time_s[3000:] += gap_s
     estimate = filters.create(name, run.rig).process(replace(block, time_s=time_s, **{lost: values}))
     error = estimate[4500:, 0] - run.truth().height_m[4500:]
-    assert np.isfinite(estimate).all()
+    assert np.isfinite(estimate[:3000]).all() and np.isfinite(estimate[3055:]).all()
     assert np.sqrt(np.mean(error**2)) < {"joint-inertial": 0.001, OURS: 0.01}[name]
 
 
@@ -397,7 +400,7 @@ def test_a_dead_accelerometer_is_forgotten():
     n = 50 * 3000
     dead = measurements(np.arange(n) / 50 - n / 50, np.zeros((n, 3)), np.zeros((n, 3)))
     f = filters.create(OURS, run.rig)
-    assert f.process(dead)[:, 1].max() < 1e4
+    assert np.isnan(f.process(dead)[200:]).all()
     assert np.abs(f.process(block)[-1000:, 0] - run.truth().height_m[-1000:]).max() < 0.03
 
 

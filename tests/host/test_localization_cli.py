@@ -142,7 +142,6 @@ def test_options_that_cannot_be_are_refused(dive, refused, options, reason):
         ("0,odometry,1,0,\n1,range,1,5,\n", "add --start X,Y,HEADING"),
         ("0,pose,0,0,0\n0,odometry,1,0,\n1,depth,5,,\n", "mixes a robot's odometry with a vehicle's depth"),
         ("0,pose,0,0,0\n1,range,1,nan,\n", "line 3: 'nan' is not a number"),
-        ("1,pose,0,0,0\n0,range,1,5,\n", "line 3: time runs backwards"),
     ],
 )
 def test_logs_that_cannot_be_are_refused(dive, refused, tmp_path, rows, reason):

@@ -58,7 +58,7 @@ def test_the_zero_of_a_drawn_wall_is_its_face():
 
 @pytest.fixture(scope="module")
 def drive():
-    """Half a minute through the office floor, with its map; beams as good as a laser scanner's, whatever their range."""
+    """Half a minute through the office floor, with its map and a laser scanner's constant noise."""
     return simulate_indoor(3, IndoorErrors(range_growth=0.0, outlier_fraction=0.0), 30.0), office_map()
 
 

@@ -12,13 +12,18 @@ from click.testing import CliRunner
 from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
+from linkpose.evaluation.scores import evaluate
+from linkpose.localization.grid import GridMap
+from linkpose.plotting import lines
+from linkpose.plotting.canvas import COLOURS
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
 
 
-def write(path, columns):
-    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+def write(path, columns, kind="estimate"):
+    head = f"# linkpose {kind} 1\n# {{}}\n" + ",".join(columns)
+    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=head, comments="")
     return str(path)
 
 
@@ -29,20 +34,197 @@ def estimate(tmp_path):
     return write(tmp_path / "estimate.csv", columns)
 
 
-def test_plot_draws_each_quantity_once(tmp_path, estimate):
-    truth = write(tmp_path / "truth.csv", {"time_s": [0, 1], "height_m": [1, 2]})
-    figure = plotting.plot_tables([read_table(tmp_path / "estimate.csv"), read_table(tmp_path / "truth.csv")])
-    assert [axes.get_ylabel() for axes in figure.axes] == ["height (m)", "y (m)"]
-    assert [len(axes.lines) for axes in figure.axes] == [2, 1]
-    assert CliRunner().invoke(plot.command, [estimate, truth, "-o", str(tmp_path / "both.png")]).exit_code == 0
-    assert (tmp_path / "both.png").read_bytes().startswith(PNG)
+def drawn(axes):
+    """Labels of an axes' legend, in order."""
+    legend = axes.get_legend()
+    return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+def link_files(tmp_path, n=600, **more):
+    """An estimate of three filters that err by known amounts, and its truth."""
+    t = np.arange(n) / 100
+    height = 1.5 + 0.1 * np.sin(3 * t)
+    columns = {"time_s": t}
+    for name, error in (("joint_inertial", 0.001), ("joint", 0.01), ("imu_baro", 0.3)):
+        columns |= {f"{name}_height_m": height + error * np.cos(9 * t), f"{name}_height_std_m": np.full(n, error)}
+        columns |= {f"{name}_roll_deg": 10 * np.sin(t)}
+    truth = {"time_s": t, "height_m": height, "roll_deg": 10 * np.sin(t), "yaw_deg": 0 * t}
+    paths = (write(tmp_path / "e.csv", columns | more), write(tmp_path / "t.csv", truth, "truth"))
+    return [read_table(Path(path)) for path in paths]
+
+
+def test_a_link_with_its_truth_shows_height_error_and_tilt(tmp_path):
+    figure, remarks = plotting.plot_tables(link_files(tmp_path))
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["height over the joint (m)", "height error (cm)", "roll (°)"]  # no filter estimates the yaw
+    height, error, _ = figure.axes
+    assert drawn(height) == ["truth", "joint-inertial", "joint", "±2σ joint-inertial"]
+    words = [label.split() for label in drawn(error)]
+    assert [word[0] for word in words] == ["joint-inertial", "joint", "±2σ"] and words[0][2:] == ["cm", "rms"]
+    assert [float(word[1]) for word in words[:2]] == pytest.approx([0.0707, 0.707], rel=0.02)
+    assert height.get_position().height > error.get_position().height
+    assert all(axes.get_shared_x_axes().joined(height, axes) for axes in figure.axes)
+    assert any("imu-baro (add --filter imu-baro)" in remark for remark in remarks)
+    assert "e.csv" in figure.get_suptitle() and "100 Hz" in figure.get_suptitle()
+    assert "no samples lost" in figure.get_suptitle()
+
+
+def test_colours_widths_and_bands_are_those_of_the_filters(tmp_path):
+    figure, _ = plotting.plot_tables(link_files(tmp_path))
+    height, error = figure.axes[:2]
+    lines = {line.get_label(): line for line in height.lines}
+    assert lines["joint-inertial"].get_color() == COLOURS["joint-inertial"]
+    assert lines["joint-inertial"].get_linewidth() > lines["joint"].get_linewidth()
+    assert (lines["truth"].get_color(), lines["truth"].get_linestyle()) == ("black", "--")
+    band = next(c for c in error.collections if c.get_label() == "±2σ joint-inertial")
+    assert np.nanmax(band.get_paths()[0].vertices[:, 1]) == pytest.approx(0.2)  # 2 × 0.1 cm
+    assert (
+        len({COLOURS[name] for name in ("joint-inertial", "tilt-inertial", "joint", "tilt", "imu-baro", "baro")}) == 6
+    )
+
+
+def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
+    figure, remarks = plotting.plot_tables(link_files(tmp_path), ["imu-baro"])
+    assert drawn(figure.axes[0])[:2] == ["truth", "imu-baro"]
+    assert any("joint-inertial" in remark for remark in remarks)
+    with pytest.raises(LinkposeError, match="no file has the filter mice; there are joint-inertial, joint, imu-baro"):
+        plotting.plot_tables(link_files(tmp_path), ["mice"])
+
+
+def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
+    figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == ["height over the joint (m)", "from best (cm)", "roll (°)"]
+    assert drawn(figure.axes[1])[0] == "joint-inertial (best)"
+
+
+def test_gaps_and_unknown_values_are_shaded(tmp_path):
+    estimate, _ = link_files(tmp_path)
+    keep = np.r_[0:200, 300:600]
+    cut = {name: column[keep] for name, column in estimate.columns.items()}
+    for name in cut:
+        if name != "time_s":
+            cut[name][100:150] = np.nan
+    np.savetxt(
+        tmp_path / "cut.csv", np.column_stack(list(cut.values())), delimiter=",", header=",".join(cut), comments=""
+    )
+    figure, _ = plotting.plot_tables([read_table(tmp_path / "cut.csv")])
+    spans = {c.get_label(): c.get_paths() for c in figure.axes[0].collections}
+    (gap,), (unknown,) = spans["gap"], spans["no valid value"]
+    assert gap.vertices[:, 0].min() == pytest.approx(1.99) and gap.vertices[:, 0].max() == pytest.approx(3.0)
+    assert unknown.vertices[:, 0].min() == pytest.approx(1.0) and unknown.vertices[:, 0].max() == pytest.approx(1.5)
+    assert "100 samples lost in 1 gap" in figure.get_suptitle()
+
+
+def test_a_robot_shows_its_path_first_and_square(tmp_path):
+    t = np.arange(400) / 100
+    pose = {"x_m": np.sin(t), "y_m": 1 - np.cos(t), "heading_rad": (t + np.pi) % (2 * np.pi) - np.pi}
+    motion = {"vx_m_s": np.ones(400), "vy_m_s": np.zeros(400)}
+    columns = {"time_s": t, **{f"planar_ekf_{k}": v for k, v in (pose | motion).items()}}
+    columns |= {"planar_ekf_x_std_m": np.full(400, 0.01), "planar_ekf_y_std_m": np.full(400, 0.02)}
+    columns |= {"mice_excluded": np.where((t > 1) & (t < 2), 2.0, 0.0)}
+    paths = (write(tmp_path / "e.csv", columns), write(tmp_path / "t.csv", {"time_s": t} | pose | motion, "truth"))
+    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    path, speed, heading, mice = figure.axes
+    assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x (m)", "y (m)", 1.0)
+    assert drawn(path) == ["truth", "planar-ekf", "±2σ planar-ekf"]
+    assert {(e.width, e.height) for e in path.patches if hasattr(e, "width")} == {(0.04, 0.08)}
+    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped (°)")
+    assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
+    (bar,) = mice.collections[1].get_paths()  # of mouse 2
+    assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_map_and_beacons_lie_under_the_path(tmp_path):
+    """A map whose own axes are turned by 90°: its corners are where map_server puts them."""
+    t = np.arange(50) / 100
+    file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
+    grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
+    scene = plotting.Scene(grid, {"A1": (3.0, 4.0, 9.0)})
+    figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
+    (path,) = figure.axes
+    (image,) = path.images
+    corner = (image.get_transform() - path.transData).transform([(4.0, 2.0)])  # 8 × 4 cells of 0.5 m
+    assert np.allclose(corner, [(-1.0, 6.0)])
+    beacon = next(line for line in path.lines if line.get_label() == "beacons")
+    assert (beacon.get_xdata()[0], beacon.get_ydata()[0]) == (3.0, 4.0)
+    assert [text.get_text() for text in path.texts] == ["A1"]
+    assert path.get_ylim()[1] >= 6.0
+
+
+def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
+    t = np.arange(300) / 100
+    angle = 30 * np.sin(t)
+    estimate = {"time_s": t, "chain_angle_deg": angle + 1, "chain_angle_std_deg": np.ones(300)}
+    truth = {"time_s": t, "chain_angle_deg": angle}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", truth, "truth"))
+    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["joint angle (°)", "angle error (°)"]
+    assert drawn(figure.axes[1])[0] == "chain 1 ° rms"
+
+
+def test_a_ball_joint_is_drawn_as_a_rotation_vector(tmp_path):
+    t = np.arange(300) / 100
+    half = np.radians(20 * np.sin(t)) / 2
+    columns = {"time_s": t, "chain_qw": -np.cos(half), "chain_qx": 0 * t, "chain_qy": 0 * t, "chain_qz": -np.sin(half)}
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "e.csv", columns)))])
+    (axes,) = figure.axes
+    z = next(line for line in axes.lines if line.get_label() == "chain z")
+    assert np.allclose(z.get_ydata(), 20 * np.sin(t))
+
+
+def test_a_recording_has_a_panel_for_each_kind_of_reading(tmp_path):
+    t = np.arange(200) / 100
+    columns = {"time_s": t, "seq": t, "flags": t, "baro_fresh": t}
+    columns |= {f"{prefix}gyro_{axis}_rad_s": np.ones(200) for prefix in ("", "imu2_") for axis in "xyz"}
+    columns |= {"pressure_Pa": np.full(200, 101325.0), "mouse1_dx_counts": t, "mouse1_dy_counts": t}
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "r.csv", columns)))])
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert labels == [
+        "angular rate\n(°/s)", "angular rate of sensor 2\n(°/s)", "pressure\n(hPa)", "mouse counts\n(counts)"
+    ]  # fmt: skip
+    assert np.allclose(figure.axes[0].lines[0].get_ydata(), np.degrees(1))
+
+
+def test_long_lines_keep_their_extremes_and_few_points(tmp_path):
+    t = np.arange(200_000) / 100
+    value = np.sin(t)
+    value[123_456] = 9.0
+    found = lines.decimated(t, value)
+    assert len(found[0]) <= lines.MOST_POINTS and 9.0 in found[1] and t[123_456] in found[0]
+
+
+def test_an_evaluation_shows_errors_their_distribution_and_the_table(tmp_path):
+    found = evaluate(*link_files(tmp_path))
+    figure = plotting.evaluation(found, "e.csv", "t.csv")
+    errors, density, roll, table = figure.axes
+    assert errors.get_ylabel() == "height error (cm)" and roll.get_ylabel() == "roll error (°)"
+    share = found.scores[0].statistics()["height"].within_2sigma
+    assert drawn(density)[0] == f"joint-inertial {100 * share:.0f} %"
+    cells = {key: cell.get_text().get_text() for key, cell in table.tables[0].get_celld().items()}
+    assert [cells[0, i] for i in range(9)] == [
+        "filter", "quantity", "RMSE", "mean", "worst", "95 %", "NEES", "within ±2σ", "rows"
+    ]  # fmt: skip
+    assert "imu-baro" in [cells[row, 0] for row in range(1, 7)]
+
+
+@pytest.mark.parametrize(("ending", "magic"), [(".png", PNG), (".svg", b"<?xml"), (".pdf", b"%PDF")])
+def test_the_ending_names_the_format_and_force_replaces(tmp_path, estimate, ending, magic):
+    picture = tmp_path / f"p{ending}"
+    assert CliRunner().invoke(plot.command, [estimate, "-o", str(picture)]).exit_code == 0
+    assert picture.read_bytes().startswith(magic)
+    with pytest.raises(LinkposeError, match="exists already"):
+        CliRunner().invoke(plot.command, [estimate, "-o", str(picture)], catch_exceptions=False)
+    assert CliRunner().invoke(plot.command, [estimate, "-o", str(picture), "--force"]).exit_code == 0
+    with pytest.raises(LinkposeError, match=r"must end in \.png, \.svg, \.pdf"):
+        CliRunner().invoke(plot.command, [estimate, "-o", str(tmp_path / "p.gif")], catch_exceptions=False)
 
 
 def test_lines_break_at_gaps_and_where_an_angle_goes_around(tmp_path):
     t = np.delete(np.arange(100) / 100, range(30, 50))
     columns = {"time_s": t, "joint_height_m": t, "joint_roll_deg": (1000 * t + 180) % 360 - 180}
     columns["joint_height_m"] = np.where(t == t[10], np.inf, t)
-    figure = plotting.plot_tables([read_table(Path(write(tmp_path / "e.csv", columns)))])
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "e.csv", columns)))])
     height, roll = (axes.lines[0].get_ydata() for axes in figure.axes)
     assert np.flatnonzero(np.isnan(height)).tolist() == [10, 30]
     assert np.nanmax(np.abs(np.diff(roll))) < 180

@@ -8,13 +8,14 @@ import pytest
 from linkpose.device.clock import DeviceClock
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.timeline import BoardClock, Timeline
+from linkpose.wire import frames
 from linkpose.wire.messages import Sample
 
 WRAP = 1 << 32
 
 
 def sample(tick: int, t_us: int) -> Sample:
-    return Sample(tick % 65536, t_us % WRAP, *([0] * 7), 0, 0, 0, 1)
+    return frames.sample(tick % 65536, t_us % WRAP, 1, (0,) * 7, baro=(0, 0, 0))
 
 
 class Bench:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from linkpose.wire import messages
+from linkpose.wire import frames, messages
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
 from linkpose.wire.messages import Hello, Ping, Pong, Sample
 
@@ -21,10 +21,16 @@ BY_NAME = {layout.cls.__name__.upper(): layout.cls for layout in messages.LAYOUT
 def golden_message(row):
     cls = BY_NAME[row["message"].replace("_", "")]
     layout = next(layout for layout in messages.LAYOUTS if layout.cls is cls)
-    message = cls(**row["fields"])
-    if layout.group_cls:
-        return message._replace(mice=tuple(layout.group_cls(**mouse) for mouse in row["mice"]))
-    return message._replace(mice=tuple(n for mouse in row["mice"] for n in mouse.values())) if row["mice"] else message
+    values = dict(row["fields"])
+    for group in layout.groups:
+        repetitions = row["groups"][group.name]
+        if group.name in cls._fields and group.cls:
+            values[group.name] = tuple(group.cls(**each) for each in repetitions)
+        elif group.name in cls._fields:
+            values[group.name] = tuple(value for each in repetitions for value in each.values())
+        else:  # a section: its fields are the message's
+            values |= {name: value for each in repetitions for name, value in each.items()}
+    return cls(**values)
 
 
 @pytest.mark.parametrize("row", VECTORS["frames"], ids=lambda row: row["name"])
@@ -63,7 +69,7 @@ def test_hello_of_an_older_protocol_is_recognised_whatever_its_length():
 
 @pytest.mark.parametrize("mice", range(5))
 def test_what_is_as_long_as_a_sample_and_is_none_is_counted_by_cause(mice):
-    body = bytes(29 + 4 * mice)
+    body = bytes(10) + bytes([0x03 | mice << 4]) + bytes(23 + 4 * mice)
     decoder = StreamDecoder()
     assert decoder.feed(frame_of(b"\x7d" + body) + frame_of(b"\x04" + body) + frame_of(b"\x02" + body + b"\0")) == []
     crossed = encode(sample(7, mice))[:-3] + b"\x11\x22\0"
@@ -80,10 +86,18 @@ def frame_of(payload: bytes) -> bytes:
 
 
 def sample(seq: int, mice: int = 3) -> Sample:
-    return Sample(
-        seq % 65536, seq * 10000 % 2**32, -seq % 1000, 0, 4096, 1, 0, -1, seq % 7, 27898, 23843, seq % 256, 0x1FF,
-        (seq % 100 - 50, -(seq % 30)) * mice,
-    )  # fmt: skip
+    imu = (-seq % 1000, 0, 4096, 1, 0, -1, seq % 7)
+    mag = (seq % 500, -200, 40, seq % 256) if seq % 3 == 0 else ()
+    return frames.sample(
+        seq % 65536,
+        seq * 10000 % 2**32,
+        0x1FF,
+        imu,
+        imu2=imu[::-1] if seq % 5 == 0 else (),
+        baro=(27898, 23843, seq % 256) if seq % 2 else (),
+        mag=mag,
+        mice=(seq % 100 - 50, -(seq % 30)) * mice,
+    )
 
 
 @given(st.lists(st.integers(1, 70), max_size=60))

@@ -13,7 +13,7 @@ from linkpose.wire.messages import Configure, Sample, SampleFlags, Start
 CLOCKS_HZ = (12_500, 10_200, 16_600, 14_000)
 MICE: list[dict[str, Any]] = [{"clockHz": clock_hz} for clock_hz in CLOCKS_HZ]  # no two alike
 MOUSE_VALID = (SampleFlags.MOUSE1_VALID, SampleFlags.MOUSE2_VALID, SampleFlags.MOUSE3_VALID, SampleFlags.MOUSE4_VALID)
-DEFAULTS = Configure(100, 8, 1000, 3, 1, 8)
+DEFAULTS = Configure(100, 8, 1000, 3, 1, 8, 400)
 UP_MS = 1500.0  # from power-on until usual mice stream
 
 

@@ -1,144 +1,185 @@
-"""`linkpose flash` through avrdude and Optiboot into the flash of the emulated board, and what can go wrong."""
+"""The upload through real bootloaders into the flash of the emulated board, and each way it can fail.
+
+Time is the emulated board's, so that nothing here depends on how fast the machine is; test_upload.py types the command.
+"""
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from bootloader import BOOT_ADDRESS, build_optiboot
-from pty_server import PtyServer
+from bootloader import ATMEGABOOT, OPTIBOOT_RESETS, BootloaderImage, build_optiboot
+from emulated_port import EmulatedPort
 
 from linkpose.errors import LinkposeError
-from linkpose.flashing import upload
 from linkpose.flashing.image import PREBUILT, Image, read_image
-from linkpose.flashing.upload import Stage, Upload, upload_with_avrdude
+from linkpose.flashing.upload import Progress, Stage, upload
 from virtual_uno import VirtualUno
 
-ROOT = Path(__file__).parents[2]
+OnStep = Callable[[EmulatedPort], None]
+PORT = "/dev/ttyACM0"
 
 
 @pytest.fixture(scope="module")
-def optiboot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def image() -> Image:
+    return read_image(PREBUILT)
+
+
+@pytest.fixture(scope="module")
+def optiboot(tmp_path_factory: pytest.TempPathFactory) -> BootloaderImage:
     return build_optiboot(tmp_path_factory.mktemp("optiboot"))
 
 
 @pytest.fixture
-def blank(optiboot: Path) -> Iterator[VirtualUno]:
-    """An UNO as it is sold: nothing in its flash but the bootloader."""
-    with VirtualUno(optiboot, boot_address=BOOT_ADDRESS) as uno:
-        yield uno
+def short(image: Image) -> Image:
+    """The first five pages and a half, for tests that do not start it."""
+    return replace(image, data=image.data[: 5 * 128 + 64])
 
 
-@pytest.fixture
-def port(tmp_path: Path) -> Path:
-    return tmp_path / "port"
+def blank(bootloader: BootloaderImage) -> VirtualUno:
+    """A board as it is sold: nothing in its flash but the bootloader."""
+    return VirtualUno(bootloader.path, boot_address=bootloader.address)
 
 
-@pytest.fixture
-def short_image(tmp_path: Path) -> Image:
-    """The first pages of the firmware, for tests that need not boot it."""
-    path = tmp_path / "short.hex"
-    path.write_text("".join(PREBUILT.read_text().splitlines(keepends=True)[:48]) + ":00000001FF\n")
-    return read_image(path)
+def opener(uno: VirtualUno, on_step: OnStep | None = None) -> Callable[[str, int], EmulatedPort]:
+    return lambda _name, baud: EmulatedPort(uno, baud, on_step)
 
 
-def flash(port: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "linkpose", "flash", "--port", str(port), *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "PLATFORMIO_CORE_DIR": str(ROOT / ".piocore")}
-    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
-
-
-def fail_to_upload(image: Image, port: Path, listen: Callable[[Upload], None] = lambda _: None) -> str:
+def fail(uno: VirtualUno, image: Image, on_step: OnStep | None = None) -> str:
+    """The sentence of an upload that must fail."""
     with pytest.raises(LinkposeError) as caught:
-        upload_with_avrdude(image, str(port), listen)
+        upload(image, PORT, lambda _: None, opener(uno, on_step))
     return str(caught.value)
 
 
-def test_the_prebuilt_firmware_is_that_of_the_sources(firmware_hex: Path) -> None:
-    same = PREBUILT.read_bytes() == firmware_hex.read_bytes()
-    assert same, "firmware.hex is stale: type `python firmware/platform/prebuilt.py`"
+# ---- bootloaders ----
 
 
-def test_a_blank_board_boots_the_prebuilt_firmware(blank: VirtualUno, port: Path) -> None:
-    image = read_image(PREBUILT)
-    with PtyServer(blank, port):
-        done = flash(port, "--prebuilt")
-    assert done.returncode == 0, done.stderr
-    assert blank.flash(0, len(image.data)) == image.data
-    shown = dict(re.findall(r"^(\S.*?)  +(.*)$", done.stdout, re.MULTILINE))
-    assert shown["firmware"] == image.identity.version
-    assert shown["source revision"] == f"{image.identity.source_revision:08x}"
-
-
-def test_platformio_builds_and_uploads(firmware_hex: Path, blank: VirtualUno, port: Path) -> None:
-    image = read_image(firmware_hex)
-    with PtyServer(blank, port):
-        done = flash(port, "--env", "uno_distro")
-    assert done.returncode == 0, done.stderr
-    assert blank.flash(0, len(image.data)) == image.data
-    assert f"source revision    {image.identity.source_revision:08x}" in done.stdout
-
-
-def test_what_is_read_back_must_be_what_was_written(blank: VirtualUno, port: Path, short_image: Image) -> None:
-    blank.stick_flash(0x200, 0xFF)
-    with PtyServer(blank, port):
-        said = fail_to_upload(short_image, port)
-    assert said.startswith("verification failed")
-    assert "bootloader is intact" in said
-
-
-def test_a_cable_pulled_halfway_leaves_a_board_that_can_be_flashed(
-    blank: VirtualUno, port: Path, short_image: Image
+@pytest.mark.parametrize("old", [False, True], ids=["UNO's Optiboot", "old Nano's ATmegaBOOT"])
+def test_a_bootloader_writes_the_firmware_and_stays_as_it_is(
+    image: Image, optiboot: BootloaderImage, old: bool
 ) -> None:
-    def pull_once() -> None:
-        if not pulled and blank.state()["pages_written"] >= 2:
-            pulled.append(True)
-            server.pull_cable()
-
-    pulled: list[bool] = []
-    server = PtyServer(blank, port, on_slice=pull_once)
-    with server:
-        said = fail_to_upload(short_image, port)
-        assert re.search(r"went away at \d+ % of writing: .* bootloader is intact, its firmware is incomplete", said)
-        back = threading.Event()
-        server.call(server.put_cable_back)
-        server.call(back.set)
-        assert back.wait(10)
-        upload_with_avrdude(short_image, str(port), lambda _: None)
-    assert blank.flash(0, len(short_image.data)) == short_image.data
+    bootloader = ATMEGABOOT if old else optiboot
+    seen: list[tuple[Stage, int]] = []
+    with blank(bootloader) as uno:
+        section = uno.flash(bootloader.address, 0x8000 - bootloader.address)
+        upload(image, PORT, lambda now: seen.append((now.stage, now.percent)), opener(uno))
+        assert uno.flash(0, len(image.data)) == image.data
+        assert set(uno.flash(len(image.data), bootloader.address - len(image.data))) == {0xFF}
+        assert uno.flash(bootloader.address, len(section)) == section
+    writing = [percent for stage, percent in seen if stage is Stage.WRITING]
+    assert writing[0] == 0
+    assert writing == sorted(writing)
+    assert len(writing) == -(-len(image.data) // 128)
 
 
-def test_an_interrupt_says_what_state_the_board_is_in(blank: VirtualUno, port: Path, short_image: Image) -> None:
-    def interrupt(progress: Upload) -> None:
-        if progress.stage is Stage.WRITING and progress.percent >= 20:
+@pytest.mark.parametrize("resets", OPTIBOOT_RESETS)
+def test_each_optiboot_starts_the_firmware_after_the_upload(tmp_path: Path, image: Image, resets: str) -> None:
+    with blank(build_optiboot(tmp_path, resets=resets)) as uno:
+        upload(image, PORT, lambda _: None, opener(uno))
+        uno.set_line(baud=250_000)
+        assert uno.run_until(lambda: len(uno.take_received()) > 0, limit_ms=1000)
+        assert uno.flash(0, len(image.data)) == image.data
+
+
+def test_a_board_that_prints_until_the_reset_is_flashed_again(
+    image: Image, optiboot: BootloaderImage, short: Image
+) -> None:
+    with blank(optiboot) as uno:
+        upload(image, PORT, lambda _: None, opener(uno))  # its own firmware sends at another bit rate
+        uno.run_ms(500)
+        upload(short, PORT, lambda _: None, opener(uno))
+        assert uno.flash(0, len(short.data)) == short.data
+
+
+# ---- failures ----
+
+
+def test_a_board_without_bootloader_does_not_answer(asleep: Callable[..., VirtualUno], short: Image) -> None:
+    reason = fail(asleep(), short)
+    assert reason.startswith(f"No UNO bootloader answers at {PORT}; nothing was written")
+
+
+def test_another_processor_is_not_written_to(tmp_path: Path, short: Image) -> None:
+    with blank(build_optiboot(tmp_path, "atmega168")) as uno:
+        reason = fail(uno, short)
+        assert uno.state()["pages_written"] == 0
+    assert "is no UNO: its processor has the signature 0x1E9406" in reason
+    assert "Nothing was written" in reason
+
+
+class Enough(Exception):
+    """The test has seen what it is about."""
+
+
+def test_an_image_that_reaches_into_the_old_bootloader_is_refused(image: Image) -> None:
+    def stop(_: Progress) -> None:
+        raise Enough
+
+    with blank(ATMEGABOOT) as uno:
+        reason = fail(uno, replace(image, data=bytes(0x7801)))
+        with pytest.raises(Enough):
+            upload(replace(image, data=bytes(0x7800)), PORT, stop, opener(uno))
+        assert uno.state()["pages_written"] == 0
+    assert "has 30721 bytes" in reason
+    assert "30720 bytes in front of its bootloader. Nothing was written" in reason
+
+
+def test_a_board_that_does_not_verify_is_reported(optiboot: BootloaderImage, short: Image) -> None:
+    with blank(optiboot) as uno:
+        uno.stick_flash(0x200, 0xFF)
+        reason = fail(uno, short)
+    assert f"Verification failed: address 0x0200 contains 0x00, and {short.data[0x200]:#04x} was written" in reason
+    assert "The bootloader is intact but the firmware is wrong" in reason
+
+
+@pytest.mark.parametrize(("pages", "stage"), [(0, "before anything was written"), (3, r"at \d+ % of writing")])
+def test_a_cable_pulled_leaves_a_board_that_can_be_flashed(
+    optiboot: BootloaderImage, short: Image, pages: int, stage: str
+) -> None:
+    def pull(port: EmulatedPort) -> None:
+        port.unplugged = uno.state()["pages_written"] >= pages
+
+    with blank(optiboot) as uno:
+        reason = fail(uno, short, pull)
+        assert re.match(f"{PORT} disappeared {stage}. .*Check the cable and run `linkpose flash` again$", reason)
+        assert ("bootloader is intact but the firmware is incomplete" in reason) == (pages > 0)
+        upload(short, PORT, lambda _: None, opener(uno))
+        assert uno.flash(0, len(short.data)) == short.data
+
+
+def test_an_upload_is_repeated_when_the_bootloader_gave_up(optiboot: BootloaderImage, short: Image) -> None:
+    def stall(port: EmulatedPort) -> None:
+        """The host stops for longer than the bootloader waits, once."""
+        if not stalled and uno.state()["pages_written"] == 3:
+            stalled.append(True)
+            uno.run_ms(1500)
+
+    stalled: list[bool] = []
+    with blank(optiboot) as uno:
+        upload(short, PORT, lambda _: None, opener(uno, stall))
+        assert stalled
+        assert uno.flash(0, len(short.data)) == short.data
+
+
+def test_a_board_that_stops_answering_is_reported(optiboot: BootloaderImage, short: Image) -> None:
+    def hold(_: EmulatedPort) -> None:
+        if uno.state()["pages_written"] % 5 == 3:
+            uno.reset()
+
+    with blank(optiboot) as uno:
+        reason = fail(uno, short, hold)
+    assert f"The board at {PORT} stopped answering" in reason or "No UNO bootloader answers" in reason
+
+
+def test_an_interrupt_reports_the_state_of_the_board(optiboot: BootloaderImage, short: Image) -> None:
+    def interrupt(progress: Progress) -> None:
+        if progress.stage is Stage.WRITING and progress.percent >= 50:
             raise KeyboardInterrupt
 
-    with PtyServer(blank, port):
-        said = fail_to_upload(short_image, port, interrupt)
-    assert said.startswith("interrupted at")
-    assert "firmware is incomplete" in said
-
-
-def test_a_board_without_bootloader_does_not_answer(
-    asleep: Callable[..., VirtualUno], port: Path, short_image: Image, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(upload, "ATTEMPTS", 1)  # each takes avrdude more than five seconds
-    with PtyServer(asleep(), port):
-        said = fail_to_upload(short_image, port)
-    assert said.startswith("no UNO bootloader answers")
-    assert "nothing was written" in said
-
-
-def test_another_processor_is_not_written_to(tmp_path: Path, port: Path, short_image: Image) -> None:
-    other = build_optiboot(tmp_path, "atmega168")
-    with VirtualUno(other, boot_address=BOOT_ADDRESS) as uno:
-        with PtyServer(uno, port):
-            said = fail_to_upload(short_image, port)
-        assert uno.state()["pages_written"] == 0
-    assert "is no UNO" in said
+    with blank(optiboot) as uno, pytest.raises(LinkposeError) as caught:
+        upload(short, PORT, interrupt, opener(uno))
+    assert str(caught.value).startswith("The upload was interrupted at 50 % of writing. The bootloader is intact")

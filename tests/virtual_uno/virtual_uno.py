@@ -100,7 +100,8 @@ class Sensor:
         """What the sensor feels from now on, in place of what it was fed before.
 
         `time_s` (N,) rises and counts from `start_s` after power-on; `values` (N, columns): for the MPU-6050 specific
-        force x y z in g, rate x y z in deg/s, temperature in degC; for the BMP180 pressure in Pa, temperature in degC.
+        force x y z in g, rate x y z in deg/s, temperature in degC; for the barometer pressure in Pa, temperature in
+        degC; for the magnetometer the field in µT.
         A row holds until the next one, or values are interpolated. Before and after the table the end rows hold.
         """
         times = np.atleast_1d(np.asarray(time_s, dtype="<f8")) + start_s
@@ -116,6 +117,10 @@ class Sensor:
     def plug(self) -> None:
         """Gives its power back: it starts with its registers as after power-on."""
         self._uno.request("plug", sensor=self._name, present=True)
+
+    def set(self, **properties: Any) -> None:
+        """Properties of the emulator's module, such as `fault` of the inertial sensor."""
+        self._uno.request("slave", sensor=self._name, set=properties)
 
     def nack(self, *, address: bool = False, data: bool = False) -> None:
         """Whether it leaves its address or the bytes written to it unacknowledged."""
@@ -185,14 +190,20 @@ class VirtualUno:
         hex_path: Path | str,
         *,
         seed: int = 0,
+        adc: dict[str, Any] | None = None,
         mpu6050: dict[str, Any] | None = None,
+        imu2: dict[str, Any] | None = None,
         bmp180: dict[str, Any] | None = None,
+        bmp280: dict[str, Any] | None = None,
+        magnetometer: str | None = None,
         mice: Sequence[dict[str, Any]] = (),
         bootloader_s: float = 0.0,
         boot_address: int = 0,
     ) -> None:
-        """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
-        these names; `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
+        """`adc`, `mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's
+        modules of these names. `imu2`: options of a second inertial sensor at 0x69 (None: there is none); `bmp280`:
+        options of a BMP280 in place of the BMP180; `magnetometer`: "hmc5883l", "qmc5883l" or "qmc5883p".
+        `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
         `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
         self._emulator = _Emulator.take()
@@ -200,9 +211,12 @@ class VirtualUno:
         self._received = bytearray()
         self.cycle = 0
         self.imu = Sensor(self, "mpu6050", 7)
+        self.imu2 = Sensor(self, "imu2", 7)
+        self.mag = Sensor(self, "magnetometer", 3)
         self.baro = Sensor(self, "bmp180", 2)
         self.mice = [Mouse(self, index) for index in range(len(mice))]
-        options = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
+        options = {"seed": seed, "adc": adc or {}, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
+        options |= {"imu2": imu2, "bmp280": bmp280, "magnetometer": magnetometer}
         options |= {"bootloaderS": bootloader_s, "bootAddress": boot_address}
         try:
             self._kinds = np.array(self.request("create", hex=str(Path(hex_path).resolve()), options=options)["kinds"])
@@ -254,9 +268,14 @@ class VirtualUno:
         """The reset line, as DTR pulls it when a host opens the port."""
         self.request("reset")
 
-    def hang(self) -> None:
-        """The program gets stuck, with interrupts off."""
-        self.request("hang")
+    def hang(self, *, interrupts: bool = False) -> int:
+        """Stops the program in an endless loop and returns the byte address of the loop."""
+        at: int = self.request("hang", interrupts=interrupts)["at"]
+        return at
+
+    def supply(self, volts: float) -> None:
+        """Sets the supply voltage of the ATmega328P."""
+        self.request("supply", volts=volts)
 
     # --- the serial line ---
 

@@ -14,7 +14,6 @@ from virtual_uno import CLOCK_HZ, VirtualUno
 M = TypeVar("M")
 
 WATCHED_BUS = ("i2c_start", "i2c_address", "i2c_write", "i2c_stop")
-_BURST = (0x1D0, 0x13B)  # address of the MPU-6050 for writing and its first data register, both acknowledged
 
 
 class WireLink:
@@ -84,11 +83,12 @@ def _upper_case(name: str) -> str:
     return "".join("_" + letter if letter.isupper() else letter for letter in name).strip("_").upper()
 
 
-def burst_starts(events: NDArray[Any]) -> NDArray[np.float64]:
-    """Cycles of the START conditions that begin an IMU burst, from events of WATCHED_BUS."""
+def burst_starts(events: NDArray[Any], address: int = 0x68) -> NDArray[np.float64]:
+    """Cycles of the START conditions that begin an inertial sensor's burst, from events of WATCHED_BUS."""
+    acknowledged = 0x100
     kinds, values = events["kind"], events["value"]
     begins = (kinds[:-2] == "i2c_start") & (kinds[1:-1] == "i2c_address") & (kinds[2:] == "i2c_write")
-    begins &= (values[1:-1] == _BURST[0]) & (values[2:] == _BURST[1])
+    begins &= (values[1:-1] == acknowledged | address << 1) & (values[2:] == acknowledged | 0x3B)
     return np.asarray(events["cycle"][:-2][begins], dtype=np.float64)
 
 

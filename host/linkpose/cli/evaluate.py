@@ -1,4 +1,4 @@
-"""`linkpose evaluate`: how far the filters are from a reference."""
+"""`linkpose evaluate`: errors of the filters against a reference."""
 
 from __future__ import annotations
 
@@ -9,60 +9,109 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.errors import printable
 
 if TYPE_CHECKING:
-    from linkpose.evaluation.scores import Score
-
-_HEADINGS = {
-    "height_rmse_cm": "height (cm)",
-    "roll_rmse_deg": "roll (°)",
-    "pitch_rmse_deg": "pitch (°)",
-    "velocity_rmse_m_s": "velocity (m/s)",
-    "rate_rmse_rad_s": "rate (rad/s)",
-    "position_rmse_m": "position (m)",
-    "heading_rmse_rad": "heading (rad)",
-}
+    from linkpose.evaluation.scores import Evaluation, Score
 
 
 @click.command("evaluate")
 @click.argument("estimate", type=options.FILE)
 @click.argument("reference", type=options.FILE)
+@click.option("--from", "from_s", type=options.FiniteRange(), metavar="S", help="Score from this time_s on (s).")
+@click.option("--to", "to_s", type=options.FiniteRange(), metavar="S", help="Score up to this time_s (s).")
 @options.up
+@options.plot("Draw errors with ±2σ, their distribution and the table.")
+@options.force
 @options.as_json
-def command(estimate: Path, reference: Path, up: str, json_lines: bool) -> None:
-    """Root mean square errors of each filter in ESTIMATE.csv against REFERENCE.csv.
+@click.option("-q", "--quiet", is_flag=True, help="Print no remarks and no verdicts.")
+def command(
+    estimate: Path,
+    reference: Path,
+    from_s: float | None,
+    to_s: float | None,
+    up: str,
+    plot_path: Path | None,
+    force: bool,
+    json_lines: bool,
+    quiet: bool,
+) -> None:
+    """Compare each filter in ESTIMATE.csv with REFERENCE.csv.
 
-    The two are aligned in time by cross-correlation where that fits clearly better than their stamps. The reference
-    is a truth of `linkpose simulate`, any CSV with such columns, or OptiTrack Motive's export of three markers: the
-    first at the sensor, the second along its x axis, the third on the side of its y axis.
+    Prints root mean square, mean, worst and 95 % error of each quantity. Where the estimate has a standard deviation σ,
+    it also prints NEES (the mean of (error/σ)², 1 where σ is right) and the share of errors within ±2σ. Rows without an
+    estimate yet are left out.
+
+    The two files are aligned in time by cross-correlation where that fits clearly better than their stamps. The
+    reference is a truth of `linkpose simulate`, any CSV with such columns, or OptiTrack Motive's export of three
+    markers: the first at the sensor, the second along its x axis, the third on the side of its y axis.
     """
+    from linkpose import plotting
     from linkpose.evaluation.motive import read_any
     from linkpose.evaluation.scores import evaluate
     from linkpose.recording.table import read_table
 
+    if from_s is not None and to_s is not None and from_s >= to_s:
+        raise click.UsageError(f"--from {from_s:g} is not before --to {to_s:g}")
+    plotting.check_output(plot_path, force)
     truth = read_any(reference, up)
-    found = evaluate(read_table(estimate), truth)
-    for remark in (*truth.remarks, *found.remarks):
-        click.echo(remark, err=True)
+    found = evaluate(read_table(estimate), truth, from_s, to_s)
+    if not quiet:
+        for remark in (*truth.remarks, *found.remarks):
+            click.echo(printable(remark), err=True)
     if json_lines:
         for score in found.scores:
             click.echo(json.dumps(score.as_dict()))
     else:
-        _show(found.scores)
+        _show(found, quiet)
+    if plot_path:
+        plotting.save(plotting.evaluation(found, estimate.name, reference.name), plot_path, force)
+        if not quiet:
+            click.echo(f"picture: {plot_path}", err=True)
 
 
-def _show(scores: list[Score]) -> None:
+def _show(found: Evaluation, quiet: bool) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    columns = [key for key in _HEADINGS if any(key in score.errors for score in scores)]
-    table = Table("filter", title="Root mean square errors")
-    for key in columns:
-        table.add_column(_HEADINGS[key], justify="right")
-    table.add_column("rows", justify="right")
-    for score in scores:
-        errors = [f"{score.errors[key]:.4g}" if key in score.errors else "" for key in columns]
-        table.add_row(score.filter, *errors, str(score.rows))
+    from linkpose.quantities import unit_text
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("filter", no_wrap=True)
+    table.add_column("error of", no_wrap=True)
+    for name in ("RMSE", "mean", "worst", "95 %", "NEES", "in ±2σ"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for score in found.scores:
+        title = score.filter
+        for name, value in score.statistics().items():
+            of = score.errors[name]
+            unit = unit_text(of.unit)
+            figures = [f"{v:.3g}" for v in (value.rmse, value.mean, value.worst, value.p95)]
+            sigma = ["", ""]
+            if value.nees is not None and value.within_2sigma is not None:
+                sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
+            table.add_row(title, f"{name} ({unit})", *figures, *sigma)
+            title = ""
     Console().print(table)
-    if scores[0].time_offset_s:
-        click.echo(f"The reference's clock is {scores[0].time_offset_s:+.4f} s from the estimate's; aligned.")
+    if quiet:
+        return
+    for score in found.scores:
+        for line in _sentences(score):
+            click.echo(line)
+    if found.scores[0].time_offset_s:
+        click.echo(
+            f"The clocks differ: {found.scores[0].time_offset_s:+.4f} s were added to the estimate's to get the "
+            "reference's."
+        )
+
+
+def _sentences(score: Score) -> list[str]:
+    """How many rows were used, and whether σ is right, for each quantity that has one."""
+    rows = f"{score.filter}: {score.rows} of {score.known_rows} rows compared"
+    if score.empty_rows:
+        rows += f", {score.empty_rows} without an estimate left out"
+    if score.yaw_drift_deg_per_min is not None:
+        rows += f"; the yaw drifts by {score.yaw_drift_deg_per_min:.2g} °/min"
+    verdicts = {name: value.verdict() for name, value in score.statistics().items()}
+    return [f"{rows}.", *(f"  {name}: {verdict}" for name, verdict in verdicts.items() if verdict)]

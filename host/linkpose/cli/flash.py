@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
     from linkpose.cli.live import Console
     from linkpose.flashing.image import Image
-    from linkpose.flashing.upload import Upload
+    from linkpose.flashing.upload import Progress
     from linkpose.wire.messages import Hello
 
 
 @click.command(name="flash")
-@click.option("--port", metavar="PORT", help="Device, such as /dev/ttyACM0 or COM3. Default: the only UNO connected.")
-@click.option("--prebuilt", is_flag=True, help="Upload the firmware that comes ready built; needs only avrdude.")
+@click.option("--port", metavar="PORT", help="Device, such as /dev/ttyACM0 or COM3. Default: the only connected UNO.")
+@click.option("--prebuilt", is_flag=True, help="Upload the firmware image of this package without building it.")
 @click.option("--hex", "hex_file", type=options.FILE, metavar="FILE.hex", help="Upload this build of the firmware.")
 @click.option(
     "--env",
@@ -37,7 +37,11 @@ if TYPE_CHECKING:
 def command(
     port: str | None, prebuilt: bool, hex_file: Path | None, environment: str, verbose: bool, quiet: bool
 ) -> None:
-    """Build the firmware with PlatformIO, upload it to the board, and prove it by the handshake."""
+    """Build the firmware with PlatformIO, upload it to the board, and check that it answers.
+
+    If PlatformIO cannot build (it is not installed, or cannot download its toolchain), the firmware image of this
+    package is uploaded instead. The upload needs no other program.
+    """
     from linkpose.cli.live import Console
     from linkpose.flashing.image import PREBUILT, read_image
 
@@ -46,10 +50,9 @@ def command(
     console = Console(quiet, verbose)
     port = _usable_port(port)
     try:
-        if prebuilt or hex_file is not None:
-            image = _upload_ready_built(read_image(hex_file or PREBUILT), port, console)
-        else:
-            image = _build_and_upload(environment, port, console)
+        ready = PREBUILT if prebuilt else hex_file
+        image = read_image(ready) if ready is not None else _build(environment, console)
+        _upload(image, port, console)
     finally:
         console.clear()
     hello = _prove(port, image, console)
@@ -59,88 +62,66 @@ def command(
 
 
 def _usable_port(named: str | None) -> str:
-    """The board's port, which can be opened: what stands in the way is said before anything is built."""
+    """The board's port. An obstacle to opening it is reported before anything is built."""
     from linkpose.device.ports import choose_port, open_port
 
     if named is not None and "://" in named:
-        raise LinkposeError(f"{named} is no board that can be flashed; name a device such as /dev/ttyACM0 or COM3")
+        raise LinkposeError(f"{named} is not a board that can be flashed. Pass a device such as /dev/ttyACM0 or COM3")
     port = named or choose_port(simulated_will_do=False)
     open_port(port).close()
     return port
 
 
-def _upload_ready_built(image: Image, port: str, console: Console) -> Image:
-    from linkpose.flashing.upload import upload_with_avrdude
+def _build(environment: str, console: Console) -> Image:
+    """The image that PlatformIO builds, or the prebuilt one when PlatformIO cannot build."""
+    from linkpose.flashing.build import CannotBuild, build, project
+    from linkpose.flashing.image import PREBUILT, read_image
 
-    _announce(console, image, port)
-    upload_with_avrdude(image, port, _shows_upload(console))
-    return image
+    console.say("building the firmware with PlatformIO; the first build downloads the toolchain")
+    try:
+        with project(environment) as firmware:
+            return build(firmware, _shows_build(console))
+    except CannotBuild as error:
+        console.say(f"{error}; uploading the prebuilt firmware instead (--prebuilt does so at once)")
+    return read_image(PREBUILT)
 
 
-def _announce(console: Console, image: Image, port: str) -> None:
+def _upload(image: Image, port: str, console: Console) -> None:
+    from linkpose.flashing.upload import upload
+
+    def show(progress: Progress) -> None:
+        console.progress(lambda: f"{progress.stage.value} {progress.percent} %")
+
     console.say(f"uploading {image.identity} ({len(image.data)} bytes) to {port}")
-
-
-def _build_and_upload(environment: str, port: str, console: Console) -> Image:
-    from linkpose.flashing.build import build, project
-    from linkpose.flashing.upload import upload_with_platformio
-
-    with project(environment) as firmware:
-        console.say("building the firmware with PlatformIO; the first time it downloads the toolchain")
-        image = build(firmware, _shows_build(console))
-        _announce(console, image, port)
-        upload_with_platformio(firmware, port, _shows_upload(console))
-    return image
+    upload(image, port, show)
 
 
 def _shows_build(console: Console) -> Callable[[str], None]:
-    transcript = _Transcript(console)
+    """A receiver of PlatformIO's output: its last line as progress, and every line with -v."""
+    pending, last_line = "", "building"
 
-    def show(said: str) -> None:
-        transcript.add(said)
-        console.progress(lambda: transcript.last_line[:78])
-
-    return show
-
-
-def _shows_upload(console: Console) -> Callable[[Upload], None]:
-    transcript = _Transcript(console)
-
-    def show(upload: Upload) -> None:
-        transcript.add(upload.said[transcript.length :])
-        console.progress(lambda: f"{upload.stage.value} {upload.percent} %")
-
-    return show
-
-
-class _Transcript:
-    """What another program says, shown line by line with -v."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._pending = ""
-        self.last_line = "building"
-        self.length = 0
-
-    def add(self, said: str) -> None:
-        self.length += len(said)
-        *lines, self._pending = (self._pending + said).split("\n")
+    def show(output: str) -> None:
+        nonlocal pending, last_line
+        *lines, pending = (pending + output).split("\n")
         for line in filter(str.strip, lines):
-            self._console.detail(line)
-            self.last_line = line.strip()
+            console.detail(line)
+            last_line = line.strip()
+        console.progress(lambda: last_line[:78])
+
+    return show
 
 
 def _prove(port: str, image: Image, console: Console) -> Hello:
-    """The HELLO of the firmware just written."""
+    """The HELLO of the firmware that was written."""
     from linkpose.device.session import Session
 
-    console.say("the upload is verified; asking the board who it is")
+    console.say("the upload is verified; waiting for the firmware")
     with _as_consequence(), Session(port, console.say) as session:
         hello = session.hello
     if hello.source_revision != image.identity.source_revision:
         raise LinkposeError(
-            f"the board at {port} answers with source revision {hello.source_revision:08x}, although "
-            f"{image.identity.source_revision:08x} was written; check that {port} is the board that was flashed"
+            f"The board at {port} reports source revision {hello.source_revision:08x}, but "
+            f"{image.identity.source_revision:08x} was written. Check that {port} is the board that was flashed"
         )
     return hello
 
@@ -150,4 +131,4 @@ def _as_consequence() -> Iterator[None]:
     try:
         yield
     except LinkposeError as error:
-        raise LinkposeError(f"the firmware was written and verified, but the handshake failed: {error}") from error
+        raise LinkposeError(f"The firmware was written and verified, but the handshake failed: {error}") from error

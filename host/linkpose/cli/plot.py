@@ -3,25 +3,66 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
+from linkpose.errors import printable
+
+if TYPE_CHECKING:
+    from linkpose.plotting import Scene
 
 
 @click.command("plot")
 @click.argument("files", type=options.FILE, nargs=-1, required=True)
-@click.option("-o", "--output", type=options.FILE, metavar="FILE.png", help="Picture; default: the first file's name.")
+@click.option(
+    "-o", "--output", type=options.FILE, metavar="FILE.png", help="PNG, SVG or PDF; default: the first file's name."
+)
+@click.option("--filter", "wanted", multiple=True, metavar="NAME", help="Draw this filter only; may be repeated.")
+@click.option("--map", "map_file", type=options.FILE, metavar="MAP.yaml", help="Draw this map under a robot's path.")
+@click.option("--beacons", type=options.FILE, metavar="BEACONS.csv", help="Draw these beacons with a robot's path.")
 @options.up
-def command(files: tuple[Path, ...], output: Path | None, up: str) -> None:
-    """Draw recordings, estimates and references over time, those of one quantity in one panel."""
+@options.force
+@click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
+def command(
+    files: tuple[Path, ...],
+    output: Path | None,
+    wanted: tuple[str, ...],
+    map_file: Path | None,
+    beacons: Path | None,
+    up: str,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Draw recordings, estimates and references.
+
+    An estimate together with its reference (a truth or a motion-capture export) shows the errors with ±2σ. Filters that
+    measure height by air pressure are drawn only when --filter names them.
+    """
     from linkpose import plotting
     from linkpose.evaluation.motive import read_any
 
     output = output or files[0].with_suffix(".png")
+    plotting.check_output(output, force)
     tables = [read_any(path, up) for path in files]
-    for table in tables:
-        for remark in table.remarks:
-            click.echo(remark, err=True)
-    plotting.save(plotting.plot_tables(tables), output)
+    scene = _scene(map_file, beacons)
+    figure, remarks = plotting.plot_tables(tables, [name.replace("_", "-") for name in wanted], scene)
+    plotting.save(figure, output, force)
+    for remark in [remark for table in tables for remark in table.remarks] + remarks:
+        if not quiet:
+            click.echo(printable(remark), err=True)
     click.echo(output)
+
+
+def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
+    """What --map and --beacons put under the path."""
+    if map_file is None and beacons is None:
+        return None
+    from linkpose.localization.grid import load_map
+    from linkpose.localization.tables import read_beacons
+    from linkpose.plotting import Scene
+
+    grid = load_map(map_file) if map_file else None
+    places = read_beacons(beacons) if beacons else {}
+    return Scene(grid, {str(name): place for name, place in places.items()})

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
 from linkpose.cli.patience import while_compiling
 
+<<<<<<< HEAD
 if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
     from linkpose.localization.events import Log
@@ -25,43 +22,37 @@ GATE = 0.997
 CORRELATION = 0.3  # off the diagonals of R and of Q
 UNMAPPED = (0.0, 0.02)  # share of beams that end at something that the map does not know
 
+=======
+>>>>>>> main
 
 @click.command("indoor")
-@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="How many simulated drives.")
-@click.option("--plot", "plot_path", type=options.FILE, metavar="FILE.png", help="Draw the errors of all variants.")
+@options.seeds("drives")
+@options.plot("Draw the errors of all variants.")
+@options.force
 @options.as_json
-def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
+def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -> None:
     """Compare fixed with range-adaptive R, diagonal with off-diagonal Q and R, and the EKF with the UKF, indoors.
 
-    The thesis's own logs and result tables are not public: these are simulated drives through a floor of the same size.
+    The thesis's own logs and result tables are not public. The drives are simulated on a floor of the same size.
     """
-    from linkpose.cli.comparison import as_table, plot, progress
-    from linkpose.localization.carmen import as_log
-    from linkpose.localization.localizer import localize, warm_up
-    from linkpose.localization.tables import score
-    from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
+    from linkpose import plotting
+    from linkpose.cli.rendering import as_table, progress
+    from linkpose.experiments import indoor
+    from linkpose.localization.localizer import warm_up
 
+    plotting.check_output(plot_path, force)
     with while_compiling():
-        warm_up(FILTERS)
-    variants = list(_variants())
-    grid = office_map()
-    for seed, unmapped in progress(itertools.product(range(seeds), UNMAPPED), "drives"):
-        errors = IndoorErrors(outlier_fraction=unmapped)
-        run = simulate_indoor(seed, errors, None, grid)
-        log = as_log(run.readings)
-        start = (float(run.pose[0, 0]), float(run.pose[0, 1]), float(run.pose[0, 2]))
-        for variant in variants:
-            if variant.others["unmapped"] == unmapped:
-                settings = _settings(variant, log, errors.range_m, errors.range_growth, start)
-                track = localize(log, variant.filter, settings, grid)
-                variant.scores.append(score(track.time_s, track.position_m, track.heading_rad, run.truth))
+        warm_up(indoor.FILTERS)
+    variants = indoor.compare(seeds, progress("drives"))
     rows = [variant.as_row() for variant in variants]
     if json_lines:
         click.echo("\n".join(json.dumps(row) for row in rows))
     else:
         click.echo(as_table(rows))
-        click.echo("\n".join(["", "The thesis's claims, here:", *_verdicts(variants)]))
+        click.echo("\n".join(["", "Claims of the thesis:", *indoor.claims(variants)]))
+        click.echo("\n".join(["", "Comparisons that the thesis does not make:", *indoor.further_claims(variants)]))
     if plot_path:
+<<<<<<< HEAD
         plot(plot_path, "Indoor localisation", variants, [_label(variant) for variant in variants])
 
 
@@ -160,3 +151,7 @@ def _label(variant: Variant) -> str:
         f"unmapped {variant.others['unmapped']}",
     ]
     return ", ".join(words)
+=======
+        figure = plotting.variants("Indoor localisation", variants, [indoor.label(variant) for variant in variants])
+        plotting.save(figure, plot_path, force)
+>>>>>>> main

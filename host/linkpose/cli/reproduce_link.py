@@ -1,4 +1,4 @@
-"""`linkpose reproduce link`: Tables 1 and 2 and Figure 2 of the link paper, measured."""
+"""`linkpose reproduce link`: Tables 1 and 2 and Figure 2 of the link paper."""
 
 from __future__ import annotations
 
@@ -12,22 +12,21 @@ from linkpose.cli import options
 from linkpose.cli.patience import while_compiling
 
 if TYPE_CHECKING:
-    from linkpose.evaluation.link import Entry, Traces
-
-_LETTERS = {"joint": "A", "tilt": "B", "imu-baro": "C", "baro": "D", "joint-inertial": ""}
-_SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
+    from linkpose.experiments.link import Entry
 
 
 @click.command("link")
-@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="How many runs of each Test.")
+@options.seeds("runs of each Test")
 @options.sensor_errors
-@click.option("--plot", "plot_path", type=options.FILE, metavar="FILE.png", help="Draw Figure 2.")
+@options.plot("Draw Figure 2.")
+@options.force
 @options.as_json
-def command(seeds: int, errors: str, plot_path: Path | None, json_lines: bool) -> None:
-    """Measure Methods A to D, and joint-inertial, on Tests 1 to 3, beside the paper's Tables 1 and 2."""
-    from linkpose import filters
-    from linkpose.evaluation.link import METHODS, reproduce, traces
+def command(seeds: int, errors: str, plot_path: Path | None, force: bool, json_lines: bool) -> None:
+    """Run Methods A to D and joint-inertial on Tests 1 to 3, and compare with the paper's Tables 1 and 2."""
+    from linkpose import filters, plotting
+    from linkpose.experiments.link import METHODS, reproduce, traces
 
+    plotting.check_output(plot_path, force)
     with while_compiling():
         filters.warm_up(METHODS)
     entries = [entry for test in (1, 2, 3) for entry in reproduce(test, seeds, errors)]
@@ -37,14 +36,14 @@ def command(seeds: int, errors: str, plot_path: Path | None, json_lines: bool) -
     else:
         _show(entries, seeds, errors)
     if plot_path:
-        _plot(plot_path, [traces(test, 0, errors) for test in (1, 2, 3)])
+        plotting.save(plotting.paper_figure_2([traces(test, 0, errors) for test in (1, 2, 3)]), plot_path, force)
 
 
 def _show(entries: list[Entry], seeds: int, errors: str) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from linkpose.evaluation.link import PAPER_ROLL_PITCH_DEG
+    from linkpose.experiments.link import PAPER_ROLL_PITCH_DEG, title
 
     heights = Table("test", "method", title=f"Table 1: height RMSE (cm), {seeds} seeds, errors: {errors}")
     for name in ("mean", "spread", "worst", "paper", "mean ‖a‖ (m/s²)"):
@@ -52,33 +51,23 @@ def _show(entries: list[Entry], seeds: int, errors: str) -> None:
     attitudes = Table("test", "method", title="Table 2: roll and pitch RMSE (°), mean")
     for name in ("roll", "pitch", "paper roll", "paper pitch"):
         attitudes.add_column(name, justify="right")
+    places = Table("test", "method", title="Beyond the paper: position (cm) and yaw (°) since the start, RMSE, mean")
+    for name in ("position", "yaw", "yaw drift (°/min)"):
+        places.add_column(name, justify="right")
     for entry in entries:
-        rmse, paper = entry.height_rmse_cm, entry.paper_height_rmse_cm
-        method = f"{entry.filter} {_LETTERS[entry.filter]}".strip()
+        rmse, paper, method = entry.rmse["height"], entry.paper_height_rmse_cm, title(entry.filter)
         figures = (f"{rmse.mean():.3f}", f"{rmse.std():.3f}", f"{rmse.max():.3f}", f"{paper:.2f}" if paper else "")
         heights.add_row(str(entry.test), method, *figures, f"{entry.mean_accel_m_s2:.2f}")
-        if entry.roll_rmse_deg is not None and entry.pitch_rmse_deg is not None:
+        if "roll" in entry.rmse and "pitch" in entry.rmse:
             printed = PAPER_ROLL_PITCH_DEG.get(entry.filter)
             beside = [f"{value:.2f}" for value in printed[entry.test - 1]] if printed else ["", ""]
-            ours = [f"{entry.roll_rmse_deg.mean():.3f}", f"{entry.pitch_rmse_deg.mean():.3f}"]
+            ours = [f"{entry.rmse[name].mean():.3f}" for name in ("roll", "pitch")]
             attitudes.add_row(str(entry.test), method, *ours, *beside)
+        if "position" in entry.rmse and entry.yaw_drift_deg_per_min is not None:
+            ours = [f"{entry.rmse[name].mean():.3f}" for name in ("position", "yaw")]
+            places.add_row(str(entry.test), method, *ours, f"{entry.yaw_drift_deg_per_min.mean():.3f}")
     console = Console()
     console.print(heights)
     console.print(attitudes)
-
-
-def _plot(path: Path, runs: list[Traces]) -> None:
-    from linkpose import plotting
-
-    figure = plotting.new_figure(10, 9)
-    for test, (axes, run) in enumerate(zip(figure.subplots(3, 1), runs, strict=True), 1):
-        for name in ("baro", "imu-baro", "tilt", "joint", "joint-inertial"):
-            axes.plot(run.time_s, 100 * run.height_m[name], linewidth=0.8, label=f"{name} {_LETTERS[name]}".strip())
-        axes.plot(run.time_s, 100 * run.truth_m, "k--", linewidth=0.8, label="truth")
-        axes.set_title(f"Test {test}")
-        axes.set_ylabel("height (cm)")
-        if test < 3:
-            axes.set_xlim(*_SHOWN_S)
-    figure.axes[0].legend(loc="upper right", ncols=3, fontsize=8)
-    figure.axes[-1].set_xlabel("time (s)")
-    plotting.save(figure, path)
+    if places.row_count:
+        console.print(places)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
 from linkpose.cli.patience import while_compiling
 
+<<<<<<< HEAD
 if TYPE_CHECKING:
     from linkpose.cli.comparison import Variant
     from linkpose.localization.kalman import FilterName
@@ -71,41 +67,38 @@ class Case:
         errors = UnderwaterErrors(outliers=self.outliers)
         return errors if self.correlated else replace(errors, correlation_m=0.0)
 
+=======
+>>>>>>> main
 
 @click.command("underwater")
-@click.option("--seeds", type=click.IntRange(min=1), default=5, show_default=True, help="How many simulated dives.")
-@click.option("--plot", "plot_path", type=options.FILE, metavar="FILE.png", help="Draw the errors of all variants.")
+@options.seeds("dives")
+@options.plot("Draw the errors of all variants.")
+@options.force
 @options.as_json
-def command(seeds: int, plot_path: Path | None, json_lines: bool) -> None:
+def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -> None:
     """Check the simulator of Tables 2.2 to 2.9, and compare the EKF with the UKF on its measurements.
 
-    Synchronous and asynchronous sensors, with and without a common error of the ranges and outliers, with and without
-    gate. The thesis's own values and result tables are not public.
+    Synchronous and asynchronous sensors, with and without a common error of the ranges, outliers and gate. The
+    thesis's own values and result tables are not public.
     """
-    from linkpose.cli.comparison import as_table, plot, progress
+    from linkpose import plotting
+    from linkpose.cli.rendering import as_table, progress
+    from linkpose.experiments import underwater
     from linkpose.localization.localizer import warm_up
 
+    plotting.check_output(plot_path, force)
     with while_compiling():
-        warm_up(FILTERS)
-    cases = [
-        _case(timing, correlated, n)
-        for timing, correlated, n in itertools.product(TIMINGS, (False, True), (0, OUTLIERS))
-    ]
-    checks = list(_checks(seeds))
-    for case, seed in progress(itertools.product(cases, range(seeds)), "dives"):
-        _dive(case, seed)
-    variants = [variant for case in cases for variant in case.variants]
-    rows = [
-        variant.as_row() | detection.as_row()
-        for case in cases
-        for variant, detection in zip(case.variants, case.detections, strict=True)
-    ]
+        warm_up(underwater.FILTERS)
+    checks = underwater.check_simulator(seeds)
+    cases = underwater.compare(seeds, progress("dives"))
+    rows = [row for case in cases for row in case.rows()]
     if json_lines:
         click.echo("\n".join(json.dumps(row) for row in [*checks, *rows]))
     else:
         click.echo(f"{as_table(checks)}\n\n{as_table(rows)}")
-        click.echo("\n".join(["", "What the thesis expects, here:", *_verdicts(cases)]))
+        click.echo("\n".join(["", "What the thesis expects:", *underwater.claims(cases)]))
     if plot_path:
+<<<<<<< HEAD
         plot(plot_path, "Underwater localisation", variants, [_label(variant) for variant in variants])
 
 
@@ -206,3 +199,8 @@ def _label(variant: Variant) -> str:
         f"{variant.others['outliers']} outliers",
     ]
     return ", ".join(words)
+=======
+        variants = [variant for case in cases for variant in case.variants]
+        labels = [underwater.label(variant) for variant in variants]
+        plotting.save(plotting.variants("Underwater localisation", variants, labels), plot_path, force)
+>>>>>>> main

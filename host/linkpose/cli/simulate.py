@@ -1,4 +1,4 @@
-"""`linkpose simulate`: recordings of simulated rigs, with their truth. Each rig is a module `simulate_<rig>`."""
+"""`linkpose simulate`: recordings of simulated rigs with their truth. Each rig is a module `simulate_<rig>`."""
 
 from __future__ import annotations
 
@@ -17,4 +17,4 @@ RIGS = {
 
 @click.group("simulate", cls=LazyGroup, table=RIGS, modules="linkpose.cli.simulate_")
 def command() -> None:
-    """Make a recording and its truth from a simulated rig. The same seed gives the same recording."""
+    """Simulate a recording and its truth. The same seed gives the same recording."""

@@ -11,40 +11,45 @@ from linkpose.sensors.rig import Vector
 
 
 @click.command("link")
-@click.option("-o", "--output", type=options.FILE, required=True, help="Recording to write (CSV).")
-@click.option("--truth", type=options.FILE, required=True, help="Truth to write (CSV).")
+@options.simulated_outputs("Recording to write (CSV).")
 @click.option("--test", type=click.IntRange(1, 3), default=1, show_default=True, help="Test of the link paper.")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Motion, errors and noise.")
-@click.option("--duration", type=float, default=65.0, show_default=True, metavar="S", help="Length in seconds.")
-@click.option("--rate", type=click.IntRange(50, 500), default=100, show_default=True, help="Samples a second.")
+@click.option("--duration", type=options.SecondsType(), default=65.0, show_default=True, help="Length in seconds.")
+@click.option("--rate", type=click.IntRange(50, 500), default=100, show_default=True, help="Samples per second.")
 @options.sensor_errors
 @click.option(
     "--j2s",
     type=options.VectorType(),
     default="-0.09,-0.04,1.65",
     show_default=True,
-    help="Vector from the joint centre to the sensor, in its axes (m).",
+    help="J2S: vector from the joint centre to the sensor, in its axes (m).",
 )
+@click.option("--rests", is_flag=True, help="Lay the sensor on its six sides in turn, as `calibrate imu` needs it.")
+@click.option("--imu2", is_flag=True, help="Add a second inertial sensor, half-way between the joint and the first.")
+@click.option("--mag", is_flag=True, help="Add a magnetometer.")
 @options.force
+@options.next_and_quiet
 def command(
-    output: Path, truth: Path, test: int, seed: int, duration: float, rate: int, errors: str, j2s: Vector, force: bool
+    output: Path,
+    truth: Path,
+    test: int,
+    seed: int,
+    duration: float,
+    rate: int,
+    errors: str,
+    j2s: Vector,
+    rests: bool,
+    imu2: bool,
+    mag: bool,
+    force: bool,
+    quiet: bool,
 ) -> None:
-    """Make a recording of the link paper's rig, and the truth of it."""
-    from linkpose.recording.truth import write_truth
-    from linkpose.recording.writer import write_recording
-    from linkpose.simulation import board
+    """Simulate a recording of the link paper's rig, and its truth."""
+    from linkpose.simulation.export import check_length, check_outputs, write_link
     from linkpose.simulation.link import LinkRun
-    from linkpose.wire.messages import Configure
 
-    run = LinkRun(test, seed, duration, rate, errors, j2s)
-    settings: Configure = board.DEFAULTS._replace(sample_rate_hz=rate)
-    name = f"sim://link?test={test}&seed={seed}&errors={errors}"
-    exact = run.truth()
-    columns = {
-        "time_s": exact.time_s,
-        "height_m": exact.height_m,
-        "roll_deg": exact.roll_deg,
-        "pitch_deg": exact.pitch_deg,
-    }
-    write_truth(truth, columns, {"device": name, "j2s_m": j2s}, force)
-    write_recording(output, board.hello(settings), run.samples(), name, run.rig, force)
+    check_outputs((output, truth), force)
+    check_length(duration, rate)
+    write_link(LinkRun(test, seed, duration, rate, errors, j2s, rests=rests, imu2=imu2, mag=mag), output, truth, force)
+    following = f"calibrate imu {output} --rig rig.toml" if rests else f"estimate {output} -o estimate.csv"
+    options.show_next(quiet, following)

@@ -1,30 +1,51 @@
-"""Serial ports: which there are, which one is the board, and opening one with a sentence for each way it fails."""
+"""Serial ports: the list of them, the choice of the board's, finding it again, and opening it."""
 
 from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import serial
 from serial.tools import list_ports
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import (
+    NoBoardFound,
+    NotASerialPort,
+    PermissionDenied,
+    PortBusy,
+    PortError,
+    PortNotFound,
+    SeveralBoardsFound,
+)
 from linkpose.wire.messages import BAUD
 
-# USB ids of the UNO: Arduino's own, and the CH340 that nearly all its copies carry.
-UNO_IDS = frozenset(
-    {
-        (0x2341, 0x0043),
-        (0x2341, 0x0001),
-        (0x2341, 0x0243),
-        (0x2341, 0x006A),
-        (0x2A03, 0x0043),
-        (0x1A86, 0x7523),
-    }
-)
+
+class Chip(NamedTuple):
+    """A USB chip of UNOs and their copies."""
+
+    name: str
+    likelihood: int  # that an UNO is behind it. 2: Arduino's own; 1: mostly on UNO copies; 0: on many other devices too
+    driver: str  # Linux kernel module
+
+
+_ARDUINO = Chip("16U2", 2, "cdc_acm")
+CHIPS = {
+    (0x2341, 0x0043): _ARDUINO,
+    (0x2341, 0x0001): _ARDUINO,
+    (0x2341, 0x0243): _ARDUINO,
+    (0x2341, 0x006A): _ARDUINO,
+    (0x2A03, 0x0043): _ARDUINO,
+    (0x1A86, 0x7523): Chip("CH340", 1, "ch341"),
+    (0x1A86, 0x55D4): Chip("CH9102", 1, "cdc_acm"),
+    (0x1A86, 0x55D3): Chip("CH343", 1, "cdc_acm"),
+    (0x0403, 0x6001): Chip("FT232R", 0, "ftdi_sio"),
+    (0x0403, 0x6015): Chip("FT231X", 0, "ftdi_sio"),
+    (0x10C4, 0xEA60): Chip("CP210x", 0, "cp210x"),
+}
 
 READ_TIMEOUT_S = 0.05
 WRITE_TIMEOUT_S = 1.0
@@ -39,83 +60,173 @@ class PortInfo:
     vid: int | None
     pid: int | None
     serial: str | None
-    is_uno: bool
-    busy: bool | None  # None where this system does not tell
+    is_uno: bool  # the USB chip is one that UNOs and their copies carry
+    busy: bool | None  # None where the system does not report it
+    location: str | None = None  # USB bus and socket
+    chip: str | None = None  # name of a known USB chip
+
+    @property
+    def likelihood(self) -> int:
+        """Of an UNO behind the port, as in `Chip`; -1 for other devices."""
+        chip = CHIPS.get((self.vid or 0, self.pid or 0))
+        return chip.likelihood if chip else -1
 
 
 def find_ports() -> list[PortInfo]:
     """All serial ports, by name."""
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: p.device):
-        is_uno = (port.vid, port.pid) in UNO_IDS
+        chip = CHIPS.get((port.vid or 0, port.pid or 0))
         description = port.description if port.description != "n/a" else ""
         busy = None if _holder_unknowable() else holder(port.device) is not None
-        found.append(PortInfo(port.device, description, port.vid, port.pid, port.serial_number, is_uno, busy))
+        found.append(
+            PortInfo(
+                port.device,
+                description,
+                port.vid,
+                port.pid,
+                port.serial_number,
+                chip is not None,
+                busy,
+                port.location,
+                chip.name if chip else None,
+            )
+        )
     return found
 
 
 def choose_port(simulated_will_do: bool = True) -> str:
-    """The port that the environment variable LINKPOSE_PORT names, otherwise the only UNO connected.
+    """The only UNO that is connected.
 
-    Raises LinkposeError, which lists the ports, when no UNO or several are connected.
+    Arduino's own USB chips precede those of copies, and these precede general adapters. The environment variable
+    LINKPOSE_PORT names another port. Raises NoBoardFound or SeveralBoardsFound, which list the ports, or PortError for
+    a board whose USB device has no port.
     """
     if named := os.environ.get("LINKPOSE_PORT"):
         return named
     ports = find_ports()
-    unos = [port for port in ports if port.is_uno]
+    best = max((port.likelihood for port in ports), default=-1)
+    unos = [port for port in ports if port.likelihood == best >= 0]
     if len(unos) == 1:
         return unos[0].port
-    listed = ", ".join(f"{p.port} ({p.description or 'no description'})" for p in (unos or ports))
     if unos:
-        raise LinkposeError(f"{len(unos)} boards are connected: {listed}; choose one with --port")
-    if ports:
-        raise LinkposeError(f"no UNO is connected; the ports there are: {listed}; connect it or choose with --port")
-    hint = ", or try --port sim://link" if simulated_will_do else ""
-    raise LinkposeError(f"no serial port is connected; plug the board in{hint}")
+        raise SeveralBoardsFound(unos)
+    for device in devices_without_port():
+        raise PortError(device.location, device.cure)
+    raise NoBoardFound(ports, simulated_will_do)
 
 
-def open_port(name: str) -> serial.Serial:
-    """Opens a device, a pyserial URL or a simulated board (`sim://...`).
+def register_scheme(package: str) -> None:
+    """Lets `open_port` open URLs of another scheme: `package` holds a module protocol_SCHEME, as pyserial asks."""
+    if package not in serial.protocol_handler_packages:
+        serial.protocol_handler_packages.append(package)
 
-    Raises LinkposeError with its own sentence for a port that is absent, busy, forbidden or none.
+
+class PortlessDevice(NamedTuple):
+    """A USB device with a known chip for which the system made no serial port."""
+
+    vid: int
+    pid: int
+    location: str
+
+    @property
+    def cure(self) -> str:
+        """What happened, and what to type."""
+        chip = CHIPS[self.vid, self.pid]
+        return (
+            f"the USB device {self.vid:04x}:{self.pid:04x} ({chip.name}) at {self.location} has no serial port. On "
+            "Ubuntu the braille program brltty takes it: type `sudo apt remove brltty`, unplug the board and plug it "
+            f"in again. Without brltty, type `sudo modprobe {chip.driver}`"
+        )
+
+
+def devices_without_port(sysfs: Path = Path("/sys/bus/usb/devices")) -> Iterator[PortlessDevice]:
+    """USB devices with a known chip but no serial port. Only Linux reports them."""
+    for device in sorted(sysfs.glob("*")):
+        try:
+            vid, pid = (int((device / name).read_text(), 16) for name in ("idVendor", "idProduct"))
+        except (OSError, ValueError):
+            continue  # an interface or a hub's port
+        has_port = any(device.glob("*:*/tty[A-Z]*")) or any(device.glob("*:*/tty/tty*"))
+        if (vid, pid) in CHIPS and not has_port:
+            yield PortlessDevice(vid, pid, device.name)
+
+
+class UsbIdentity(NamedTuple):
+    """What stays the same when a device returns under another port name."""
+
+    vid: int
+    pid: int
+    serial: str | None
+    location: str | None
+
+
+def usb_identity(name: str) -> UsbIdentity | None:
+    """The USB device behind a port; None for other ports."""
+    device = os.path.realpath(name)
+    for port in list_ports.comports():
+        if device in (port.device, os.path.realpath(port.device)) and port.vid is not None and port.pid is not None:
+            return UsbIdentity(port.vid, port.pid, port.serial_number, port.location)
+    return None
+
+
+def find_again(name: str, identity: UsbIdentity | None) -> str | None:
+    """The present name of the port that was called `name`; None while its device is absent.
+
+    A device with a USB serial number is found by it. One without (CH340) is found in its USB socket, or as the only
+    device of its kind.
     """
-    if "linkpose.simulation" not in serial.protocol_handler_packages:
-        serial.protocol_handler_packages.append("linkpose.simulation")
-    options: dict[str, Any] = {"baudrate": BAUD, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
+    if identity is None:
+        return name
+    alike = [port for port in list_ports.comports() if (port.vid, port.pid) == identity[:2]]
+    if identity.serial:
+        same = [port.device for port in alike if port.serial_number == identity.serial]
+    else:
+        same = [port.device for port in alike if port.location and port.location == identity.location]
+        same = same or [port.device for port in alike if len(alike) == 1]
+    if any(os.path.realpath(name) == os.path.realpath(device) for device in same):
+        return name
+    return same[0] if same else None
+
+
+def open_port(name: str, baud: int = BAUD) -> serial.Serial:
+    """Opens a device, a pyserial URL, or a URL of a registered scheme, at a bit rate.
+
+    Raises PortNotFound, PortBusy, PermissionDenied, NotASerialPort or another PortError.
+    """
+    options: dict[str, Any] = {"baudrate": baud, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
         user = holder(name)
         if user:
-            raise LinkposeError(f"{name} is in use by {user}; close it and try again")
+            raise PortBusy(name, user)
         if os.name == "posix":
             options["exclusive"] = True
     try:
         port = serial.serial_for_url(name, **options)
     except (serial.SerialException, OSError, ValueError) as error:
-        raise LinkposeError(_why_not(name, error)) from error
+        raise _why_not(name, error) from error
     return port
 
 
-def _why_not(name: str, error: Exception) -> str:
+def _why_not(name: str, error: Exception) -> PortError:
+    """The error that says why a port cannot be opened, from what the system or pyserial raised."""
     code = getattr(error, "errno", None)
     text = str(error).lower()
-    if code == errno.ENOENT or "filenotfound" in text or "could not find" in text:
-        return f"there is no port {name}; `linkpose ports` lists those there are"
+    if code in (errno.ENOENT, errno.ENXIO) or "filenotfound" in text or "could not find" in text:
+        return PortNotFound(name)
     if code in (errno.EACCES, errno.EPERM) or "permissionerror(13" in text or "access is denied" in text:
-        if os.name == "nt":
-            return f"{name} is in use by another program; close it and try again"
-        join = f"sudo usermod -aG {_group(name)} $USER"
-        return f"no permission to open {name}; join the group that owns it with `{join}` and log in again"
+        return PortBusy(name) if os.name == "nt" else PermissionDenied(name, _group(name))
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{name} is in use by another program; close it and try again"
+        return PortBusy(name)
     if "no handler" in text or "invalid url" in text:
-        return f"{name} is no port that can be opened; name a device such as /dev/ttyACM0 or COM3, or sim://link"
+        return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
-        return f"{name} is not a serial port; `linkpose ports` lists those there are"
-    return f"cannot open {name}: {error}"
+        return NotASerialPort(name)
+    return PortError(name, f"cannot open {name}: {error}")
 
 
 def _group(name: str) -> str:
-    """The group that may use the port: dialout on Debian, uucp on Arch."""
+    """The group whose members may open the port: dialout on Debian, uucp on Arch."""
     try:
         return Path(name).group()
     except (OSError, KeyError, NotImplementedError):
@@ -127,10 +238,10 @@ def _holder_unknowable() -> bool:
 
 
 def holder(name: str) -> str | None:
-    """The program that has the device open, as "name (process id)"; None when none is known to.
+    """The program that has the device open, as "name (process id)"; None if none is known.
 
-    Only Linux tells, and only of the processes that this user may look into. Opening the port to find out would reset
-    the board.
+    Only Linux reports it, and only for processes that this user may inspect. Opening the port instead would reset the
+    board.
     """
     if _holder_unknowable():
         return None

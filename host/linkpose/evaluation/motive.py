@@ -1,8 +1,8 @@
 """References from OptiTrack: the CSV that Motive exports, with three markers on the sensor's plate.
 
 Marker 1 is at the sensor, marker 2 lies in the direction of its x axis and marker 3 on the side of its y axis, as on
-the paper's set square. They give the sensor's axes, and with the direction upwards the tilt Z. Marker 1 moves on a
-sphere about the joint's centre, which is fitted: the height is that of marker 1 over it, wherever the origin is.
+the set square of [Link]. They define the sensor's axes, and with the upward direction the tilt Z. Marker 1 moves on a
+sphere about the joint centre. The sphere is fitted, and the height is counted from its centre, wherever the origin is.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from linkpose.sensors.measurements import Floats
 _SIGNATURE = b"Format Version,"
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker moves
-_WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be judged are better than a centimetre
+_WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be scored are better than a centimetre
 _LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
-_STILL = 10.0  # times its noise: noise alone also lies about a sphere, of some two and a half times its deviation
+_STILL = 10.0  # radius over noise: noise alone also fits a sphere, with a radius of about 2.5 times its deviation
 _CLEARLY_WIDER_DEG = 15.0
 _FARTHEST = 1e9  # in any unit
 _LONGEST_LINK_M = 10.0
@@ -39,7 +39,7 @@ def read_any(path: Path, up: str) -> Table:
 def read_motive(path: Path, up: str = "y") -> Table:
     """Time, height, roll and pitch of the plate as a reference; rows with a hidden marker are NaN.
 
-    `up` is the axis of the room that points upwards: "y" unless Motive was told to export with Z up.
+    `up` is the axis of the room that points upwards: "y" unless Motive exports with Z up.
     Raises LinkposeError naming the file and what is missing in it.
     """
     take = _read_take(path)
@@ -172,7 +172,7 @@ def _joint_height(path: Path, positions: Floats, up: int) -> float:
     centre, radius, noise, std = _fit_sphere(seen - middle)
     if radius < _STILL * noise:
         raise LinkposeError(
-            f"{path}: marker 1 hardly moves, which tells no joint: tilt the link to all sides in the take"
+            f"{path}: marker 1 hardly moves, so the joint cannot be located: tilt the link to all sides in the take"
         )
     if noise > _WORST_SPHERE_M:
         raise LinkposeError(
@@ -180,8 +180,8 @@ def _joint_height(path: Path, positions: Floats, up: int) -> float:
         )
     if std[up] > _WORST_HEIGHT_STD_M:
         raise LinkposeError(
-            f"{path}: the motion of marker 1 tells the joint's height to ±{100 * std[up]:.1f} cm only: "
-            "tilt the link further, for turning about the vertical tells nothing of it"
+            f"{path}: the motion of marker 1 locates the joint's height to ±{100 * std[up]:.1f} cm only: "
+            "tilt the link further; turning about the vertical does not help"
         )
     return float(middle[up] + centre[up])
 
@@ -207,7 +207,7 @@ def _fit_sphere(p: Floats) -> tuple[Floats, float, float, Floats]:
             break
     noise = max(float(np.sqrt(np.mean(off**2))), _LEAST_NOISE_M)
     radius = max(float(state[3]), noise)
-    # Noise across the radius turns the rows of the Jacobian, which looks like motion and tells nothing.
+    # Noise across the radius turns the rows of the Jacobian. That looks like motion, but holds no information.
     told[:3, :3] -= (noise / radius) ** 2 * (len(p) * np.eye(3) - told[:3, :3])
     covariance = noise**2 * _solve(told, np.eye(4), (noise / _LONGEST_LINK_M) ** 2)
     return state[:3], radius, noise, np.sqrt(np.diag(covariance))[:3]

@@ -2,40 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
-from linkpose.evaluation.series import Series, difference, find_offset, paired
+from linkpose.errors import LinkposeError, TooFewRows
+from linkpose.evaluation.errors import COMPONENTS, Errors, errors_of, scored, yaw_drift_deg_per_min
+from linkpose.evaluation.series import Series, find_offset, is_sparser, paired
+from linkpose.evaluation.statistics import Statistics
+from linkpose.quantities import (
+    ANGLE,
+    CHAIN_ROTATION,
+    HEADING,
+    HEIGHT,
+    HEIGHT1,
+    HEIGHT2,
+    PITCH,
+    ROLL,
+    ROTATION,
+    VX,
+    VY,
+    WZ,
+    YAW,
+    Quantity,
+    X,
+    Y,
+    Z,
+    by_filter,
+    std_column,
+)
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
-# What an estimate's column ends with is what the reference's column is called. Longest first: `_vx_m_s` is not `_x_m`.
-_LINK = ("height_m", "roll_deg", "pitch_deg")
-_PLANAR = ("vx_m_s", "vy_m_s", "wz_rad_s", "x_m", "y_m", "heading_rad")
-_POSE = ("x_m", "y_m", "heading_rad")
-_ODOMETRIC = ("mice", "planar-ekf", "planar-ukf")  # their poses count from where the robot stood at their first sample
-_UNRELATED = 0.9  # share of the reference's motion that is left when even the best filter's is taken away
+_CHAIN = (ANGLE, *CHAIN_ROTATION, HEIGHT1, HEIGHT2)
+_LINK = (HEIGHT, ROLL, PITCH, YAW, *_CHAIN)
+_SCORED = (*_LINK, VX, VY, WZ, X, Y, HEADING, Z)
+_UNRELATED = 0.9  # share of the reference's motion that remains when even the best filter's is subtracted
 _SAME_TILT_DEG = 30.0
-_ANGLES = {"roll_deg": np.pi / 180, "pitch_deg": np.pi / 180, "heading_rad": 1.0}  # radians in a unit
+_FEWEST = 0.5  # share of a filter's rows that must have a reference
+
+Pair = tuple[Series, Series]  # estimate, reference
+Window = tuple[float, float]  # s, on the estimate's clock
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Root mean square errors of one filter; only of what the reference has."""
+    """Errors of one filter, only of quantities that the reference has."""
 
     filter: str
     rows: int  # instants that were compared
-    errors: dict[str, float]  # by the names of the JSON keys, in their units
-    time_offset_s: float  # added to the estimate's clock to have the reference's
+    known_rows: int  # instants at which the filter has an estimate
+    empty_rows: int  # instants at which it has none yet: left out, not scored
+    time_offset_s: float  # added to the estimate's clock to get the reference's
     is_planar: bool
+    errors: dict[str, Errors] = field(default_factory=dict)  # by name: height, roll, position, ...
+    yaw_drift_deg_per_min: float | None = None
 
-    def as_dict(self) -> dict[str, str | int | float]:
-        """The object that `evaluate --json` prints."""
-        offset = {} if self.is_planar else {"time_offset_s": round(self.time_offset_s, 6)}
-        return {"filter": self.filter, "rows": self.rows, **self.errors, **offset}
+    def statistics(self) -> dict[str, Statistics]:
+        """By quantity."""
+        return {name: errors.statistics() for name, errors in self.errors.items()}
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object that `evaluate --json` prints.
+
+        The RMSE of a vector is one figure; its components have only NEES and share within 2σ.
+        """
+        found = self.statistics()
+        components = {q.name for q in COMPONENTS}
+        row: dict[str, Any] = {"filter": self.filter, "rows": self.rows}
+        for name, value in found.items():
+            if name not in components:
+                row[f"{name}_rmse_{self.errors[name].unit}"] = value.rmse
+        if self.yaw_drift_deg_per_min is not None:
+            row["yaw_drift_deg_per_min"] = self.yaw_drift_deg_per_min
+        if not self.is_planar:
+            row["time_offset_s"] = round(self.time_offset_s, 6)
+        row |= {"known_rows": self.known_rows, "empty_rows": self.empty_rows}
+        for name, value in found.items():
+            if value.nees is not None:
+                row |= {f"{name}_nees": value.nees, f"{name}_within_2sigma": value.within_2sigma}
+        row["quantities"] = {name: _details(self.errors[name].unit, value) for name, value in found.items()}
+        return row
+
+
+def _details(unit: str, value: Statistics) -> dict[str, Any]:
+    details: dict[str, Any] = {"unit": unit, "rows": value.rows, "rmse": value.rmse, "mean": value.mean}
+    details |= {"worst": value.worst, "p95": value.p95}
+    if value.nees is not None:
+        details |= {"nees": value.nees, "within_2sigma": value.within_2sigma}
+    return details
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,49 +100,125 @@ class Evaluation:
     """The scores of all filters in a file, in its order."""
 
     scores: list[Score]
-    remarks: list[str]  # what makes the comparison itself doubtful
+    remarks: list[str]  # why the comparison itself may be doubtful
 
 
-def evaluate(estimate: Table, reference: Table) -> Evaluation:
-    """Compares all filters of the estimate with the reference, on one common offset between the two clocks.
+def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_s: float | None = None) -> Evaluation:
+    """Compares all filters of the estimate with the reference, with one common offset between the two clocks.
 
-    Raises LinkposeError where the files have nothing in common: no filter, no quantity, no time.
+    `from_s` and `to_s` limit the comparison on the estimate's clock (s). The offset, and the common start of poses
+    without an absolute origin, come from the whole files. Raises LinkposeError where the files have nothing in common
+    (no filter, no quantity, no time), or where less than half of a filter's rows have a reference.
     """
     estimate.require("time_s")
     reference.require("time_s")
+    compared = _pairs(estimate, reference)
+    offset_s, residual = _common_offset(compared.values())
+    window = (-np.inf if from_s is None else from_s, np.inf if to_s is None else to_s)
+    scores = [_score(estimate, reference, name, both, offset_s, window) for name, both in compared.items()]
+    return Evaluation(scores, _doubts(estimate, reference, compared.values(), offset_s, residual))
+
+
+# ---- what can be compared ----
+
+
+def _pairs(estimate: Table, reference: Table) -> dict[str, dict[Quantity, Pair]]:
+    """Filter -> quantity -> (estimate, reference)."""
     found = _filters(estimate)
-    known = [q for q in (*_LINK, *_PLANAR) if q in reference.columns]
+    known = {q: column for q in _SCORED if (column := _reference_column(reference, q))}
     if not known:
         raise LinkposeError(
             f"{reference.path} is no reference: it has {', '.join(reference.columns)}, "
-            f"and none of {', '.join((*_LINK, *_PLANAR))}"
+            f"and none of {', '.join(q.column for q in _SCORED)}"
         )
-    truth = {q: _series(reference, q, q) for q in known}
-    pairs = {}
+    pairs: dict[str, dict[Quantity, Pair]] = {}
     for name, columns in found.items():
-        both = {q: (_series(estimate, column, q), truth[q]) for q, column in columns.items() if q in truth}
+        both = {
+            q: (_series(estimate, column, q), _series(reference, known[q], q))
+            for q, column in columns.items()
+            if q in known
+        }
+        if not all(q in both for q in CHAIN_ROTATION):
+            both = {q: pair for q, pair in both.items() if q not in CHAIN_ROTATION}
         if both:
             pairs[name] = both
     if not pairs:
         raise LinkposeError(
-            f"{reference.path} has {', '.join(known)}, and no filter in {estimate.path} estimates any of it"
+            f"{reference.path} has {', '.join(known.values())}, and no filter in {estimate.path} estimates any of it"
         )
-    offsets = [find_offset(list(both.values())) for both in pairs.values()]
-    offset_s, residual = min(offsets, key=lambda found: found[1])
-    scores = [_score(estimate, reference, name, both, offset_s) for name, both in pairs.items()]
-    return Evaluation(scores, _doubts(estimate, reference, pairs.values(), offset_s, residual))
+    return pairs
+
+
+def _filters(estimate: Table) -> dict[str, dict[Quantity, str]]:
+    """Filter -> quantity that can be scored -> column."""
+    found = {}
+    for name, columns in by_filter(estimate.columns).items():
+        kept = {q: column for q, column in columns.items() if q in _SCORED}
+        if kept:
+            found[name] = kept
+    if not found:
+        raise LinkposeError(
+            f"{estimate.path} holds no estimates: type `linkpose estimate {estimate.path} -o ESTIMATE.csv` first"
+            if estimate.kind == "recording"
+            else f"{estimate.path} holds no estimates: no column is named like joint_height_m or mice_vx_m_s"
+        )
+    return found
+
+
+def _reference_column(reference: Table, quantity: Quantity) -> str | None:
+    """The reference's column of a quantity. That of a chain may have the filter's prefix; z is the height."""
+    names = [quantity.column]
+    names += [f"chain_{quantity.column}"] if quantity in _CHAIN else []
+    names += [HEIGHT.column] if quantity is Z else []
+    return next((name for name in names if name in reference.columns), None)
+
+
+def _series(table: Table, column: str, quantity: Quantity) -> Series:
+    """The column as a signal; angles in radians, a quaternion's numbers with the signs that make it continuous."""
+    value = table.columns[column] * quantity.radians
+    if quantity in CHAIN_ROTATION:
+        prefix = column.removesuffix(quantity.column)
+        value = value * _continuous_sign(np.stack([table.columns[f"{prefix}{q.column}"] for q in CHAIN_ROTATION]))
+    stamped = np.isfinite(table.columns["time_s"])
+    return Series(table.columns["time_s"][stamped], value[stamped], quantity.is_angle)
+
+
+def _continuous_sign(q: Floats) -> Floats:
+    """Signs (N,) that keep neighbours of the quaternions (4, N) in one hemisphere: q and −q are one rotation."""
+    known = np.flatnonzero(np.isfinite(q).all(axis=0))
+    sign = np.ones(q.shape[1])
+    if len(known):
+        seen = q[:, known]
+        turned = np.where((seen[:, 1:] * seen[:, :-1]).sum(axis=0) < 0, -1.0, 1.0)
+        sign[known] = np.concatenate([[1.0], np.cumprod(turned)])
+    return sign
+
+
+def _common_offset(compared: Iterable[Mapping[Quantity, Pair]]) -> tuple[float, float]:
+    """The offset (s) of the filter that fits best, and its residual."""
+    offsets = [find_offset(pairs) for both in compared if (pairs := _comparable(both))]
+    return min(offsets, key=lambda found: found[1]) if offsets else (0.0, np.inf)
+
+
+def _comparable(both: Mapping[Quantity, Pair]) -> list[Pair]:
+    """The pairs that move alike. A link's x and y do not where the two count yaw from different directions."""
+    unaligned = (YAW, *CHAIN_ROTATION, *((X, Y) if YAW in both else ()))
+    return [pair for q, pair in both.items() if q not in unaligned]
+
+
+# ---- doubts ----
 
 
 def _doubts(
     estimate: Table,
     reference: Table,
-    compared: Collection[Mapping[str, tuple[Series, Series]]],
+    compared: Collection[Mapping[Quantity, Pair]],
     offset_s: float,
     residual: float,
 ) -> list[str]:
-    """What speaks against one run, or one frame, in both files."""
+    """Evidence that the files are of different runs or frames."""
     both_files = f"{estimate.path} and {reference.path}"
-    tilts = [both for both in compared if "roll_deg" in both and "pitch_deg" in both]
+    tilts = [both for both in compared if ROLL in both and PITCH in both]
     apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
     if apart > _SAME_TILT_DEG:
         cure = (
@@ -100,89 +233,75 @@ def _doubts(
     return []
 
 
-def _tilt_apart_deg(both: Mapping[str, tuple[Series, Series]], offset_s: float) -> float:
-    """Median angle between the two verticals, seen by the sensor; 0 without an instant in common."""
-    roll, pitch = (np.array(paired(*both[quantity], offset_s)) for quantity in ("roll_deg", "pitch_deg"))
+def _tilt_apart_deg(both: Mapping[Quantity, Pair], offset_s: float) -> float:
+    """Median angle between the two verticals, in the sensor's axes; 0 without an instant in common."""
+    roll, pitch = (np.array(paired(*both[quantity], offset_s)) for quantity in (ROLL, PITCH))
     z = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])  # (3, 2, N)
     angle = np.arccos(np.clip((z[:, 0] * z[:, 1]).sum(axis=0), -1.0, 1.0))
     return float(np.degrees(np.median(angle[np.isfinite(angle)]))) if np.isfinite(angle).any() else 0.0
 
 
-def _filters(table: Table) -> dict[str, dict[str, str]]:
-    """Filter -> quantity -> column."""
-    found: dict[str, dict[str, str]] = {}
-    for column in table.columns:
-        for quantity in (*_LINK, *_PLANAR):
-            if column.endswith("_" + quantity):
-                name = column.removesuffix("_" + quantity).replace("_", "-")
-                found.setdefault(name, {})[quantity] = column
-                break
-    if not found:
-        raise LinkposeError(
-            f"{table.path} holds no estimates: type `linkpose estimate {table.path} -o ESTIMATE.csv` first"
-            if table.kind == "recording"
-            else f"{table.path} holds no estimates: no column is named like joint_height_m or mice_vx_m_s"
-        )
-    return found
-
-
-def _series(table: Table, column: str, quantity: str) -> Series:
-    value = table.columns[column]
-    return Series(table.columns["time_s"], value * _ANGLES.get(quantity, 1.0), quantity in _ANGLES)
+# ---- one filter ----
 
 
 def _score(
-    estimate: Table, reference: Table, name: str, both: Mapping[str, tuple[Series, Series]], offset_s: float
+    estimate: Table,
+    reference: Table,
+    name: str,
+    both: Mapping[Quantity, Pair],
+    offset_s: float,
+    window: Window,
 ) -> Score:
-    errors = {quantity: difference(ours, theirs, offset_s) for quantity, (ours, theirs) in both.items()}
-    is_planar = not any(quantity in _LINK for quantity in errors)
-    if name in _ODOMETRIC and all(quantity in errors for quantity in _POSE):
-        errors |= _from_common_start({q: paired(*both[q], offset_s)[0] for q in _POSE}, errors)
-    compared = np.logical_or.reduce([np.isfinite(error) for error in errors.values()])
-    if not compared.any():
+    at = {q: paired(*pair, offset_s) for q, pair in both.items()}
+    ours, theirs = ({q: values[side] for q, values in at.items()} for side in (0, 1))
+    time_s = _instants(*next(iter(both.values())), offset_s)
+    inside = (time_s >= window[0]) & (time_s <= window[1])
+    errors = {q: np.where(inside, error, np.nan) for q, error in errors_of(name, ours, theirs).items()}
+    errors = {q: error for q, error in errors.items() if np.isfinite(error).any()}
+    if not errors:
         raise LinkposeError(
             f"{estimate.path} and {reference.path} have no instant in common for {name}: "
             "check that they are of the same run"
         )
-    errors = {quantity: error for quantity, error in errors.items() if np.isfinite(error).any()}
-    rms = _planar(errors) if is_planar else _link(errors)
-    return Score(name, int(compared.sum()), rms, offset_s, is_planar)
+    rows = int(np.logical_or.reduce([np.isfinite(error) for error in errors.values()]).sum())
+    known, empty = _known_rows(both, window)
+    if rows < _FEWEST * known:
+        common = time_s[_any_finite(errors)]
+        raise TooFewRows(name, (estimate.path, reference.path), (rows, known), (float(common[0]), float(common[-1])))
+    is_planar = not any(q in _LINK for q in both)
+    std = _std(estimate, name, both, offset_s)
+    drift = yaw_drift_deg_per_min(time_s, errors[YAW]) if YAW in errors else None
+    return Score(name, rows, known, empty, offset_s, is_planar, scored(time_s, errors, std, is_planar), drift)
 
 
-def _from_common_start(pose: Mapping[str, Floats], errors: Mapping[str, Floats]) -> dict[str, Floats]:
-    """Errors of a pose (x, y, heading) moved as a whole to agree with the reference at the first common instant."""
-    both = np.flatnonzero(np.logical_and.reduce([np.isfinite(errors[quantity]) for quantity in _POSE]))
-    if not len(both):
-        return {}
-    first = both[0]
-    turn = -errors["heading_rad"][first]
-    x, y = (pose[quantity] - pose[quantity][first] for quantity in ("x_m", "y_m"))
-    moved_x, moved_y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
-    return {
-        "x_m": moved_x - x + errors["x_m"] - errors["x_m"][first],
-        "y_m": moved_y - y + errors["y_m"] - errors["y_m"][first],
-        "heading_rad": (errors["heading_rad"] + turn + np.pi) % (2 * np.pi) - np.pi,
-    }
+def _any_finite(errors: Mapping[Quantity, Floats]) -> Any:
+    return np.logical_or.reduce([np.isfinite(error) for error in errors.values()])
 
 
-def _link(errors: Mapping[str, Floats]) -> dict[str, float]:
-    units = {"height_m": ("height_rmse_cm", 100.0), "roll_deg": ("roll_rmse_deg", 180 / np.pi)}
-    units["pitch_deg"] = ("pitch_rmse_deg", 180 / np.pi)
-    return {key: scale * _rms(errors[q]) for q, (key, scale) in units.items() if q in errors}
+def _instants(estimate: Series, reference: Series, offset_s: float) -> Floats:
+    """The instants of `paired`, on the estimate's clock."""
+    return reference.time_s - offset_s if is_sparser(reference, estimate) else estimate.time_s
 
 
-def _planar(errors: Mapping[str, Floats]) -> dict[str, float]:
-    rms: dict[str, float] = {}
-    if "vx_m_s" in errors and "vy_m_s" in errors:
-        rms["velocity_rmse_m_s"] = _rms(np.hypot(errors["vx_m_s"], errors["vy_m_s"]))
-    if "wz_rad_s" in errors:
-        rms["rate_rmse_rad_s"] = _rms(errors["wz_rad_s"])
-    if "x_m" in errors and "y_m" in errors:
-        rms["position_rmse_m"] = _rms(np.hypot(errors["x_m"], errors["y_m"]))
-    if "heading_rad" in errors:
-        rms["heading_rmse_rad"] = _rms(errors["heading_rad"])
-    return rms
+def _std(estimate: Table, name: str, both: Mapping[Quantity, Pair], offset_s: float) -> dict[Quantity, Floats]:
+    """σ of each quantity that has one, at the instants of `paired`, in the column's unit, angles in radians."""
+    columns, found = _filters(estimate)[name], {}
+    for quantity, pair in both.items():
+        column = std_column(columns[quantity]) or ""
+        if column in estimate.columns:
+            of = ROTATION if quantity in CHAIN_ROTATION else quantity
+            value = estimate.columns[column][np.isfinite(estimate.columns["time_s"])] * of.radians
+            found[of] = paired(Series(pair[0].time_s, value), pair[1], offset_s)[0]
+    return found
 
 
-def _rms(error: Floats) -> float:
-    return float(np.sqrt(np.nanmean(error**2)))
+def _known_rows(both: Mapping[Quantity, Pair], window: Window) -> tuple[int, int]:
+    """How many instants of the comparison have an estimate, and how many have none, inside the window."""
+    estimate, reference = next(iter(both.values()))
+    known = np.logical_or.reduce([np.isfinite(ours.value) for ours, _ in both.values()])
+    inside = (estimate.time_s >= window[0]) & (estimate.time_s <= window[1])
+    if not is_sparser(reference, estimate):
+        return int((known & inside).sum()), int((~known & inside).sum())
+    share = estimate.interval_s / reference.interval_s
+    stamps, empty = (len(np.unique(estimate.time_s[part & inside])) for part in (known, ~known))
+    return round(share * stamps), round(share * empty)

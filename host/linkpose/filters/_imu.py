@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled
+from linkpose.compiling import inner
+from linkpose.filters import _vector as vec
 from linkpose.filters._vector import Vec
 from linkpose.sensors.rig import Imu
 from linkpose.wire.messages import SampleFlags
@@ -22,6 +24,8 @@ _JERK_RAD_S3 = 50.0  # of a hand's motion: between two known rates Ts apart the 
 _ACCEL_RAD_S2 = 5.0  # a rate that is held grows wrong by this
 _GUESS_RAD_S = 1.0  # the most that a rate is thought to be wrong
 
+# Unknown lever arm and rhythm of a start in motion: acceleration (m/s²) to a rate of 1 rad/s.
+_START_ACCEL_PER_RATE = 5.0
 # Beyond what any sensor reads: garbage, the square of which could overflow.
 _MOST_M_S2 = 1e4
 _MOST_RAD_S = 1e4
@@ -53,7 +57,7 @@ class ImuCalibration(NamedTuple):
         )
 
 
-@compiled
+@inner
 def rotation_variance(step_s: float, held_s: float, imu: ImuCalibration) -> float:
     """Variance (rad²) about each axis of the rotation over a step, with a rate that has been held for `held_s`."""
     if held_s == 0.0 and step_s <= LONGEST_STEP_S:
@@ -62,19 +66,19 @@ def rotation_variance(step_s: float, held_s: float, imu: ImuCalibration) -> floa
     return step_s * step_s * (imu.gyro_variance + min(wrong, _GUESS_RAD_S) ** 2)
 
 
-@compiled
+@inner
 def blind_for(held_s: float, step_s: float, has_rate: bool, longest_s: float) -> float:
     """For how long the gyro has been of no use (s). Beyond the longest, a rate alone does not end it: Z is lost."""
     return 0.0 if has_rate and max(held_s, step_s) <= longest_s else held_s + step_s
 
 
-@compiled
+@inner
 def _below(reading: Vec, most: float) -> bool:
     """Whether all components are less than `most`, and none is NaN."""
     return abs(reading[0]) < most and abs(reading[1]) < most and abs(reading[2]) < most
 
 
-@compiled
+@inner
 def read_accel(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
     """Whether a sample's specific force can be used, and the calibrated force (m/s²)."""
     o, k = imu.accel_offset, imu.accel_gain
@@ -82,9 +86,22 @@ def read_accel(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
     return _below(force, _MOST_M_S2) and not flags & _ACCEL_SATURATED, force
 
 
-@compiled
+@inner
 def read_gyro(raw: Vec, flags: int, imu: ImuCalibration) -> tuple[bool, Vec]:
     """Whether a sample's angular rate can be used, and the rate less its bias (rad/s)."""
     b = imu.gyro_bias
     rate = (raw[0] - b[0], raw[1] - b[1], raw[2] - b[2])
     return _below(rate, _MOST_RAD_S) and not flags & _GYRO_SATURATED, rate
+
+
+@inner
+def is_bounded(reading: Vec) -> bool:
+    """Whether a reading that cannot be used is at least finite and of a possible size, as a saturated one is."""
+    return _below(reading, _MOST_M_S2)
+
+
+@inner
+def unknown_accel(force: Vec, rate: Vec) -> float:
+    """Square of the acceleration (m/s²)² that a sample of unknown history may hold: 0 at rest."""
+    excess = math.sqrt(vec.dot(force, force)) - GRAVITY
+    return excess * excess + _START_ACCEL_PER_RATE**2 * vec.dot(rate, rate)

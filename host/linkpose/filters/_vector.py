@@ -1,6 +1,6 @@
-"""Vectors and symmetric matrices of three, as tuples that the compiler keeps in registers.
+"""Vectors and symmetric 3 × 3 matrices as tuples, which the compiler keeps in registers.
 
-A vector is (x, y, z); a symmetric matrix is (xx, xy, xz, yy, yz, zz). All are compiled into the filters that use them.
+A vector is (x, y, z); a symmetric matrix is (xx, xy, xz, yy, yz, zz).
 """
 
 from __future__ import annotations
@@ -10,41 +10,46 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled
+from linkpose.compiling import inner
 
 Floats = NDArray[np.float64]
 Vec = tuple[float, float, float]
 Sym = tuple[float, float, float, float, float, float]
 
 
-@compiled
+@inner
 def cross(a: Vec, b: Vec) -> Vec:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-@compiled
+@inner
 def dot(a: Vec, b: Vec) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@compiled
+@inner
 def minus(a: Vec, b: Vec) -> Vec:
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
-@compiled
-def plus(a: Vec, scale: float, b: Vec) -> Vec:
-    """a + scale · b"""
+@inner
+def axpy(scale: float, b: Vec, a: Vec) -> Vec:
+    """scale · b + a"""
     return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
 
 
-@compiled
+@inner
+def scale(factor: float, a: Vec) -> Vec:
+    return (factor * a[0], factor * a[1], factor * a[2])
+
+
+@inner
 def unit(a: Vec) -> Vec:
     inverse = 1.0 / math.sqrt(dot(a, a))
     return (a[0] * inverse, a[1] * inverse, a[2] * inverse)
 
 
-@compiled
+@inner
 def apply(s: Sym, v: Vec) -> Vec:
     """s v"""
     return (
@@ -54,13 +59,13 @@ def apply(s: Sym, v: Vec) -> Vec:
     )
 
 
-@compiled
+@inner
 def plus_diagonal(s: Sym, value: float) -> Sym:
     """s + value · I"""
     return (s[0] + value, s[1], s[2], s[3] + value, s[4], s[5] + value)
 
 
-@compiled
+@inner
 def add(a: Sym, scale: float, b: Sym) -> Sym:
     """a + scale · b"""
     return (
@@ -73,18 +78,18 @@ def add(a: Sym, scale: float, b: Sym) -> Sym:
     )
 
 
-@compiled
+@inner
 def scaled(scale: float, s: Sym) -> Sym:
     """scale · s"""
     return (scale * s[0], scale * s[1], scale * s[2], scale * s[3], scale * s[4], scale * s[5])
 
 
-@compiled
+@inner
 def trace(s: Sym) -> float:
     return s[0] + s[3] + s[5]
 
 
-@compiled
+@inner
 def cholesky(s: Sym) -> Sym:
     """L of s = L Lᵀ, s positive definite: (l00, l10, l20, l11, l21, l22)."""
     l00 = math.sqrt(s[0])
@@ -94,7 +99,7 @@ def cholesky(s: Sym) -> Sym:
     return l00, l10, l20, l11, l21, math.sqrt(s[5] - l20 * l20 - l21 * l21)
 
 
-@compiled
+@inner
 def inverse(s: Sym) -> Sym:
     """Inverse of a positive definite matrix, by cofactors."""
     c00 = s[3] * s[5] - s[4] * s[4]
@@ -111,31 +116,31 @@ def inverse(s: Sym) -> Sym:
     )
 
 
-@compiled
+@inner
 def quadratic(s: Sym, v: Vec) -> float:
     """vᵀ s v"""
     return dot(v, apply(s, v))
 
 
-@compiled
-def at(a: Floats, k: int) -> Vec:
-    """The vector that an array holds from element k on."""
-    return (a[k], a[k + 1], a[k + 2])
+@inner
+def load(a: Floats) -> Vec:
+    """The first three elements of an array."""
+    return (a[0], a[1], a[2])
 
 
-@compiled
-def put(a: Floats, k: int, value: Vec) -> None:
-    """Puts a vector into an array from element k on."""
-    a[k], a[k + 1], a[k + 2] = value
+@inner
+def store(a: Floats, value: Vec) -> None:
+    """Store a vector in the first three elements of an array."""
+    a[0], a[1], a[2] = value
 
 
-@compiled
+@inner
 def load_sym(a: Floats) -> Sym:
-    """The symmetric matrix that an array of six holds."""
+    """The symmetric matrix stored in an array of six."""
     return (a[0], a[1], a[2], a[3], a[4], a[5])
 
 
-@compiled
+@inner
 def cross_square(v: Vec, scale: float) -> Sym:
     """scale · [v×][v×]ᵀ = scale · (‖v‖² I − v vᵀ)"""
     xx, yy, zz = v[0] * v[0], v[1] * v[1], v[2] * v[2]
@@ -149,15 +154,15 @@ def cross_square(v: Vec, scale: float) -> Sym:
     )
 
 
-@compiled
+@inner
 def outer(v: Vec) -> Sym:
     """v vᵀ"""
     return (v[0] * v[0], v[0] * v[1], v[0] * v[2], v[1] * v[1], v[1] * v[2], v[2] * v[2])
 
 
-@compiled
+@inner
 def parallel(a: Sym, b: Sym, a_plus_b_inverse: Sym) -> Sym:
-    """a (a + b)⁻¹ b, symmetric, and positive where a and b are: a covariance corrected without a subtraction."""
+    """a (a + b)⁻¹ b, symmetric and positive where a and b are: a Kalman-updated covariance without a subtraction."""
     i = a_plus_b_inverse
     c0 = apply(i, (b[0], b[1], b[2]))
     c1 = apply(i, (b[1], b[3], b[4]))
@@ -173,9 +178,9 @@ def parallel(a: Sym, b: Sym, a_plus_b_inverse: Sym) -> Sym:
     )
 
 
-@compiled
+@inner
 def turn_back(rotation: Vec, v: Vec) -> Vec:
-    """exp(−[rotation×]) v: a fixed vector as seen after the frame has turned by `rotation` (rad)."""
+    """exp(−[rotation×]) v: a fixed vector, expressed in a frame that has turned by `rotation` (rad)."""
     square = dot(rotation, rotation)
     if square < 0.01:  # series: relative error below 1e-10
         sine = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
@@ -193,9 +198,9 @@ def turn_back(rotation: Vec, v: Vec) -> Vec:
     )
 
 
-@compiled
+@inner
 def turn_back_sym(r: Vec, s: Sym) -> Sym:
-    """(I − [r×]) s (I − [r×])ᵀ: a covariance after a small turn r (rad), to first order and positive all the same."""
+    """(I − [r×]) s (I − [r×])ᵀ: a covariance after a small turn r (rad), to first order, and still positive."""
     m00, m01, m02 = s[0] + r[2] * s[1] - r[1] * s[2], s[1] + r[2] * s[3] - r[1] * s[4], s[2] + r[2] * s[4] - r[1] * s[5]
     m10, m11, m12 = s[1] - r[2] * s[0] + r[0] * s[2], s[3] - r[2] * s[1] + r[0] * s[4], s[4] - r[2] * s[2] + r[0] * s[5]
     m20, m21, m22 = s[2] + r[1] * s[0] - r[0] * s[1], s[4] + r[1] * s[1] - r[0] * s[3], s[5] + r[1] * s[2] - r[0] * s[4]
@@ -209,8 +214,32 @@ def turn_back_sym(r: Vec, s: Sym) -> Sym:
     )
 
 
-@compiled
+@inner
 def roll_pitch(tilt: Vec) -> tuple[float, float]:
     """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖), degrees."""
     roll, pitch = math.atan2(tilt[1], tilt[2]), math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))
     return math.degrees(roll), math.degrees(pitch)
+
+
+@inner
+def squared(s: Sym) -> Sym:
+    """s s"""
+    return (
+        s[0] * s[0] + s[1] * s[1] + s[2] * s[2],
+        s[0] * s[1] + s[1] * s[3] + s[2] * s[4],
+        s[0] * s[2] + s[1] * s[4] + s[2] * s[5],
+        s[1] * s[1] + s[3] * s[3] + s[4] * s[4],
+        s[1] * s[2] + s[3] * s[4] + s[4] * s[5],
+        s[2] * s[2] + s[4] * s[4] + s[5] * s[5],
+    )
+
+
+@inner
+def cross_product_covariance(v: Vec, s: Sym) -> Sym:
+    """[v×] s [v×]ᵀ: covariance of v × e, e of covariance s."""
+    c0 = cross(v, (s[0], s[1], s[2]))
+    c1 = cross(v, (s[1], s[3], s[4]))
+    c2 = cross(v, (s[2], s[4], s[5]))
+    r0, r1, r2 = (c0[0], c1[0], c2[0]), (c0[1], c1[1], c2[1]), (c0[2], c1[2], c2[2])
+    x, y, z = cross(v, r0), cross(v, r1), cross(v, r2)
+    return x[0], x[1], x[2], y[1], y[2], z[2]

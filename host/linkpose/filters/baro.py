@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled, inlined
+from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, read_accel, read_gyro
 from linkpose.filters._vector import Vec
@@ -84,14 +84,14 @@ class BaroFilter:
         return out
 
 
-@inlined
+@inner
 def tilt_variance(force: Vec, squares: float, number: float) -> float:
     """Variance (rad²) of a mean force's direction: what varied was not gravity, and half of it may not average out."""
     varied = squares / number - vec.dot(force, force) / (number * number)
     return float(0.25 * max(varied, 0.0) / GRAVITY**2)
 
 
-@inlined
+@inner
 def listen(
     time_s: float, raw_accel: Vec, flags: int, pressure: float, fresh: bool, imu: ImuCalibration, state: StartState
 ) -> bool:
@@ -108,7 +108,7 @@ def listen(
                 state.force[j] += force[j]
             state.unsteady[0] += vec.dot(force, force)
             state.unsteady[1] += 1.0
-            state.unsteady[2] = tilt_variance(vec.at(state.force, 0), state.unsteady[0], state.unsteady[1])
+            state.unsteady[2] = tilt_variance(vec.load(state.force), state.unsteady[0], state.unsteady[1])
     elif state.pressure[1] > 0.0:
         return good
     if good:
@@ -117,21 +117,21 @@ def listen(
     return good
 
 
-@inlined
+@inner
 def start_height(state: StartState, j2s: Vec) -> float:
     """Height (m) of the sensor over the joint's centre at the start, 0 where no tilt is known."""
-    force = vec.at(state.force, 0)
+    force = vec.load(state.force)
     length = math.sqrt(vec.dot(force, force))
     return float(vec.dot(force, j2s) / length) if length > 0.0 else 0.0
 
 
-@inlined
+@inner
 def start_variance(state: StartState, height: float, j2s: Vec) -> float:
     """Variance (m²) of `start_height`, which is `height`."""
     return float(state.unsteady[2] * max(vec.dot(j2s, j2s) - height * height, 0.0))
 
 
-@inlined
+@inner
 def air_variance(since_s: float, raw_gyro: Vec, flags: int, imu: ImuCalibration, j2s: Vec) -> float:
     """Variance (Pa²) of what else than height a pressure differs by from the one `since_s` ago, at rest."""
     if not since_s > 0.0:
@@ -144,20 +144,20 @@ def air_variance(since_s: float, raw_gyro: Vec, flags: int, imu: ImuCalibration,
     return float(slow + weather * weather + suction * suction)
 
 
-@inlined
+@inner
 def barometric_height(pressure: float, state: StartState) -> float:
     """Height (m) over the start's mean pressure."""
     ratio: float = pressure * state.pressure[1] / state.pressure[0]
     return float(HEIGHT_SCALE_M * (1.0 - ratio**HEIGHT_EXPONENT))
 
 
-@inlined
+@inner
 def metres_per_pascal(state: StartState) -> float:
     """|dh/dp| at the start's mean pressure."""
     return float(HEIGHT_SCALE_M * HEIGHT_EXPONENT * state.pressure[1] / state.pressure[0])
 
 
-@inlined
+@inner
 def measure(
     pressure: float,
     time_s: float,
@@ -180,7 +180,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
     imu: ImuCalibration,

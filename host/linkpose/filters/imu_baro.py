@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled, inlined
+from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec
@@ -101,7 +101,7 @@ class ImuBaroFilter:
         return out
 
 
-@inlined
+@inner
 def propagate(mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: VerticalParameters) -> tuple[Vec, Sym]:
     """One step of the model; `accel` is Zᵀs_A − g (m/s²), of no use where not `seen`."""
     h, v, b = mean
@@ -125,7 +125,7 @@ def propagate(mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: Ver
     return (h + t * v + s * a, v + t * a, b), p
 
 
-@inlined
+@inner
 def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym]:
     """Kalman correction with a measured height, in Joseph's form."""
     gain = 1.0 / (p[0] + variance)
@@ -145,7 +145,7 @@ def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym
     return mean, p
 
 
-@inlined
+@inner
 def hear(lasting: Vec, innovation: float, time_s: float) -> Vec:
     """The lasting innovation (m), over how long it has been taken and the time of the last (s), with one more."""
     mean, span_s, last_s = lasting
@@ -161,7 +161,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
     imu: ImuCalibration,
@@ -175,8 +175,8 @@ def _process(
     out: Floats,
 ) -> None:
     now = recall(tilt_state)
-    mean, covariance = vec.at(vertical.mean, 0), vec.load_sym(vertical.covariance)
-    lasting = vec.at(vertical.lasting, 0)
+    mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
+    lasting = vec.load(vertical.lasting)
     rejected = 0
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled, inlined
+from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec
@@ -97,13 +97,13 @@ class JointFilter:
         return out
 
 
-@inlined
+@inner
 def weights(h1: float, h2: float) -> Vec:
     """c₀, c₁, c₂ (1/s) of the derivative at the last of three samples h2 and h1 apart (s)."""
     return ((2.0 * h1 + h2) / (h1 * (h1 + h2)), -(h1 + h2) / (h1 * h2), h1 / (h2 * (h1 + h2)))
 
 
-@inlined
+@inner
 def gravity_reference(force: Vec, rate: Vec, derivative: Vec, d: Vec) -> Vec:
     """z_c of (12): the force less the acceleration that the angular motion gives the sensor."""
     tangential = vec.cross(derivative, d)
@@ -115,7 +115,7 @@ def gravity_reference(force: Vec, rate: Vec, derivative: Vec, d: Vec) -> Vec:
     )
 
 
-@inlined
+@inner
 def reference_noise(rate: Vec, c: Vec, d: Vec, imu: ImuCalibration) -> Sym:
     """B / g². With [w×][d×] = d wᵀ − (w·d) I and [(w×d)×] = d wᵀ − w dᵀ, G = 2 d wᵀ − w dᵀ − (w·d) I."""
     wd = vec.dot(rate, d)
@@ -130,7 +130,7 @@ def reference_noise(rate: Vec, c: Vec, d: Vec, imu: ImuCalibration) -> Sym:
     return vec.plus_diagonal(gyro, imu.accel_variance / GRAVITY**2)
 
 
-@inlined
+@inner
 def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu: ImuCalibration) -> Now:
     """(12)-(14), with the rate's derivative from the present and the two last rates by the weights `c`."""
     rate, tilt = now.rate, now.tilt
@@ -159,7 +159,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     imu: ImuCalibration,
     parameters: TiltParameters,
     d: Vec,
@@ -170,7 +170,7 @@ def _process(
 ) -> None:
     now = recall(state)
     t1, t2 = history.time[0], history.time[1]
-    w1, w2 = vec.at(history.rate[0], 0), vec.at(history.rate[1], 0)
+    w1, w2 = vec.load(history.rate[0]), vec.load(history.rate[1])
     rejected = 0
     for i in range(len(time_s)):
         a = (accel[i, 0], accel[i, 1], accel[i, 2])

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
-from linkpose.filters import CannotRun
+from linkpose.errors import CannotRun
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import LONGEST_STEP_S, Floats, ImuCalibration, read_gyro
 from linkpose.filters._vector import Vec
@@ -244,7 +244,7 @@ def fuse(reading: Reading, step: float, rate: float, place: Placement, p: MicePa
 
     `rate` is the gyro's (rad/s), NaN without one.
     """
-    normal, right, before = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), vec.at(state.velocity, 0)
+    normal, right, before = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), vec.load(state.velocity)
     for i in range(state.used.shape[0]):
         if state.used[i]:
             at = place.position[i]
@@ -289,7 +289,7 @@ def explain(left_out: int, sums: Floats, reading: Reading, place: Placement, sta
         if reading.trusted[i] and i != left_out:
             s = sums[i]
             normal, right = add_mouse(normal, right, reading.weight[i], place.position[i], s[0], s[1])
-    r, linear, angular, by_gyro = vec.at(state.reference, 0), 0.0, 0.0, 0.0
+    r, linear, angular, by_gyro = vec.load(state.reference), 0.0, 0.0, 0.0
     if left_out < mice or number(reading.trusted) < 2:
         linear = 1.0 / (_ACCEL_M_S2 * _WINDOW_S * span) ** 2
         angular = 1.0 / (_ANGULAR_RAD_S2 * _WINDOW_S * span) ** 2
@@ -344,7 +344,7 @@ def find_fault(
 def remember(reading: Reading, dt: float, step: float, rate: float, place: Placement, state: MiceState) -> None:
     """Takes the step into the window. A mouse that is away moves there as the others say: it returns in good order."""
     mice = reading.sound.shape[0]
-    keep, velocity = math.exp(-dt / _WINDOW_S), vec.at(state.velocity, 0)
+    keep, velocity = math.exp(-dt / _WINDOW_S), vec.load(state.velocity)
     for i in range(mice):
         if not reading.sound[i]:
             x, y = at_mouse(velocity, place.position[i])
@@ -376,7 +376,7 @@ def agree(reading: Reading, step: float, rate: float, place: Placement, state: M
         if misfit(x, place.position[i], state.window[i]) > 2.0 * _AGREES / reading.weight[i]:
             state.watch[i, 1] = state.watch[i, 2] = 0.0
             continue
-        vx, vy = at_mouse(vec.at(state.velocity, 0), place.position[i])
+        vx, vy = at_mouse(vec.load(state.velocity), place.position[i])
         state.watch[i, 1] += step
         state.watch[i, 2] += step * math.hypot(vx, vy)
         state.distrusted[i] = state.watch[i, 1] < _AGREED_S or state.watch[i, 2] < _AGREED_M
@@ -548,7 +548,7 @@ def _process(
     time_s: Floats,
     counts: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     place: Placement,
     imu: ImuCalibration,
     p: MiceParameters,

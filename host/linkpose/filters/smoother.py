@@ -21,7 +21,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.filters.joint_inertial import LONGEST_HOLD_S, JointInertialFilter
+from linkpose.filters.inertial.process import LONGEST_HOLD_S
+from linkpose.filters.inertial.state import roll_pitch_deg
+from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig, Vector
 from linkpose.wire.messages import SampleFlags
@@ -59,7 +61,7 @@ class JointInertialSmoother:
         forward.start_from(self._ahead)
         backward.start_from(self._ahead, backwards=True)
         after = backward.process(_reversed(block))[::-1]
-        return _combined(forward.process(block), after, self.j2s_m[1])
+        return _combined(forward.process(block), after, *self.j2s_m)
 
 
 def _reversed_rig(rig: Rig) -> Rig:
@@ -72,7 +74,7 @@ def _reversed(block: Measurements) -> Measurements:
     """The recording as it would have been, had time run backwards; only what the filter reads is turned."""
     at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
     accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
-    accel_bit, gyro_bit = np.uint16(SampleFlags.ACCEL_SATURATED), np.uint16(SampleFlags.GYRO_SATURATED)
+    accel_bit, gyro_bit = np.uint32(SampleFlags.ACCEL_SATURATED), np.uint32(SampleFlags.GYRO_SATURATED)
     flags = block.flags & ~(accel_bit | gyro_bit) | block.flags[at_accel] & accel_bit | block.flags[at_gyro] & gyro_bit
     return replace(
         block,
@@ -97,27 +99,37 @@ def _next_reading(time_s: Floats, values: Floats) -> NDArray[np.int64]:
     return np.where((following < n) & (time_s[ahead] - time_s < LONGEST_HOLD_S), ahead, own)
 
 
-def _combined(forward: Floats, backward: Floats, j2s_covariance: Floats) -> Floats:
-    """The mean of both, weighted by the inverse of their variances; the one that is there where the other is NaN."""
-    only_backward = np.isnan(forward[:, :1])
-    forward = np.where(only_backward, backward, forward)
-    backward = np.where(np.isnan(backward[:, :1]), forward, backward)
+def _combined(forward: Floats, backward: Floats, j2s_m: Floats, j2s_covariance: Floats) -> Floats:
+    """The mean of both, weighted by the inverse variances of the height; one filter's estimate where the other is NaN.
+
+    The heading is that of the forward filter: both headings are relative to their own first sample, and the forward
+    filter already uses the biases of the whole recording.
+    """
+    both = np.flatnonzero(~np.isnan(forward[:, 4]) & ~np.isnan(backward[:, 4]))
+    if len(both):
+        backward[:, 4] += forward[both[0], 4] - backward[both[0], 4]
+    forward = np.where(np.isnan(forward[:, 2:3]), backward, forward)
+    backward = np.where(np.isnan(backward[:, 2:3]), forward, backward)
     before, after = forward[:, 1] ** 2, backward[:, 1] ** 2
     share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
     tilt = share[:, None] * _tilt(forward) + (1 - share[:, None]) * _tilt(backward)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     common = np.einsum("ni,ij,nj->n", tilt, j2s_covariance, tilt)
-    return np.column_stack(
-        [
-            share * forward[:, 0] + (1 - share) * backward[:, 0],
-            np.sqrt(np.maximum(share * before, common)),
-            np.degrees(np.arctan2(tilt[:, 1], tilt[:, 2])),
-            np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
-        ]
-    )
+    height = share * forward[:, 0] + (1 - share) * backward[:, 0]
+    roll, pitch = roll_pitch_deg(tilt)
+    x, y = _horizontal(np.radians(roll), np.radians(pitch), np.radians(forward[:, 4]), j2s_m)
+    std = np.sqrt(np.maximum(share * before, common))
+    return np.column_stack([height, std, roll, pitch, forward[:, 4], forward[:, 5], x, y, height])
+
+
+def _horizontal(roll: Floats, pitch: Floats, yaw: Floats, d: Floats) -> tuple[Floats, Floats]:
+    """x, y (m) of J2S turned by R_z(yaw) R_y(pitch) R_x(roll); angles (N,) in rad."""
+    across = np.cos(roll) * d[1] - np.sin(roll) * d[2]
+    ahead = np.cos(pitch) * d[0] + np.sin(pitch) * (np.sin(roll) * d[1] + np.cos(roll) * d[2])
+    return np.cos(yaw) * ahead - np.sin(yaw) * across, np.sin(yaw) * ahead + np.cos(yaw) * across
 
 
 def _tilt(estimate: Floats) -> Floats:
     """Z (N, 3) from roll and pitch."""
-    roll, pitch = np.radians(estimate[:, 2:]).T
+    roll, pitch = np.radians(estimate[:, 2:4]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])

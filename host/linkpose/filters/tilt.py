@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.compiling import compiled, inlined
+from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
@@ -44,13 +44,12 @@ from linkpose.filters._imu import (
     read_accel,
     read_gyro,
     rotation_variance,
+    unknown_accel,
 )
 from linkpose.filters._vector import Sym, Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-# Unknown lever arm and rhythm of a start in motion: acceleration (m/s²) to a rate of 1 rad/s.
-_START_ACCEL_PER_RATE = 5.0
 _GUESS_RAD2 = 0.005  # a tilt whose variances sum to more is a guess: 3° either way
 _SWING_SAMPLES = 30.0  # that an acceleration lasts
 _LASTING_S = 5.0  # over which the residual is averaged: some swings of a hand, and less than the filter's memory
@@ -131,14 +130,7 @@ class TiltFilter:
         return out
 
 
-@inlined
-def unknown_accel(force: Vec, rate: Vec) -> float:
-    """Square of the acceleration (m/s²)² that a sample of unknown history may hold: 0 at rest."""
-    excess = math.sqrt(vec.dot(force, force)) - GRAVITY
-    return excess * excess + _START_ACCEL_PER_RATE**2 * vec.dot(rate, rate)
-
-
-@inlined
+@inner
 def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
     """Tilt and its covariance from one sample: the direction of the force, with the doubt that a motion brings."""
     variance = (imu.accel_variance + unknown_accel(force, rate)) / GRAVITY**2
@@ -146,7 +138,7 @@ def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
     return tilt, vec.cross_square(tilt, min(variance, 1.0))
 
 
-@inlined
+@inner
 def predict(now: Now, time_s: float, step_s: float, rate: Vec, held_s: float, imu: ImuCalibration) -> Now:
     """(5) over `step_s`, from the rates at its ends, the last of which has been held for `held_s`."""
     half, before = 0.5 * step_s, now.rate
@@ -159,13 +151,13 @@ def predict(now: Now, time_s: float, step_s: float, rate: Vec, held_s: float, im
     return Now(time_s, rate, held_s, tilt, covariance, now.accel, lasting)
 
 
-@inlined
+@inner
 def acceleration(force: Vec, tilt: Vec) -> Vec:
     """a⁺ = s_A − g Z⁺"""
     return (force[0] - GRAVITY * tilt[0], force[1] - GRAVITY * tilt[1], force[2] - GRAVITY * tilt[2])
 
 
-@inlined
+@inner
 def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -> Now:
     """(6), (8): the force less the acceleration that the model (4) expects.
 
@@ -199,7 +191,7 @@ def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -
     return Now(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), accel, now.lasting)
 
 
-@inlined
+@inner
 def hear(now: Now, residual: Vec) -> Now:
     """Takes a sample's residual (in g) into the lasting one."""
     m, share = now.lasting.mean, now.lasting.share
@@ -212,13 +204,13 @@ def hear(now: Now, residual: Vec) -> Now:
     return Now(now.time, now.rate, now.held, now.tilt, now.covariance, now.accel, lasting)
 
 
-@inlined
+@inner
 def hear_accel(now: Now) -> Now:
     """Takes a⁺ as the sample's residual."""
     return hear(now, (now.accel[0] / GRAVITY, now.accel[1] / GRAVITY, now.accel[2] / GRAVITY))
 
 
-@inlined
+@inner
 def height_std(now: Now, j2s: Vec, j2s_std: float) -> float:
     """Standard deviation of the height (m): of the modelled noise, of what lasts in the residual, and of J2S."""
     mean, z = now.lasting.mean, now.tilt
@@ -228,14 +220,14 @@ def height_std(now: Now, j2s: Vec, j2s_std: float) -> float:
     return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0) + j2s_std * j2s_std)
 
 
-@inlined
+@inner
 def step_between(now: float, last: float) -> tuple[bool, float]:
     """Whether time has gone on, and by how much (s), at most LONGEST_GAP_S."""
     step = now - last
     return step > 0.0, min(step, LONGEST_GAP_S)
 
 
-@inlined
+@inner
 def describe(now: Now, delay_s: float, j2s: Vec) -> Vec:
     """Height Zᵀd (15) (m), roll and pitch (°), at the time of the stamp.
 
@@ -243,26 +235,26 @@ def describe(now: Now, delay_s: float, j2s: Vec) -> Vec:
     """
     tilt = now.tilt
     if delay_s > 0.0:
-        tilt = vec.turn_back(vec.plus((0.0, 0.0, 0.0), delay_s, now.rate), tilt)
+        tilt = vec.turn_back(vec.scale(delay_s, now.rate), tilt)
     roll, pitch = vec.roll_pitch(tilt)
     return vec.dot(tilt, j2s), roll, pitch
 
 
-@inlined
+@inner
 def recall(state: TiltState) -> Now:
     """The state in registers."""
     return Now(
         state.time[0],
-        vec.at(state.rate, 0),
+        vec.load(state.rate),
         state.time[1],
-        vec.at(state.tilt, 0),
+        vec.load(state.tilt),
         vec.load_sym(state.covariance),
-        vec.at(state.accel, 0),
-        Lasting(vec.at(state.lasting, 0), state.lasting[3], 0.0),
+        vec.load(state.accel),
+        Lasting(vec.load(state.lasting), state.lasting[3], 0.0),
     )
 
 
-@inlined
+@inner
 def keep(state: TiltState, now: Now, rejected: int) -> None:
     """The registers back into the state, and more rejected samples."""
     state.time[0], state.time[1] = now.time, now.held
@@ -277,7 +269,7 @@ def keep(state: TiltState, now: Now, rejected: int) -> None:
     state.rejected[0] += rejected
 
 
-@inlined
+@inner
 def advance(
     now: Now, time_s: float, raw_accel: Vec, raw_gyro: Vec, flags: int, imu: ImuCalibration
 ) -> tuple[Now, bool, Vec, bool]:
@@ -304,7 +296,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     imu: ImuCalibration,
     parameters: TiltParameters,
     j2s: Vec,

@@ -1,1 +1,1 @@
-"""Putting the firmware on the board: its image, its build with PlatformIO, and the upload through the bootloader."""
+"""Flashing the board: firmware images, the build with PlatformIO, and the upload through the bootloader."""

@@ -1,4 +1,4 @@
-"""Building the firmware with PlatformIO, from a checkout or from the sources that an installed package brings along."""
+"""Building the firmware with PlatformIO, from a checkout or from the sources in an installed package."""
 
 from __future__ import annotations
 
@@ -16,37 +16,36 @@ from linkpose.errors import LinkposeError
 from linkpose.flashing.image import Image, read_image
 from linkpose.flashing.process import follow
 
-# PlatformIO says the one or the other when its registry is out of reach.
+# What PlatformIO prints when its registry cannot be reached.
 UNREACHABLE = re.compile(
     r"HTTPClientError|InternetConnectionError|not connected to the Internet|Could not install package|"
     r"Could not find the package|PackageException|Max retries exceeded|Connection(Error| refused| reset)|timed out|"
-    r"name resolution",
+    r"name resolution|UnknownPackageError",
     re.IGNORECASE,
-)
-TOOLCHAIN_UNREACHABLE = (
-    "PlatformIO cannot download its toolchain; connect to the internet, or type `linkpose flash --prebuilt` to upload "
-    "the firmware that comes ready built"
 )
 
 _PACKAGE = Path(__file__).parents[1]
 
 
+class CannotBuild(LinkposeError):
+    """PlatformIO, its toolchain or the sources are missing: no build is possible here. The prebuilt image helps."""
+
+
 @dataclass(frozen=True, slots=True)
 class Project:
-    """The firmware as PlatformIO builds it."""
+    """The firmware as a PlatformIO project."""
 
-    folder: Path  # holds platformio.ini and firmware/
-    environment_name: str  # of platformio.ini
-    variables: dict[str, str]  # that PlatformIO runs with
+    folder: Path  # contains platformio.ini and firmware/
+    environment_name: str  # in platformio.ini
+    variables: dict[str, str]  # the environment variables of PlatformIO
 
-    def command(self, *arguments: str) -> list[str]:
+    def command(self) -> list[str]:
         """`pio run` of this project."""
-        run = [sys.executable, "-m", "platformio", "run", "-d", str(self.folder), "-e", self.environment_name]
-        return [*run, *arguments]
+        return [sys.executable, "-m", "platformio", "run", "-d", str(self.folder), "-e", self.environment_name]
 
     @property
     def hex_path(self) -> Path:
-        """What a build leaves."""
+        """The result of a build."""
         workspace = Path(self.variables.get("PLATFORMIO_WORKSPACE_DIR", self.folder / ".pio"))
         build = Path(self.variables.get("PLATFORMIO_BUILD_DIR", workspace / "build"))
         return build / self.environment_name / "firmware.hex"
@@ -54,15 +53,13 @@ class Project:
 
 @contextlib.contextmanager
 def project(environment_name: str) -> Iterator[Project]:
-    """The firmware's project. Raises LinkposeError when its sources or PlatformIO are missing.
+    """The firmware's project. Raises CannotBuild when PlatformIO or the sources are missing.
 
-    A checkout builds in its own `.pio`. An installed package, which may be read-only, builds in a folder that is gone
-    when the context is left.
+    A checkout builds in its own `.pio`. An installed package, which may be read-only, builds in a temporary folder that
+    is removed at the end of the context.
     """
     if importlib.util.find_spec("platformio") is None:
-        raise LinkposeError(
-            "PlatformIO is not installed; type `pip install platformio`, or `linkpose flash --prebuilt` to do without"
-        )
+        raise CannotBuild("PlatformIO is not installed (`pip install platformio`)")
     variables = {
         **os.environ,
         "PLATFORMIO_NO_ANSI": "true",
@@ -77,29 +74,30 @@ def project(environment_name: str) -> Iterator[Project]:
     elif (checkout / "platformio.ini").is_file():
         yield Project(checkout, environment_name, variables)
     else:
-        raise LinkposeError(
-            "the firmware's sources are missing from this installation; type `pip install --force-reinstall linkpose`, "
-            "or `linkpose flash --prebuilt` to do without"
-        )
+        raise CannotBuild("the firmware's sources are missing from this installation")
 
 
-def build(firmware: Project, listen: Callable[[str], None]) -> Image:
-    """Builds the firmware; its image. Raises LinkposeError. `listen` gets what PlatformIO says, as it comes."""
+def build(firmware: Project, show: Callable[[str], None]) -> Image:
+    """Build the firmware and return its image. `show` receives PlatformIO's output as it comes.
 
-    def go_on(said: str) -> bool:
-        listen(said)
-        return True
-
-    status, output = follow(firmware.command(), firmware.variables, go_on)
+    Raises CannotBuild when PlatformIO cannot download its toolchain, and LinkposeError when the sources do not compile.
+    """
+    try:
+        status, output = follow(firmware.command(), firmware.variables, show)
+    except OSError as error:
+        raise CannotBuild(f"PlatformIO does not run ({error.strerror})") from error
     if status != 0:
-        raise LinkposeError(_why_not_built(output))
+        raise _why_not_built(output)
     return read_image(firmware.hex_path)
 
 
-def _why_not_built(output: str) -> str:
+def _why_not_built(output: str) -> LinkposeError:
     if "Compiling" not in output and UNREACHABLE.search(output):
-        return f"the firmware was not built: {TOOLCHAIN_UNREACHABLE}"
+        return CannotBuild("PlatformIO cannot download its toolchain (no internet connection?)")
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if re.search(r"\berror\b|undefined reference", line, re.IGNORECASE)]
-    said = (errors or lines[-1:] or ["no reason"])[0]
-    return f"PlatformIO did not build the firmware ({said}); see all of it with -v, or type `linkpose flash --prebuilt`"
+    reason = (errors or lines[-1:] or ["no reason"])[0]
+    return LinkposeError(
+        f"PlatformIO did not build the firmware ({reason}). Add -v to see all of its output, or run `linkpose flash "
+        "--prebuilt`"
+    )

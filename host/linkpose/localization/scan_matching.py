@@ -69,8 +69,7 @@ def beam_ends(scan: Scan) -> Floats:
     echo = echo[:: max(1, math.ceil(len(echo) / MOST_BEAMS))]
     angles = scan.angles_rad[echo] + scan.mount[2]
     ranges = scan.ranges_m[echo]
-    weights = 1.0 / (1.0 + (growth * ranges / BEAM_STD_M) ** 2)
-    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles), weights))
+    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles)))
 
 
 class ScanMatcher:

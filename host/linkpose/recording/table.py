@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotRead, FileFormatError
 from linkpose.sensors.measurements import Floats
 
 
@@ -29,36 +29,38 @@ class Table:
         return len(next(iter(self.columns.values())))
 
     def require(self, *names: str) -> None:
-        """Raises LinkposeError unless the table has all these columns."""
+        """Raises FileFormatError unless the table has all these columns."""
         missing = [name for name in names if name not in self.columns]
         if missing:
-            raise LinkposeError(f"{self.path} has no column {', '.join(missing)}; it has {', '.join(self.columns)}")
+            raise FileFormatError(
+                self.path, f"{self.path} has no column {', '.join(missing)}; it has {', '.join(self.columns)}"
+            )
 
 
 def read_bytes(path: Path) -> bytes:
-    """The file's bytes; raises LinkposeError where it cannot be read."""
+    """The file's bytes; raises CannotRead where it cannot be read."""
     try:
         return path.read_bytes()
     except OSError as error:
-        raise LinkposeError(f"cannot read {path}: {error.strerror}") from error
+        raise CannotRead(path, error.strerror) from error
 
 
 def read_table(path: Path, kind: str | None = None) -> Table:
     """Reads a linkpose CSV (of one kind, when `kind` names it) or a plain CSV with a header of names.
 
-    An incomplete last line of linkpose's own, as a killed program leaves it, is left out. Raises LinkposeError naming
+    An incomplete last line of linkpose's own, as a killed program leaves it, is left out. Raises FileFormatError naming
     the file and the line for whatever else is not a number, a row of another length, or a time that runs backwards.
     """
     data = read_bytes(path).removeprefix(b"\xef\xbb\xbf")  # as spreadsheets save
     lines_before, offset, comments = _head_lines(data)
     found = _kind(path, comments)
     if kind is not None and found != kind:
-        raise LinkposeError(
-            f"{path} is no linkpose {kind}: its first line is {_excerpt(data)!r}, not '# linkpose {kind} 1'"
+        raise FileFormatError(
+            path, f"{path} is no linkpose {kind}: its first line is {_excerpt(data)!r}, not '# linkpose {kind} 1'"
         )
     header_end = data.find(b"\n", offset)
     if header_end < 0:
-        raise LinkposeError(f"{path} ends before its first row; it holds no data")
+        raise FileFormatError(path, f"{path} ends before its first row; it holds no data")
     names = [name.strip() for name in data[offset:header_end].decode("utf-8", "replace").strip().split(",")]
     _check_names(path, names, lines_before + 1)
     if not found and not data.endswith(b"\n"):  # typed by hand, not cut by a kill
@@ -73,12 +75,14 @@ def read_table(path: Path, kind: str | None = None) -> Table:
 
 
 def check_times(path: Path, time_s: Floats, first_line: int) -> None:
-    """Raises LinkposeError at the first stamp that is missing or earlier than the one before it."""
+    """Raises FileFormatError at the first stamp that is missing or earlier than the one before it."""
     bad = np.flatnonzero(~(np.diff(time_s, prepend=-np.inf) >= 0))
     if len(bad):
         row = int(bad[0])
         what = "is missing" if np.isnan(time_s[row]) else f"runs backwards ({time_s[row]:.6f} s)"
-        raise LinkposeError(f"{path}, line {first_line + row}: time_s {what}; remove the rows before or after it")
+        raise FileFormatError(
+            path, f"{path}, line {first_line + row}: time_s {what}; remove the rows before or after it"
+        )
 
 
 def _head_lines(data: bytes) -> tuple[int, int, list[str]]:
@@ -93,14 +97,15 @@ def _head_lines(data: bytes) -> tuple[int, int, list[str]]:
 
 
 def _kind(path: Path, comments: list[str]) -> str:
-    """What the first line says that the file is; raises LinkposeError for another version of the format."""
+    """What the first line says that the file is; raises FileFormatError for another version of the format."""
     words = comments[0].split() if comments else []
     if len(words) != 3 or words[0] != "linkpose":
         return ""
     if words[2] != "1":
-        raise LinkposeError(
+        raise FileFormatError(
+            path,
             f"{path} is a linkpose {words[1]} of version {words[2][:20]}, and this program reads version 1: "
-            "read it with the linkpose that wrote it, or a newer one"
+            "read it with the linkpose that wrote it, or a newer one",
         )
     return words[1]
 
@@ -112,9 +117,11 @@ def _excerpt(data: bytes) -> str:
 def _check_names(path: Path, names: list[str], line: int) -> None:
     twice = {name for name in names if names.count(name) > 1}
     if twice:
-        raise LinkposeError(f"{path}, line {line}: column {', '.join(sorted(twice))} stands twice")
+        raise FileFormatError(path, f"{path}, line {line}: column {', '.join(sorted(twice))} stands twice")
     if "" in names or all(_is_number(name) for name in names):
-        raise LinkposeError(f"{path}, line {line}: expected the names of the columns, found {','.join(names)[:60]!r}")
+        raise FileFormatError(
+            path, f"{path}, line {line}: expected the names of the columns, found {','.join(names)[:60]!r}"
+        )
 
 
 def _is_number(text: str) -> bool:
@@ -144,9 +151,9 @@ def _json(path: Path, text: str, line: int) -> dict[str, Any]:
     try:
         content = json.loads(text)
     except ValueError as error:
-        raise LinkposeError(f"{path}, line {line}: the metadata is not JSON: {error}") from error
+        raise FileFormatError(path, f"{path}, line {line}: the metadata is not JSON: {error}", line) from error
     if not isinstance(content, dict):
-        raise LinkposeError(f"{path}, line {line}: the metadata is not a JSON object")
+        raise FileFormatError(path, f"{path}, line {line}: the metadata is not a JSON object")
     return content
 
 
@@ -155,7 +162,7 @@ def _numbers(path: Path, body: bytes, width: int, first_line: int) -> Floats:
     if b"\r" in body:
         body = body.replace(b"\r\n", b"\n")
     if not body:
-        raise LinkposeError(f"{path} has a header but no row; nothing was recorded")
+        raise FileFormatError(path, f"{path} has a header but no row; nothing was recorded")
     raw = np.frombuffer(body, np.uint8)
     ends = np.flatnonzero(raw == ord("\n"))
     commas = np.flatnonzero(raw == ord(","))
@@ -163,14 +170,14 @@ def _numbers(path: Path, body: bytes, width: int, first_line: int) -> Floats:
     wrong = np.flatnonzero(per_row != width)
     if len(wrong):
         row = int(wrong[0])
-        raise LinkposeError(
+        raise FileFormatError(
+            path,
             f"{path}, line {first_line + row}: {per_row[row]} fields where the header has {width}; "
-            "the file was cut or edited: remove that row"
+            "the file was cut or edited: remove that row",
         )
     values = _parse(body, width * len(ends))
     if values is None:
-        _name_first_word(path, body, first_line)
-    assert values is not None
+        raise _first_word_error(path, body, first_line)
     return values.reshape(len(ends), width)
 
 
@@ -189,11 +196,12 @@ def _parse(body: bytes, count: int) -> Floats | None:
     return values if len(values) == count else None
 
 
-def _name_first_word(path: Path, body: bytes, first_line: int) -> None:
-    """Raises LinkposeError for the first field that is no number."""
+def _first_word_error(path: Path, body: bytes, first_line: int) -> FileFormatError:
+    """The error that names the first field that is not a number."""
     for number, line in enumerate(body.decode("utf-8", "replace").split("\n"), first_line):
         for text in line.split(","):
             if text.strip() and not _is_number(text):
                 word = text.strip()[:30]
-                raise LinkposeError(f"{path}, line {number}: {word!r} is not a number; correct or remove that row")
-    raise LinkposeError(f"{path}: a field is not a number")
+                text = f"{path}, line {number}: {word!r} is not a number; correct or remove that row"
+                return FileFormatError(path, text, number)
+    return FileFormatError(path, f"{path}: a field is not a number")

@@ -34,6 +34,16 @@ class Calibration(NamedTuple):
     mc: int
     md: int
 
+    @staticmethod
+    def of(words: tuple[int, ...]) -> Calibration:
+        """From HELLO's `baro_words`: unsigned, in the order of the EEPROM."""
+        signed = [word - 0x10000 if word & 0x8000 and at not in (3, 4, 5) else word for at, word in enumerate(words)]
+        return Calibration(*signed[:11])
+
+    def words(self) -> tuple[int, ...]:
+        """HELLO's `baro_words`."""
+        return (*(word & 0xFFFF for word in self), 0)
+
 
 def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int) -> tuple[Integers, Integers]:
     """Temperature (0.1 degC) and pressure (Pa) from UT and UP; integers, or int64 arrays of one shape.
@@ -55,6 +65,17 @@ def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int
     p = b7 * (1 + fits) // b4 * (2 - fits)
     x1 = (p >> 8) * (p >> 8) * 3038 >> 16
     return temperature, p + ((x1 + (-7357 * p >> 16) + 3791) >> 4)
+
+
+def is_impossible(ut: NDArray[np.int64], words: Calibration) -> NDArray[np.bool_]:
+    """Where (N,) a temperature reading makes a divisor of `compensate` zero: no BMP180 gives it."""
+    import numpy as np
+
+    x1 = (ut - words.ac6) * words.ac5 >> 15
+    zero = x1 + words.md == 0
+    b6 = x1 + _quotient(words.mc << 11, np.where(zero, 1, x1 + words.md)) - 4000
+    x3 = ((words.ac3 * b6 >> 13) + (words.b1 * (b6 * b6 >> 12) >> 16) + 2) >> 2
+    return np.asarray(zero | (words.ac4 * (x3 + 32768) >> 15 == 0))
 
 
 def _quotient(numerator: int, denominator: Integers) -> Integers:

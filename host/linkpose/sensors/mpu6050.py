@@ -1,17 +1,10 @@
-"""MPU-6050: raw counts to SI units. The scales are the wire schema's; the ranges in force come from HELLO."""
+"""MPU-6050 and its successors: raw counts to SI units. Scales by the wire schema and the family, ranges by HELLO."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
 
-from linkpose.wire.messages import SCALES, SelfTestResult
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Number = TypeVar("Number", float, NDArray[np.float64])
+from linkpose.wire.messages import SCALES, DeviceFamily, SelfTestResult
 
 STANDARD_GRAVITY = 9.80665  # m/s² per g, by definition
 
@@ -31,34 +24,58 @@ def gyro_scale(gyro_range_deg_s: int) -> float:
     return math.radians(SCALES["SAMPLE.gyro_x"].scale * gyro_range_deg_s)
 
 
-def temperature(count: Number) -> Number:
-    """Die temperature in degC of a count, or of an array of them (register map, 4.18)."""
-    scale = SCALES["SAMPLE.imu_temp"]
-    return count * scale.scale + scale.offset
+# Die temperature by family: degC per count, degC at 0 counts. Sources: RM-MPU-6000A 4.18; PS-MPU-6500A 3.4.2
+# (333.87 LSB/degC, 0 at 21 degC); DS ICM-20602, ICM-20608, ICM-20689 (326.8 LSB/degC, 0 at 25 degC).
+TEMPERATURE = {
+    DeviceFamily.MPU6050: (1 / 340, 36.53),
+    DeviceFamily.MPU6500: (1 / 333.87, 21.0),
+    DeviceFamily.ICM20600: (1 / 326.8, 25.0),
+}
 
 
-# Of the readings through the low-pass filter at DLPF_CFG 0 to 6, by the slower of the two sensors; the other comes a
-# millisecond sooner at the most. Source: register map, 4.3, "Configuration".
+def temperature_scale(family: int) -> tuple[float, float]:
+    """Die temperature: degC per count and degC at 0 counts; NaN for a family whose formula is unknown."""
+    return TEMPERATURE.get(DeviceFamily(family), (0.0, math.nan))
+
+
+# Group delay through the low-pass filter at DLPF_CFG 0 to 6, the slower of the two sensors; the other is at most 1 ms
+# faster. Source: RM-MPU-6000A 4.3 "Configuration". The successors' filters are within 1 ms of it (PS-MPU-6500A 4.2).
 DLPF_DELAY_S = (0.00098, 0.0020, 0.0030, 0.0049, 0.0085, 0.0138, 0.0190)
 
 
-SELF_TEST_LIMIT = 0.14  # of the factory's response (data sheet, 6.1 and 6.2)
+SELF_TEST_LIMIT = 0.14  # deviation from the factory's response, MPU-6050 (data sheet, 6.1 and 6.2)
+SELF_TEST_LIMIT_6500 = 0.5  # the successors (AN-MPU-9250A-03: response within 50 to 150 % of the factory's)
+
+
+def self_test_limit(result: SelfTestResult) -> float:
+    """Largest permitted magnitude of `self_test_deviation` for the family that was tested."""
+    return SELF_TEST_LIMIT if result.family == DeviceFamily.MPU6050 else SELF_TEST_LIMIT_6500
 
 
 def self_test_deviation(result: SelfTestResult) -> dict[str, float | None]:
-    """How far each axis's answer to the self-test is from the factory's, as a share of that; None without a factory's.
+    """Relative deviation of each axis's self-test response from the factory's; None if no factory response is stored.
 
-    Source: register map, 4.1, "Self-test registers"; readings at 8 g and 250 deg/s.
+    Sources: MPU-6050: RM-MPU-6000A 4.1, readings at 8 g and 250 deg/s. Successors: AN-MPU-9250A-03, factory response
+    2620 · 1.01^(code − 1) counts at 2 g and 250 deg/s.
     """
-    fine = result.trim_a
     deviations: dict[str, float | None] = {}
     for at, axis in enumerate("xyz"):
-        trim = getattr(result, f"trim_{axis}")
-        accel_code = (trim >> 3 & 0x1C) | (fine >> (4 - 2 * at) & 3)
-        gyro_code = trim & 0x1F
-        accel_factory = 4096 * 0.34 * (0.92 / 0.34) ** ((accel_code - 1) / 30)
-        gyro_factory = 25 * 131 * 1.046 ** (gyro_code - 1) * (-1 if axis == "y" else 1)
-        for sensor, code, factory in (("accel", accel_code, accel_factory), ("gyro", gyro_code, gyro_factory)):
+        for sensor, factory in zip(("accel", "gyro"), _factory_responses(result, at), strict=True):
             answer = getattr(result, f"excited_{sensor}_{axis}") - getattr(result, f"plain_{sensor}_{axis}")
-            deviations[f"{sensor}_{axis}"] = answer / factory - 1 if code else None
+            deviations[f"{sensor}_{axis}"] = answer / factory - 1 if factory else None
     return deviations
+
+
+def _factory_responses(result: SelfTestResult, axis: int) -> tuple[float, float]:
+    """The factory's response (counts) of the accelerometer and the gyro of an axis, 0 to 2; 0: none is stored."""
+    trims = (result.trim_1, result.trim_2, result.trim_3, result.trim_4, result.trim_5, result.trim_6)
+    if result.family == DeviceFamily.MPU6050:
+        accel_code = (trims[axis] >> 3 & 0x1C) | (trims[3] >> (4 - 2 * axis) & 3)
+        gyro_code = trims[axis] & 0x1F
+        accel = 4096 * 0.34 * (0.92 / 0.34) ** ((accel_code - 1) / 30)
+        gyro = 25 * 131 * 1.046 ** (gyro_code - 1) * (-1 if axis == 1 else 1)
+    else:
+        gyro_code, accel_code = trims[axis], trims[3 + axis]
+        accel = 2620 * 1.01 ** (accel_code - 1) * 2 / 8  # the readings are at 8 g
+        gyro = 2620 * 1.01 ** (gyro_code - 1)
+    return accel if accel_code else 0.0, gyro if gyro_code else 0.0

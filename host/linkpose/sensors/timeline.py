@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.sensors.conversion import GAP_BEFORE, Placed
 from linkpose.wire.messages import Sample
 
 _SEQ_WRAP = 1 << 16
@@ -53,35 +53,51 @@ class Gap:
         }
 
 
-class Placed(NamedTuple):
-    """A sample's place: seconds since the first, ticks since START, and its flags with `gap_before`."""
-
-    time_s: float
-    seq: int
-    flags: int
-
-
 class Timeline:
     """Places the samples of one recording one after another, over wraps, losses and restarts of the board."""
 
     def __init__(self, sample_rate_hz: float, end_s: float = math.inf) -> None:
-        """Samples from `end_s` on are not taken, nor counted in any way."""
+        """Samples from `end_s` on are not accepted. Those missing before it are counted as lost."""
         self._period_s = 1.0 / sample_rate_hz
-        self._end_s = end_s - self._period_s / 2
-        self._start_s = 0.0  # the host's time of the first sample
+        self._end_s = end_s
+        self.start_s = 0.0  # the host's time of the first sample
         self._last: Placed | None = None
         self._wire_seq = 0  # the last sample's seq as it came
         self._cause = "link"
         self._restarted = False
-        self.is_over = False  # the end has come
+        self.is_over = False  # the end is reached
+        self.missing_at_end = 0  # samples between the last one and the end, a part of `lost`
+        self.end_gap_s = 0.0
         self.samples = 0
         self.lost = 0
         self.gaps: list[Gap] = []
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the end of the last one's interval."""
+        """From the first sample to the end of the last one's interval, or to the end if samples are missing there."""
+        if self.missing_at_end:
+            return self._end_s
         return self._last.time_s + self._period_s if self._last else 0.0
+
+    @property
+    def _last_due_s(self) -> float:
+        """A sample from this time on lies behind the end."""
+        return self._end_s - self._period_s / 2
+
+    def end_if_past(self, time_s: float) -> None:
+        """End the timeline when `time_s`, in seconds since the first sample, is behind the end."""
+        if not self.is_over and time_s >= self._end_s:
+            self._end()
+
+    def _end(self) -> None:
+        """Count what is missing between the last sample and the end."""
+        self.is_over = True
+        last_s = self._last.time_s if self._last else -self._period_s
+        missing = round((self._end_s - last_s) / self._period_s) - 1
+        if missing > 0:
+            self.missing_at_end, self.end_gap_s = missing, self._end_s - last_s - self._period_s
+            self.lost += missing
+            self.gaps.append(Gap(last_s, self._end_s - last_s, missing, self._cause))
 
     def interrupted(self, cause: str) -> None:
         """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters start anew."""
@@ -92,16 +108,20 @@ class Timeline:
 
         None for one that came twice, and for one from the end on.
         """
+        if self.is_over:
+            return None
         host_s = clock.host_time(clock.unwrap(sample.t_us, arrived_s))
         last = self._last
         if last is None:
-            self._start_s = host_s
+            self.start_s = host_s
             time_s, seq, missing = 0.0, sample.seq, sample.seq  # START set the count to 0
         else:
-            time_s = max(host_s - self._start_s, last.time_s)
+            time_s = max(host_s - self.start_s, last.time_s)
             ticks = self._ticks(sample.seq, (time_s - last.time_s) / self._period_s)
-            if ticks == 0 or time_s >= self._end_s:
-                self.is_over = time_s >= self._end_s
+            if time_s >= self._last_due_s:
+                self._end()
+                return None
+            if ticks == 0:
                 return None
             seq, missing = last.seq + ticks, ticks - 1
         marked = missing or (self._restarted and last)
@@ -112,7 +132,7 @@ class Timeline:
         self._restarted, self._cause, self._wire_seq = False, "link", sample.seq
         self._last = Placed(time_s, seq, sample.flags | (GAP_BEFORE if marked else 0))
         self.samples += 1
-        self.is_over = time_s + self._period_s >= self._end_s
+        self.is_over = time_s + self._period_s >= self._last_due_s
         return self._last
 
     def _ticks(self, seq: int, elapsed: float) -> int:

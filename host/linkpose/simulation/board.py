@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol
 
+from linkpose.sensors.devices import DEVICES, Sensors
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
@@ -16,8 +17,12 @@ from linkpose.wire.messages import (
     Ack,
     Command,
     Configure,
+    DeviceFamily,
+    DeviceKind,
+    DeviceState,
     GetInfo,
     Hello,
+    HelloDevice,
     HelloMouse,
     Message,
     Nak,
@@ -27,17 +32,24 @@ from linkpose.wire.messages import (
     ResetCause,
     ResetMice,
     Sample,
+    Sections,
     SelfTest,
     SelfTestResult,
-    Sensors,
     Start,
     Status,
+    StatusDevice,
     StatusMouse,
     Stop,
 )
 
 DEFAULTS = Configure(
-    sample_rate_hz=100, accel_range_g=8, gyro_range_deg_s=1000, dlpf=3, baro_oversampling=1, mouse_counts_per_mm=8
+    sample_rate_hz=100,
+    accel_range_g=8,
+    gyro_range_deg_s=1000,
+    dlpf=3,
+    baro_oversampling=1,
+    mouse_counts_per_mm=8,
+    i2c_khz=400,
 )
 
 _ALLOWED = (
@@ -46,6 +58,7 @@ _ALLOWED = (
     (NakReason.DLPF_OUT_OF_RANGE, "dlpf", range(7)),
     (NakReason.BARO_OVERSAMPLING_OUT_OF_RANGE, "baro_oversampling", range(4)),
     (NakReason.MOUSE_RESOLUTION_OUT_OF_RANGE, "mouse_counts_per_mm", (1, 2, 4, 8)),
+    (NakReason.I2C_CLOCK_OUT_OF_RANGE, "i2c_khz", (100, 400)),
 )
 _TIMER_HZ = 2_000_000  # the firmware's tick is a whole number of timer counts
 
@@ -124,8 +137,8 @@ class SimulatedBoard:
                 return [Ack(Command.STOP)]
             case Configure():
                 return [self._configure(message)]
-            case SelfTest():
-                return self._self_test()
+            case SelfTest(device):
+                return self._self_test(device)
             case ResetMice(ports):
                 no_such_port = Nak(Command.RESET_MICE, NakReason.MOUSE_PORT_OUT_OF_RANGE)
                 return [no_such_port if ports >> len(self._run.hello_mice) else Ack(Command.RESET_MICE)]
@@ -149,21 +162,24 @@ class SimulatedBoard:
     def _status(self, now_us: int) -> Status:
         """A board whose every counter is 0: a simulated one has no bus, no stack and no load."""
         zero = dict.fromkeys(Status._fields, 0)
-        mice = tuple(StatusMouse(0, 0, 0) for _ in self._run.hello_mice)
-        told = {"t_us": now_us & 0xFFFFFFFF, "ticks": self._tick, "mice": mice}
-        return Status(**(zero | told))  # type: ignore[arg-type]
+        mice = tuple(StatusMouse(0, 0, 0, 0) for _ in self._run.hello_mice)
+        devices = tuple(StatusDevice(0, 0, 0, 0, 0) for _ in DEVICES)
+        known = {"t_us": now_us & 0xFFFFFFFF, "ticks": self._tick, "devices": devices, "mice": mice}
+        return Status(**(zero | known))  # type: ignore[arg-type]
 
-    def _self_test(self) -> list[Message]:
+    def _self_test(self, device: int) -> list[Message]:
         """A sound sensor at rest: each axis answers the self-test with just its factory trim (register map, 4.1)."""
         if self._samples is not None:
             return [Nak(Command.SELF_TEST, NakReason.STREAMING)]
+        if device > 1 or not self._run.hello_sensors & DEVICES[device]:
+            return [Nak(Command.SELF_TEST, NakReason.SENSOR_ABSENT)]
         code = 16
         gyro, accel = round(25 * 131 * 1.046 ** (code - 1)), round(4096 * 0.34 * (0.92 / 0.34) ** ((code - 1) / 30))
         packed = code | (code >> 2 & 7) << 5  # low bits of the gyro's code, high bits of the accelerometer's
-        trims = (packed, packed, packed, (code & 3) * 0b010101)
+        trims = (packed, packed, packed, (code & 3) * 0b010101, 0, 0)
         plain = (0, 0, 4096, 0, 0, 0)
         excited = (accel, accel, 4096 + accel, gyro, -gyro, gyro)
-        return [Ack(Command.SELF_TEST), SelfTestResult(*trims, *plain, *excited, baro_id=0x55)]
+        return [Ack(Command.SELF_TEST), SelfTestResult(device, DeviceFamily.MPU6050, *trims, *plain, *excited)]
 
 
 def hello(
@@ -183,14 +199,26 @@ def hello(
         firmware_patch=patch,
         source_revision=0,
         reset_cause=int(ResetCause.POWER_ON),
+        hung_at=0xFFFF,
         streaming=int(streaming),
-        sample_rate_hz=settings.sample_rate_hz,
-        sensors=int(sensors),
-        imu_id=0x68,
-        accel_range_g=settings.accel_range_g,
-        gyro_range_deg_s=settings.gyro_range_deg_s,
-        dlpf=settings.dlpf,
-        baro_oversampling=settings.baro_oversampling,
-        **DATASHEET_WORDS._asdict(),
+        sections=_sections(sensors, len(mice)),
+        **settings._asdict(),
+        devices=tuple(device if sensors & bit else device._replace(**_ABSENT) for bit, device in _DEVICES),
+        baro_words=DATASHEET_WORDS.words() if sensors & Sensors.BMP180 else (0,) * 12,
         mice=mice,
     )
+
+
+_ABSENT = {"id": 0, "family": DeviceFamily.NONE, "state": DeviceState.ABSENT}
+_DEVICES = (
+    (Sensors.MPU6050, HelloDevice(DeviceKind.IMU, 0x68, 0x68, DeviceFamily.MPU6050, DeviceState.OK)),
+    (Sensors.IMU2, HelloDevice(DeviceKind.IMU, 0x69, 0x68, DeviceFamily.MPU6050, DeviceState.OK)),
+    (Sensors.BMP180, HelloDevice(DeviceKind.BAROMETER, 0x77, 0x55, DeviceFamily.BMP180, DeviceState.OK)),
+    (Sensors.MAG, HelloDevice(DeviceKind.MAGNETOMETER, 0x0D, 0xFF, DeviceFamily.QMC5883L, DeviceState.OK)),
+)
+
+
+def _sections(sensors: Sensors, mice: int) -> int:
+    """HELLO's field `sections`."""
+    bits = zip(DEVICES, (Sections.IMU, Sections.IMU2, Sections.BARO, Sections.MAG), strict=True)
+    return sum(section for sensor, section in bits if sensors & sensor) | mice << 4

@@ -11,8 +11,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.sensors.mpu6050 import STANDARD_GRAVITY, accel_scale, gyro_scale
-from linkpose.wire.messages import SCALES
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY, TEMPERATURE, accel_scale, gyro_scale
+from linkpose.wire.messages import DeviceFamily
 
 Floats = NDArray[np.float64]
 
@@ -85,8 +85,8 @@ def gyro_counts(gyro_rad_s: Floats, range_deg_s: int) -> NDArray[np.int16]:
 
 
 def temperature_counts(temp_degC: Floats) -> NDArray[np.int16]:
-    scale = SCALES["SAMPLE.imu_temp"]
-    return to_counts(temp_degC - scale.offset, scale.scale)
+    scale, offset = TEMPERATURE[DeviceFamily.MPU6050]
+    return to_counts(temp_degC - offset, scale)
 
 
 def to_counts(value: Floats, scale: float) -> NDArray[np.int16]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.errors import LinkposeError
+
 Floats = NDArray[np.float64]
 
 STILL_S = 2.0  # rest at either end
@@ -21,15 +23,26 @@ _TONES = 5  # harmonics to an axis
 _BAND_HZ = np.array([[0.30, 0.75], [0.30, 0.75], [0.20, 0.60]])
 _WIDEST_RAD = 0.5  # rms of a swing
 _SHARE = np.array([1.0, 1.0, 0.8])
+SHORTEST_REST_S = 2.5  # on a side: `calibrate imu` leaves out half a second at either end of a rest
 
 
 @dataclass(frozen=True, slots=True)
 class Kinematics:
-    """Tilt and angular motion at N instants."""
+    """Attitude and angular motion at N instants."""
 
+    yaw_rad: Floats  # (N,) about n's Z
     tilt: Floats  # (N, 3) n's Z axis seen in s
     rate_rad_s: Floats  # (N, 3) angular rate, in s
     rate_derivative_rad_s2: Floats  # (N, 3) angular acceleration, in s
+
+    def horizontal(self, j2s_m: Floats) -> Floats:
+        """x and y (N, 2), m, in n, of the point at `j2s_m` from the joint: those rows of R_ns d."""
+        sine, cosine = -self.tilt[:, 0], np.hypot(self.tilt[:, 1], self.tilt[:, 2])  # of the pitch
+        roll = np.arctan2(self.tilt[:, 1], self.tilt[:, 2])
+        aside = np.sin(roll) * j2s_m[1] + np.cos(roll) * j2s_m[2]
+        ahead, across = cosine * j2s_m[0] + sine * aside, np.cos(roll) * j2s_m[1] - np.sin(roll) * j2s_m[2]
+        cos_yaw, sin_yaw = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.column_stack([cos_yaw * ahead - sin_yaw * across, sin_yaw * ahead + cos_yaw * across])
 
     def acceleration(self, j2s_m: Floats) -> Floats:
         """Linear acceleration (N, 3), m/s², in s, of the point at `j2s_m` from the fixed joint: ω̇×d + ω×(ω×d)."""
@@ -99,6 +112,34 @@ class HandMotion:
         return np.stack([product, first, second])
 
 
+class SixSides:
+    """A sensor laid on each of its six sides in turn, with a rest on each and a smooth turn between them.
+
+    The rests are as `calibrate imu` needs them. The joint stays the centre of the turns.
+    """
+
+    _ROLL = np.radians([0.0, 90.0, 180.0, 180.0, 180.0, 270.0])
+    _PITCH = np.radians([0.0, 0.0, 0.0, 88.0, -88.0, 0.0])  # at 90° roll and yaw are one
+    _TURNING = 0.35  # share of a side's time that the turn to it takes
+
+    def __init__(self, duration_s: float) -> None:
+        """Raises LinkposeError where the sides have no second of rest each."""
+        self._slot_s = duration_s / len(self._ROLL)
+        if (1 - self._TURNING) * self._slot_s < SHORTEST_REST_S:
+            shortest = len(self._ROLL) * SHORTEST_REST_S / (1 - self._TURNING)
+            raise LinkposeError(f"six rests do not fit {duration_s:g} s: simulate {shortest:.0f} s or more")
+
+    def at(self, time_s: Floats) -> Kinematics:
+        """Kinematics at `time_s` (N,), s; after the end the sensor stays on its last side."""
+        angle = np.zeros((3, 3, len(time_s)))  # derivative order, axis, instant
+        for axis, sides in enumerate((self._ROLL, self._PITCH)):
+            angle[0, axis] = sides[0]
+            for side in range(1, len(sides)):
+                start = side * self._slot_s
+                angle[:, axis] += (sides[side] - sides[side - 1]) * _ramp(time_s - start, self._TURNING * self._slot_s)
+        return _kinematics(angle)
+
+
 def _ramp(time_s: Floats, length_s: float) -> Floats:
     """Step from 0 to 1 over `length_s` with three continuous derivatives, so that jerk is continuous; (3, N)."""
     u = np.clip(time_s / length_s, 0.0, 1.0)
@@ -125,4 +166,4 @@ def _kinematics(angle: Floats) -> Kinematics:
         ],
         axis=1,
     )
-    return Kinematics(tilt, rate, derivative)
+    return Kinematics(angle[0, 2], tilt, rate, derivative)

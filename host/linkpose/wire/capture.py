@@ -1,4 +1,4 @@
-"""Decodes a whole raw capture at once, compiled: the same frames, the same counts of corrupt ones as StreamDecoder."""
+"""Decodes a whole raw capture at once, compiled. It accepts the same frames as StreamDecoder, with the same counts."""
 
 from __future__ import annotations
 
@@ -8,21 +8,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.wire.frames import Corrupt, OtherProtocol, StreamDecoder
-from linkpose.wire.messages import LAYOUTS, MAX_FRAME, Hello, Message, Sample
+from linkpose.wire.frames import Corrupt, OtherProtocol, StreamDecoder, sample_shapes
+from linkpose.wire.messages import LAYOUTS, MAX_FRAME, Message, Sample
 
 _SAMPLE = next(layout for layout in LAYOUTS if layout.cls is Sample)
-_HELLO_TYPE = next(layout.type_id for layout in LAYOUTS if layout.cls is Hello)
 _NUMPY = {"B": "u1", "b": "i1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4"}
-_FIELDS = np.dtype([(name, _NUMPY[code]) for name, code in zip(Sample._fields, _SAMPLE.fields, strict=False)])
-_GROUP = np.dtype([(name, _NUMPY[code]) for name, code in zip(("dx", "dy"), _SAMPLE.group, strict=True)])
+_BYTES = {"B": 1, "b": 1, "H": 2, "h": 2, "I": 4, "i": 4}
+_MICE = _SAMPLE.groups[-1]
+_CODES = _SAMPLE.fields + "".join(group.code for group in _SAMPLE.groups[:-1])
+_MOUSE = np.dtype([(name, _NUMPY[code]) for name, code in zip(("dx", "dy"), _MICE.code, strict=True)])
 
-# One SAMPLE with room for all mice; `mouse_count` says how many it really brought.
-SAMPLE_DTYPE = np.dtype([*((name, _FIELDS[name]) for name in _FIELDS.names or ()), ("mice", _GROUP, _SAMPLE.group_max)])
+# One SAMPLE with room for all sections and all mice; absent ones are 0.
+SAMPLE_DTYPE = np.dtype(
+    [
+        *((name, _NUMPY[code]) for name, code in zip(Sample._fields[:-1], _CODES, strict=True)),
+        ("mice", _MOUSE, _MICE.most),
+    ]
+)
+_HEAD_SIZE = sum(_BYTES[code] for code in _SAMPLE.fields)
+_GROUP_SIZES = np.array([sum(_BYTES[code] for code in group.code) for group in _SAMPLE.groups])
+_SECTIONS_AT = 1 + sum(_BYTES[code] for code in _SAMPLE.fields[: Sample._fields.index("sections")])
 
 
 class Capture(NamedTuple):
-    """What a capture holds."""
+    """Contents of a capture."""
 
     samples: NDArray[np.void]  # (N,) of SAMPLE_DTYPE
     mouse_count: NDArray[np.uint8]  # (N,) mice in each
@@ -40,12 +49,21 @@ def _crc_table() -> NDArray[np.uint16]:
     return table
 
 
+def _counts_table() -> NDArray[np.int64]:
+    """Repetitions of each group for every value of `sections`, (256, groups); -1 where a value is impossible."""
+    table = np.full((256, len(_SAMPLE.groups)), -1)
+    for shape in sample_shapes():
+        table[shape.sections] = shape.counts
+    return table
+
+
 _CRC = _crc_table()
+_COUNTS = _counts_table()
 
 
 @compiled
 def _unstuff(data: NDArray[np.uint8], start: int, end: int, out: NDArray[np.uint8]) -> int:
-    """COBS-decodes data[start:end] into `out`; its length, or -1 where a code points past the end."""
+    """COBS-decodes data[start:end] into `out`. Returns the length, or -1 if a code points past the end."""
     length = 0
     while start < end:
         code = data[start]
@@ -63,13 +81,45 @@ def _unstuff(data: NDArray[np.uint8], start: int, end: int, out: NDArray[np.uint
 
 
 @compiled
+def _body_length(counts: NDArray[np.int64], head: int, group_sizes: NDArray[np.int64]) -> int:
+    """Length of the body with these repetitions of the groups, -1 if they are impossible."""
+    length = head
+    for group in range(len(group_sizes)):
+        if counts[group] < 0:
+            return -1
+        length += counts[group] * group_sizes[group]
+    return length
+
+
+@compiled
+def _spread(
+    payload: NDArray[np.uint8],
+    counts: NDArray[np.int64],
+    head: int,
+    group_sizes: NDArray[np.int64],
+    row: NDArray[np.uint8],
+) -> None:
+    """Copies a body to a row in which every group has its place."""
+    row[:] = 0
+    row[:head] = payload[1 : 1 + head]
+    source, target = 1 + head, head
+    last = len(group_sizes) - 1
+    for group in range(len(group_sizes)):
+        size = counts[group] * group_sizes[group]
+        row[target : target + size] = payload[source : source + size]
+        source += size
+        target += size if group == last else group_sizes[group]
+
+
+@compiled
 def _decode(
     data: NDArray[np.uint8],
     crc_table: NDArray[np.uint16],
+    counts_table: NDArray[np.int64],
     sample_type: int,
-    fixed: int,
-    group: int,
-    groups: int,
+    sections_at: int,
+    head: int,
+    group_sizes: NDArray[np.int64],
     rows: NDArray[np.uint8],
     mouse_count: NDArray[np.uint8],
     others: NDArray[np.int64],
@@ -77,7 +127,7 @@ def _decode(
 ) -> tuple[int, int]:
     """Fills `rows` with the bodies of sound SAMPLEs and `others` with (start, end, samples before) of all other frames.
 
-    Anything that is not a sound SAMPLE is left to the StreamDecoder. Returns how many of either there are.
+    Whatever is not a sound SAMPLE is left to the StreamDecoder. Returns the numbers of rows and of others.
     """
     payload = np.empty(longest, np.uint8)
     sample_count = other_count = 0
@@ -89,17 +139,17 @@ def _decode(
         if begin == at:
             continue
         length = _unstuff(data, begin, at, payload) if at - begin <= longest else 0
-        mice = (length - 3 - fixed) // group
-        if length >= 3 + fixed and payload[0] == sample_type and (length - 3 - fixed) % group == 0 and mice <= groups:
-            crc = 0xFFFF
-            for i in range(length - 2):
-                crc = ((crc << 8) & 0xFFFF) ^ crc_table[(crc >> 8) ^ payload[i]]
-            if crc == payload[length - 2] | (payload[length - 1] << 8):
-                rows[sample_count, : length - 3] = payload[1 : length - 2]
-                rows[sample_count, length - 3 :] = 0
-                mouse_count[sample_count] = mice
-                sample_count += 1
-                continue
+        if length >= 3 + head and payload[0] == sample_type:
+            counts = counts_table[payload[sections_at]]
+            if length == 3 + _body_length(counts, head, group_sizes):
+                crc = 0xFFFF
+                for i in range(length - 2):
+                    crc = ((crc << 8) & 0xFFFF) ^ crc_table[(crc >> 8) ^ payload[i]]
+                if crc == payload[length - 2] | (payload[length - 1] << 8):
+                    _spread(payload, counts, head, group_sizes, rows[sample_count])
+                    mouse_count[sample_count] = counts[len(counts) - 1]
+                    sample_count += 1
+                    continue
         others[other_count, 0], others[other_count, 1], others[other_count, 2] = begin, at, sample_count
         other_count += 1
     return sample_count, other_count
@@ -115,10 +165,11 @@ def decode_capture(data: bytes) -> Capture:
     sample_count, other_count = _decode(
         raw,
         _CRC,
+        _COUNTS,
         _SAMPLE.type_id,
-        _FIELDS.itemsize,
-        _GROUP.itemsize,
-        _SAMPLE.group_max,
+        _SECTIONS_AT,
+        _HEAD_SIZE,
+        _GROUP_SIZES,
         rows,
         mouse_count,
         others,

@@ -17,15 +17,15 @@ class FakeBoard : public commands::Board {
   bool is_streaming = false;
   bool has_imu = true;
   uint8_t ports = 3;
-  uint8_t mice = 3;
+  uint8_t body_size = 40;  // an inertial sensor, a barometer and two mice
   uint16_t rate = 100;
   wire::Configure configured = {};
 
   bool streaming() const override { return is_streaming; }
   uint16_t sample_rate_hz() const override { return rate; }
-  bool imu_present() const override { return has_imu; }
+  bool imu_present(uint8_t device) const override { return has_imu && device == 0; }
   uint8_t mouse_ports() const override { return ports; }
-  uint8_t mice_in_sample() const override { return mice; }
+  uint8_t sample_size() const override { return body_size; }
   void send_hello() override { log += "hello "; }
   void send_pong(uint32_t token) override { log += "pong" + std::to_string(token) + " "; }
   void acknowledge(uint8_t command) override { log += "ack" + std::to_string(command) + " "; }
@@ -39,7 +39,7 @@ class FakeBoard : public commands::Board {
   void start() override { log += "start "; }
   void stop() override { log += "stop "; }
   void reset_mice(uint8_t port_bits) override { log += "reset" + std::to_string(port_bits) + " "; }
-  void self_test() override { log += "test "; }
+  void self_test(uint8_t device) override { log += "test" + std::to_string(device) + " "; }
 };
 
 std::string carry_out(FakeBoard& board, uint8_t type, Bytes body = {}) {
@@ -51,7 +51,7 @@ std::string carry_out(FakeBoard& board, uint8_t type, Bytes body = {}) {
 }
 
 Bytes configure_body(uint16_t rate, uint8_t accel, uint16_t gyro, uint8_t dlpf, uint8_t oversampling, uint8_t mouse) {
-  const wire::Configure settings = {rate, accel, gyro, dlpf, oversampling, mouse};
+  const wire::Configure settings = {rate, accel, gyro, dlpf, oversampling, mouse, 400};
   Bytes body(sizeof settings);
   std::memcpy(body.data(), &settings, sizeof settings);
   return body;
@@ -69,7 +69,7 @@ TEST_CASE("commands without a condition") {
   CHECK(carry_out(board, wire::Ping::kType, {0x0D, 0x0C, 0, 0}) == "pong3085 ");
   CHECK(carry_out(board, wire::Start::kType) == "start ack131 ");
   CHECK(carry_out(board, wire::Stop::kType) == "stop ack132 ");
-  CHECK(carry_out(board, wire::SelfTest::kType) == "test ack135 ");
+  CHECK(carry_out(board, wire::SelfTest::kType, {0}) == "test0 ack135 ");
   CHECK(carry_out(board, wire::ResetMice::kType, {5}) == "reset5 ack134 ");
 }
 
@@ -103,18 +103,22 @@ TEST_CASE("CONFIGURE names what is out of range, and changes nothing") {
   CHECK(refused(configure_body(100, 8, 1000, 3, 4, 8)) == nak(0x82, NakReason::kBaroOversamplingOutOfRange));
   CHECK(refused(configure_body(100, 8, 1000, 3, 1, 0)) == nak(0x82, NakReason::kMouseResolutionOutOfRange));
   CHECK(refused(configure_body(100, 8, 1000, 3, 1, 16)) == nak(0x82, NakReason::kMouseResolutionOutOfRange));
+  Bytes odd_clock = configure_body(100, 8, 1000, 3, 1, 8);
+  odd_clock[8] = 0x2C;  // 300 kHz
+  odd_clock[9] = 1;
+  CHECK(refused(odd_clock) == nak(0x82, NakReason::kI2cClockOutOfRange));
   board.is_streaming = true;
   CHECK(refused(configure_body(100, 8, 1000, 3, 1, 8)) == nak(0x82, NakReason::kStreaming));
 }
 
 TEST_CASE("a rate whose SAMPLEs the link does not carry is refused") {
   FakeBoard board;
-  board.mice = 4;
+  board.body_size = 48;  // with four mice
   CHECK(carry_out(board, 0x82, configure_body(500, 8, 1000, 3, 1, 8)) == nak(0x82, NakReason::kLinkTooSlow));
   CHECK(carry_out(board, 0x82, configure_body(400, 8, 1000, 3, 1, 8)) == "configure ack130 ");
   board.rate = 500;
   CHECK(carry_out(board, wire::Start::kType) == nak(0x83, NakReason::kLinkTooSlow));
-  board.mice = 3;
+  board.body_size = 40;
   CHECK(carry_out(board, wire::Start::kType) == "start ack131 ");
 }
 
@@ -126,10 +130,12 @@ TEST_CASE("START while streaming is acknowledged and does not begin anew") {
 
 TEST_CASE("SELF_TEST needs a sensor that is not in use; RESET_MICE ports that there are") {
   FakeBoard board;
+  CHECK(carry_out(board, wire::SelfTest::kType, {1}) == nak(0x87, NakReason::kSensorAbsent));
+  CHECK(carry_out(board, wire::SelfTest::kType, {2}) == nak(0x87, NakReason::kSensorAbsent));
   board.has_imu = false;
-  CHECK(carry_out(board, wire::SelfTest::kType) == nak(0x87, NakReason::kSensorAbsent));
+  CHECK(carry_out(board, wire::SelfTest::kType, {0}) == nak(0x87, NakReason::kSensorAbsent));
   board.is_streaming = true;
-  CHECK(carry_out(board, wire::SelfTest::kType) == nak(0x87, NakReason::kStreaming));
+  CHECK(carry_out(board, wire::SelfTest::kType, {0}) == nak(0x87, NakReason::kStreaming));
   CHECK(carry_out(board, wire::ResetMice::kType, {0}) == nak(0x86, NakReason::kMousePortOutOfRange));
   CHECK(carry_out(board, wire::ResetMice::kType, {8}) == nak(0x86, NakReason::kMousePortOutOfRange));
 }
@@ -141,7 +147,7 @@ TEST_CASE("every unknown type and every wrong length is refused by name") {
     CHECK(carry_out(board, static_cast<uint8_t>(type)) == nak(static_cast<uint8_t>(type), NakReason::kUnknownCommand));
   }
   for (uint8_t type = 0x81; type <= 0x87; type++) {
-    CHECK(carry_out(board, type, Bytes(7)) == nak(type, NakReason::kBadLength));
+    CHECK(carry_out(board, type, Bytes(6)) == nak(type, NakReason::kBadLength));
   }
 }
 
@@ -189,5 +195,5 @@ TEST_CASE("fuzz: a million inputs, each answered once or counted, none out of bo
   }
   CHECK(frames > 200000);
   CHECK(corrupt > 300000);
-  CHECK(commands::link_carries(board.configured.sample_rate_hz, board.mice));
+  CHECK(commands::line_carries(board.configured.sample_rate_hz, board.body_size));
 }

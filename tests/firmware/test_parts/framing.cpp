@@ -68,7 +68,7 @@ TEST_CASE("a frame that is broken is corrupt; one of an unknown type or length i
   for (const RejectedFrame& rejected : kRejectedFrames) {
     CAPTURE(rejected.name);
     const std::string name = rejected.name, cause = rejected.cause;
-    const bool whole = cause == "type" || name.find("body one byte") != std::string::npos;
+    const bool whole = cause == "type" || name.find("body one byte") != std::string::npos || name.find("declares") != std::string::npos;
     CHECK(decode(from_hex(rejected.frame)).event == (whole ? Event::kFrame : Event::kCorrupt));
   }
 }
@@ -89,7 +89,7 @@ TEST_CASE("after any rubbish the decoder is in step at the next 0x00") {
 }
 
 TEST_CASE("every single-bit error in a frame is found") {
-  const Bytes good = frame_of(wire::Configure::kType, {100, 0, 8, 0xE8, 3, 3, 1, 8});
+  const Bytes good = frame_of(wire::Configure::kType, {100, 0, 8, 0xE8, 3, 3, 1, 8, 0x90, 1});
   int accepted = 0;
   for (size_t bit = 0; bit < 8 * (good.size() - 1); bit++) {
     Bytes bad = good;

@@ -30,10 +30,15 @@ const EXAMPLE_WORDS = {
 class Bmp180 extends I2cSlave {
   /** @param {() => number} traffic count of what has passed on the bus
    *  @param {() => number} random
-   *  @param {{ words?: typeof EXAMPLE_WORDS, speed?: "maximum"|"typical", disturbancePa?: number }} options
-   *  disturbancePa: standard deviation that traffic during a conversion adds */
-  constructor(cpu, traffic, random, { words = EXAMPLE_WORDS, speed = "maximum", disturbancePa = 0 } = {}) {
+   *  @param {{ words?: typeof EXAMPLE_WORDS, speed?: "maximum"|"typical", disturbancePa?: number, id?: number,
+   *    lateMs?: number }} options
+   *  disturbancePa: standard deviation that traffic during a conversion adds; lateMs: how much longer than the data
+   *  sheet's maximum a clone converts, with its Sco bit set and the old result in its registers */
+  constructor(cpu, traffic, random, options = {}) {
     super(cpu, 0x77);
+    const { words = EXAMPLE_WORDS, speed = "maximum", disturbancePa = 0 } = options;
+    this.id = options.id ?? CHIP_ID;
+    this.lateS = (options.lateMs ?? 0) / 1000;
     this.words = words;
     this.durations = DURATIONS_S[speed];
     this.disturbancePa = disturbancePa;
@@ -56,7 +61,7 @@ class Bmp180 extends I2cSlave {
       registers[CALIBRATION + 2 * i] = (word >> 8) & 0xff;
       registers[CALIBRATION + 2 * i + 1] = word & 0xff;
     });
-    registers[ID] = CHIP_ID;
+    registers[ID] = this.id;
     registers[OUT_MSB] = 0x80;
     this.busyUntil = this.cpu.now + START_UP_S * CLOCK_HZ;
   }
@@ -81,7 +86,7 @@ class Bmp180 extends I2cSlave {
     const duration = temperature ? this.durations.temperature : this.durations.pressure[oversampling];
     const trafficBefore = this.traffic();
     cpu.log.add("baro_begin", cpu.now, control);
-    this.conversion = cpu.after(duration * CLOCK_HZ, () => {
+    this.conversion = cpu.after((duration + this.lateS) * CLOCK_HZ, () => {
       this.conversion = null;
       const traffic = this.traffic() - trafficBefore;
       this.conversions += 1;

@@ -26,7 +26,9 @@ NakReason check(const wire::Configure& c, const Board& board) {
   if (c.dlpf > 6) return NakReason::kDlpfOutOfRange;
   if (c.baro_oversampling > 3) return NakReason::kBaroOversamplingOutOfRange;
   if (!is_one_of(c.mouse_counts_per_mm, 1, 8)) return NakReason::kMouseResolutionOutOfRange;
-  if (!link_carries(c.sample_rate_hz, board.mice_in_sample())) return NakReason::kLinkTooSlow;
+  const bool slow_bus = c.i2c_khz == 100 && c.sample_rate_hz <= kMaxSlowBusHz;
+  if (!slow_bus && c.i2c_khz != 400) return NakReason::kI2cClockOutOfRange;
+  if (!line_carries(c.sample_rate_hz, board.sample_size())) return NakReason::kLinkTooSlow;
   return kFine;
 }
 
@@ -39,8 +41,8 @@ NakReason configure(const uint8_t* body, Board& board) {
 }
 
 NakReason start(uint16_t rate_hz, Board& board) {
-  // Mice may have come since the rate was set.
-  if (!link_carries(rate_hz, board.mice_in_sample())) return NakReason::kLinkTooSlow;
+  // Mice or sensors may have been found since the rate was set.
+  if (!line_carries(rate_hz, board.sample_size())) return NakReason::kLinkTooSlow;
   if (!board.streaming()) board.start();
   return kFine;
 }
@@ -52,10 +54,11 @@ NakReason reset_mice(const uint8_t* body, Board& board) {
   return kFine;
 }
 
-NakReason self_test(Board& board) {
+NakReason self_test(const uint8_t* body, Board& board) {
+  const uint8_t device = body[0];
   if (board.streaming()) return NakReason::kStreaming;
-  if (!board.imu_present()) return NakReason::kSensorAbsent;
-  board.self_test();
+  if (device > 1 || !board.imu_present(device)) return NakReason::kSensorAbsent;
+  board.self_test(device);
   return kFine;
 }
 
@@ -75,11 +78,11 @@ int16_t body_size(uint8_t type) {
 
 }  // namespace
 
-bool link_carries(uint16_t rate_hz, uint8_t mice) {
+bool line_carries(uint16_t rate_hz, uint8_t sample_size) {
   constexpr uint8_t kOverhead = 5;  // type, CRC, COBS code, delimiter
   constexpr uint32_t kBytesPerSecond = wire::kBaud / 10;
   constexpr uint32_t kForTheRest = kBytesPerSecond / 20;
-  return static_cast<uint32_t>(rate_hz) * (wire::Sample::size(mice) + kOverhead) <= kBytesPerSecond - kForTheRest;
+  return static_cast<uint32_t>(rate_hz) * (sample_size + kOverhead) <= kBytesPerSecond - kForTheRest;
 }
 
 void carry_out(uint8_t type, const uint8_t* body, uint8_t size, Board& board) {
@@ -99,7 +102,7 @@ void carry_out(uint8_t type, const uint8_t* body, uint8_t size, Board& board) {
     case wire::Start::kType: reason = start(board.sample_rate_hz(), board); break;
     case wire::Stop::kType: board.stop(); break;
     case wire::ResetMice::kType: reason = reset_mice(body, board); break;
-    default: reason = self_test(board); break;
+    default: reason = self_test(body, board); break;
   }
   if (reason != kFine) return board.refuse(type, reason);
   board.acknowledge(type);

@@ -12,22 +12,26 @@
 namespace twi {
 namespace {
 
-constexpr uint32_t kBusHz = 400000;
 constexpr uint8_t kSda = _BV(PC4);
 constexpr uint8_t kScl = _BV(PC5);
 
-// The longest transaction, the BMP180's calibration, is 25 bytes of 9 bits at 2.5 us, and about 3 us between two bytes.
+// The longest transaction, a barometer's calibration, is 27 bytes of 9 bits, and about 3 us between two bytes: 0.7 ms at
+// 400 kHz, 2.5 ms at 100 kHz. In steps of 0.5 us.
 constexpr uint16_t kDeadlineSteps = 2000;
+constexpr uint16_t kSlowDeadlineSteps = 6000;
 constexpr uint16_t kMarginSteps = 200;
 
 constexpr uint8_t kGo = _BV(TWINT) | _BV(TWEN) | _BV(TWIE);
 
-volatile State burst = State::kIdle;
+volatile State burst[kBursts] = {State::kIdle, State::kIdle};
 volatile State request_state = State::kIdle;
 volatile bool bus_down;
-uint8_t burst_bytes[14];
+uint8_t burst_bytes[kBursts][14];
 uint8_t request_bytes[I2cRequest::kMaxRead];
-I2cRequest burst_request = {0, {0, 0}, 1, 0};
+I2cRequest burst_request[kBursts] = {{0, {0, 0}, 1, 0, false}, {0, {0, 0}, 1, 0, false}};
+volatile uint8_t next_burst = kBursts;  // to be started when the present one ends
+uint16_t deadline_steps = kDeadlineSteps;
+uint8_t bit_rate = (F_CPU / 400000 - 16) / 2;
 I2cRequest pending;
 
 // The transaction on the bus.
@@ -39,30 +43,50 @@ volatile uint8_t at;
 volatile uint32_t error_count;
 uint16_t recovery_count;
 
-// `stop`: what ends it on the bus.
-inline void end(State how, uint8_t stop) {
-  TWCR = _BV(TWINT) | _BV(TWEN) | stop;
-  *state = how;
-  clock::disarm_deadline();
-  idle::signal_work();
-}
-
-inline void fail(uint8_t stop) {
-  error_count++;
-  end(State::kFailed, stop);
-}
-
-inline void run(const I2cRequest& request, uint8_t* bytes, volatile State* its_state) {
+// Inline, as is all that the interrupt does: an interrupt that calls no function saves only the registers that it uses.
+inline __attribute__((always_inline)) void run(const I2cRequest& request, uint8_t* bytes, volatile State* its_state) {
   active = &request;
   into = bytes;
   state = its_state;
   *its_state = State::kBusy;
-  clock::arm_deadline_locked(kDeadlineSteps);
+  clock::arm_deadline_locked(deadline_steps);
+}
+
+// Number of the next burst to be read, kBursts when there is none.
+inline __attribute__((always_inline)) uint8_t burst_from(uint8_t number) {
+  while (number < kBursts && burst_request[number].read_count == 0) number++;
+  return number;
+}
+
+// Starts a burst; `stop` ends the transaction before it on the bus, if there was one.
+inline __attribute__((always_inline)) void run_burst(uint8_t number, uint8_t stop) {
+  next_burst = burst_from(number + 1);
+  TWCR = kGo | _BV(TWSTA) | stop;
+  run(burst_request[number], burst_bytes[number], &burst[number]);
+}
+
+// `stop`: how it ends on the bus.
+inline __attribute__((always_inline)) void end(State how, uint8_t stop) {
+  *state = how;
+  if (next_burst < kBursts && stop) {
+    run_burst(next_burst, stop);
+    return;
+  }
+  TWCR = _BV(TWINT) | _BV(TWEN) | stop;
+  if (next_burst < kBursts) burst[next_burst] = State::kFailed;
+  next_burst = kBursts;
+  clock::disarm_deadline();
+  idle::signal_work();
+}
+
+inline __attribute__((always_inline)) void fail(uint8_t stop) {
+  if (!(active->probe && TW_STATUS == TW_MT_SLA_NACK)) error_count++;
+  end(State::kFailed, stop);
 }
 
 void enable() {
   TWSR = 0;
-  TWBR = (F_CPU / kBusHz - 16) / 2;
+  TWBR = bit_rate;
   TWCR = _BV(TWEN);
 }
 
@@ -81,19 +105,32 @@ void begin() {
   if (!high(kSda)) bus_down = true;  // a reset in the middle of a read leaves the sensor in the middle of its answer
 }
 
-void set_burst(uint8_t address, uint8_t first_register, uint8_t count) {
-  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { burst_request = I2cRequest::read(address, first_register, count); }
+void set_clock(uint16_t khz) {
+  const bool slow = khz < 400;
+  bit_rate = slow ? (F_CPU / 100000 - 16) / 2 : (F_CPU / 400000 - 16) / 2;
+  deadline_steps = slow ? kSlowDeadlineSteps : kDeadlineSteps;
+  TWBR = bit_rate;
 }
 
-State burst_state() { return burst; }
-const uint8_t* burst_data() { return burst_bytes; }
+void set_burst(uint8_t number, uint8_t address, uint8_t first_register, uint8_t count) {
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { burst_request[number] = I2cRequest::read(address, first_register, count); }
+}
+
+bool bursts_done() {
+  for (const volatile State& each : burst) {
+    if (each == State::kBusy) return false;
+  }
+  return next_burst == kBursts;
+}
+State burst_state(uint8_t number) { return burst[number]; }
+const uint8_t* burst_data(uint8_t number) { return burst_bytes[number]; }
 
 bool begin_request(const I2cRequest& request) {
-  if (clock::steps_left() < kDeadlineSteps + kMarginSteps || (TWCR & _BV(TWSTO))) return false;
+  if (clock::steps_left() < deadline_steps + kMarginSteps || (TWCR & _BV(TWSTO))) return false;
   pending = request;
   bool free;
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-    free = !bus_down && burst != State::kBusy && request_state == State::kIdle;
+    free = !bus_down && bursts_done() && request_state == State::kIdle;
     if (free) {
       TWCR = kGo | _BV(TWSTA);
       run(pending, request_bytes, &request_state);
@@ -142,14 +179,13 @@ uint32_t errors() {
 }
 uint16_t recoveries() { return recovery_count; }
 
-void start_burst() {
-  const bool free = !bus_down && request_state != State::kBusy && burst_request.read_count != 0;
-  if (!free) {
-    burst = burst_request.read_count == 0 ? State::kIdle : State::kFailed;
-    return;
+void start_bursts() {
+  const uint8_t first = burst_from(0);
+  const bool free = !bus_down && request_state != State::kBusy && bursts_done();
+  for (uint8_t i = 0; i < kBursts; i++) {
+    if (burst[i] != State::kBusy) burst[i] = burst_request[i].read_count == 0 ? State::kIdle : State::kFailed;
   }
-  TWCR = kGo | _BV(TWSTA);
-  run(burst_request, burst_bytes, &burst);
+  if (free && first < kBursts) run_burst(first, 0);
 }
 
 void expire() {
@@ -157,6 +193,8 @@ void expire() {
   TWCR = 0;  // lets both lines go
   bus_down = true;
   *state = State::kFailed;
+  if (next_burst < kBursts) burst[next_burst] = State::kFailed;
+  next_burst = kBursts;
   error_count++;
 }
 

@@ -1,7 +1,7 @@
-// I2C master at 400 kHz, run by interrupts, one transaction at a time. Every transaction has a deadline.
+// I2C master at 100 or 400 kHz, driven by interrupts, one transaction at a time. Every transaction has a deadline.
 //
-// Two things start one: the tick, whose interrupt starts the IMU's burst; and the main loop, for all others, which are
-// begun only when they will have ended well before the next tick.
+// The tick's interrupt starts the bursts of the inertial sensors, the second as soon as the first has ended. The main
+// loop starts all other transactions, and only those that will have ended well before the next tick.
 #pragma once
 #include <I2cRequest.h>
 #include <stdint.h>
@@ -17,10 +17,15 @@ enum class State : uint8_t {
 
 void begin();
 
-// The burst of each tick from now on; count 0: none.
-void set_burst(uint8_t address, uint8_t first_register, uint8_t count);
-State burst_state();           // of the present tick
-const uint8_t* burst_data();   // valid until the next tick
+// Takes effect with the next transaction. Call it with the bus quiet.
+void set_clock(uint16_t khz);
+
+// Bursts of each tick from now on, read one after the other; count 0: none.
+constexpr uint8_t kBursts = 2;
+void set_burst(uint8_t number, uint8_t address, uint8_t first_register, uint8_t count);
+bool bursts_done();                        // of the present tick
+State burst_state(uint8_t number);
+const uint8_t* burst_data(uint8_t number);  // valid until the next tick
 
 // False when there is no time left before the next tick, or the bus is taken or down.
 bool begin_request(const I2cRequest& request);
@@ -28,7 +33,7 @@ bool begin_request(const I2cRequest& request);
 State take_request_state();
 const uint8_t* request_data();
 
-// A transaction was overdue: something holds the bus. free_bus() tries to get it back, and says whether it did.
+// A transaction was overdue: something holds the bus. free_bus() tries to free it and returns whether it succeeded.
 bool down();
 bool free_bus();
 
@@ -36,7 +41,7 @@ uint32_t errors();
 uint16_t recoveries();
 
 // For the interrupts of Timer1.
-void start_burst();
+void start_bursts();
 void expire();
 
 }  // namespace twi

@@ -1,0 +1,164 @@
+"""The checks and comparisons of chapter 3.2 of [Thesis] on simulated dives.
+
+The simulator follows the thesis's Tables 2.2 to 2.9. The thesis's own values and result tables are not public.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from linkpose.experiments.variants import Progress, Variant, verdict
+from linkpose.localization.kalman import FilterName
+from linkpose.localization.localizer import Settings, Track, localize
+from linkpose.localization.noise import RangeNoise
+from linkpose.localization.tables import score
+from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, UnderwaterRun, self_check, simulate_underwater
+
+FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")
+GATE = 0.997
+DURATION_S = 60.0
+OUTLIERS = 30
+TIMINGS = ("asynchronous", "synchronous")
+
+
+@dataclass(slots=True)
+class Detection:
+    """Outliers of a variant over all seeds: injected and rejected ones, and good ranges that were rejected."""
+
+    injected: int = 0
+    found: int = 0
+    good: int = 0
+    false_alarms: int = 0
+
+    def add(self, run: UnderwaterRun, track: Track) -> None:
+        """Counts one run."""
+        ranges = sum(len(values) for values in run.ranges_m.values())
+        found = len(track.rejected_ranges & run.outliers)
+        self.injected += len(run.outliers)
+        self.found += found
+        self.good += ranges - len(run.outliers)
+        self.false_alarms += len(track.rejected_ranges) - found
+
+    def as_row(self) -> dict[str, object]:
+        """The part of the JSON object that says how well outliers were detected."""
+        return {
+            "detection_rate": self.found / self.injected if self.injected else None,
+            "false_alarm_rate": self.false_alarms / self.good,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A simulated sea, and the variants that are compared in it."""
+
+    timing: str
+    correlated: bool
+    outliers: int
+    variants: list[Variant] = field(default_factory=list)
+    detections: list[Detection] = field(default_factory=list)
+
+    def errors(self) -> UnderwaterErrors:
+        """The simulated errors of this sea."""
+        errors = UnderwaterErrors(outliers=self.outliers)
+        return errors if self.correlated else replace(errors, correlation_m=0.0)
+
+    def rows(self) -> list[dict[str, object]]:
+        """The objects that `reproduce underwater --json` prints."""
+        return [v.as_row() | d.as_row() for v, d in zip(self.variants, self.detections, strict=True)]
+
+
+def compare(seeds: int, progress: Progress = iter) -> list[Case]:
+    """All cases, their variants scored on seeds 0 … seeds − 1."""
+    cases = [
+        _case(timing, correlated, n)
+        for timing, correlated, n in itertools.product(TIMINGS, (False, True), (0, OUTLIERS))
+    ]
+    for case, seed in progress(list(itertools.product(cases, range(seeds)))):
+        _dive(case, seed)
+    return cases
+
+
+def _case(timing: str, correlated: bool, outliers: int) -> Case:
+    """Off-diagonal R applies to ranges of one instant: asynchronous ranges have no neighbour to correlate with."""
+    case = Case(timing, correlated, outliers)
+    errors = case.errors()
+    shared = errors.correlation_m**2 / (errors.correlation_m**2 + errors.range_m**2)
+    rhos = (0.0, round(shared, 3)) if correlated and timing == "synchronous" else (0.0,)
+    for name, rho, gate in itertools.product(FILTERS, rhos, (GATE, None)):
+        others: dict[str, object] = {"timing": timing, "correlation_std_m": errors.correlation_m, "outliers": outliers}
+        case.variants.append(Variant(name, "fixed", rho, gate, others))
+        case.detections.append(Detection())
+    return case
+
+
+def _dive(case: Case, seed: int) -> None:
+    errors = case.errors()
+    run = simulate_underwater(seed, errors, DURATION_S, case.timing == "synchronous")
+    for variant, detection in zip(case.variants, case.detections, strict=True):
+        track = localize(run.log, variant.filter, _settings(errors, variant), None, BEACONS)
+        variant.scores.append(score(track.time_s, track.position_m, track.heading_rad, run.motion.truth))
+        detection.add(run, track)
+
+
+def _settings(errors: UnderwaterErrors, variant: Variant) -> Settings:
+    """The filter uses the simulated sensors' true errors; the common error is part of each range's variance."""
+    return Settings(
+        ranges=RangeNoise("fixed", math.hypot(errors.range_m, errors.correlation_m), correlation=variant.correlation),
+        depth_std_m=errors.depth_m,
+        attitude_std_rad=errors.attitude_rad,
+        velocity_std_m_s=math.hypot(errors.velocity_m_s, errors.motion_velocity_m_s),
+        gate=variant.gate,
+    )
+
+
+def check_simulator(seeds: int) -> list[dict[str, object]]:
+    """The simulator's own statistics beside the figures asked for, mean over the seeds."""
+    runs = [
+        self_check(simulate_underwater(seed, UnderwaterErrors(outliers=OUTLIERS), DURATION_S)) for seed in range(seeds)
+    ]
+    return [
+        {"check": rows[0].check, "asked": rows[0].asked, "measured": sum(row.measured for row in rows) / seeds}
+        for rows in zip(*runs, strict=True)
+    ]
+
+
+def claims(cases: Sequence[Case]) -> list[str]:
+    """What the thesis expects, each with its result on these runs."""
+    late, at_once = TIMINGS
+    ukf = _find(cases, late, True, OUTLIERS, "ukf")
+    clean, synchronous = (_find(cases, timing, True, 0, "ukf") for timing in TIMINGS)
+    return [
+        verdict("the UKF is better than the EKF", _find(cases, late, True, OUTLIERS, "ekf"), ukf),
+        verdict("with outliers, the gate is better than none", _find(cases, late, True, OUTLIERS, "ukf", None), ukf),
+        verdict("without outliers, the gate is better than none", _find(cases, late, True, 0, "ukf", None), clean),
+        verdict("ranges without a common error are better than with one", clean, _find(cases, late, False, 0, "ukf")),
+        verdict(
+            "with a common error, off-diagonal R is better than diagonal R",
+            synchronous,
+            _find(cases, at_once, True, 0, "ukf", rho=True),
+        ),
+        verdict("asynchronous sensors are better than synchronous ones", synchronous, clean),
+    ]
+
+
+def _find(
+    cases: Sequence[Case],
+    timing: str,
+    correlated: bool,
+    outliers: int,
+    name: str,
+    gate: float | None = GATE,
+    rho: bool = False,
+) -> Variant:
+    case = next(c for c in cases if (c.timing, c.correlated, c.outliers) == (timing, correlated, outliers))
+    return next(v for v in case.variants if (v.filter, v.gate, v.correlation > 0) == (name, gate, rho))
+
+
+def label(variant: Variant) -> str:
+    """The variant in one line of a plot."""
+    words = [variant.filter, str(variant.others["timing"]), f"ρ {variant.correlation:g}"]
+    words += ["gate" if variant.gate else "no gate", f"common {variant.others['correlation_std_m']} m"]
+    return ", ".join([*words, f"{variant.others['outliers']} outliers"])

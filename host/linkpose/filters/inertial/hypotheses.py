@@ -1,0 +1,63 @@
+"""Two filters with different assumptions about the sensors, mixed by their probabilities.
+
+The filter is not told whether the sensors were calibrated, and the two hypotheses behave differently during start-up.
+Two filters therefore run in parallel, one with the errors that a calibration leaves and one with the data sheet's. A
+filter whose estimated sensor errors lie far outside its own prior becomes less probable: its likelihood is e^−χ²/2 of
+those errors. The estimate is the mean of both.
+
+Source: D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control
+10(4), 1965.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from linkpose.filters.inertial.state import Floats, SensorErrors
+
+# What a calibration leaves (simulated twelve-position calibration, ../simulation/link.py) and what the MPU-6050's data
+# sheet allows (zero-rate output ±20 °/s after a rough subtraction, zero-g output ±50 mg, scale ±3 %, cross-axis ±2 %).
+CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.016, 0.0015, 0.0005, 200.0)
+DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012, 1000.0)
+
+# Prior log odds of the calibrated hypothesis. Doubling it delays the change to the other on an uncalibrated sensor.
+_LOG_ODDS = 15.0
+# The wider hypothesis also fits what is no error of a sensor, so its own χ² counts this many times (Occam's factor).
+_OCCAM = 8.0
+_MOST = 50.0  # log odds beyond which the other filter has no weight
+
+
+def log_odds(first: Floats, second: Floats) -> Floats:
+    """Log odds of the first hypothesis, from half the χ² of the sensor errors that each filter has estimated."""
+    return np.clip(_LOG_ODDS + _OCCAM * second - first, -_MOST, _MOST)
+
+
+def mix(a: Any, b: Any) -> dict[str, Floats]:
+    """The mean of two filters' estimates (records of ESTIMATE, (N,)) as arrays (N,); `tilt` is (N, 3), not normalised.
+
+    A variance includes how far the filters differ. Where one filter has no height, the other's counts alone.
+    """
+    share = 1.0 / (1.0 + np.exp(-log_odds(a.distance, b.distance)))
+    lone = np.where(np.isnan(b.height) & ~np.isnan(a.height), 1.0, share)
+    lone = np.where(np.isnan(a.height) & ~np.isnan(b.height), 0.0, lone)
+    found: dict[str, Floats] = {"tilt": a.tilt * share[:, None] + b.tilt * (1.0 - share)[:, None]}
+    for name in ("height", "x", "y"):
+        found[name] = _mixed(lone, a[name], b[name])
+    found["height_std"] = _mixed_std(lone, a.height, a.height_std, b.height, b.height_std)
+    turn = (b.yaw - a.yaw + np.pi) % (2 * np.pi) - np.pi
+    found["yaw"] = (a.yaw + (1.0 - share) * turn + np.pi) % (2 * np.pi) - np.pi
+    found["yaw_std"] = np.minimum(_mixed_std(share, 0.0 * turn, a.yaw_std, turn, b.yaw_std), np.pi)
+    return found
+
+
+def _mixed(share: Floats, a: Floats, b: Floats) -> Floats:
+    return np.where(share == 1.0, a, np.where(share == 0.0, b, share * a + (1.0 - share) * b))
+
+
+def _mixed_std(share: Floats, a: Floats, a_std: Floats, b: Floats, b_std: Floats) -> Floats:
+    """Standard deviation of a mixture of two."""
+    apart = _mixed(share, np.square(a - b), 0.0 * a) * (1.0 - share)
+    apart = np.where(share * (1.0 - share) == 0.0, 0.0, apart)
+    return np.sqrt(_mixed(share, np.square(a_std), np.square(b_std)) + apart)

@@ -1,0 +1,368 @@
+"""The core over a block of samples: integrate each sample, update some 25 times in a second, report each sample.
+
+A reading that repeats the last one to the last bit is an old one, read again by a logger that is faster than the
+sensor: the step then waits for the next new force, with the rotation summed over the rates that arrive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.compiling import compiled, inner
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import (
+    ImuCalibration,
+    blind_for,
+    is_bounded,
+    read_accel,
+    read_gyro,
+    rotation_variance,
+    unknown_accel,
+)
+from linkpose.filters._vector import Vec
+from linkpose.filters.inertial.free_velocity import follow_speed, update_free_velocity
+from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
+from linkpose.filters.inertial.joint_velocity import update_joint_velocity
+from linkpose.filters.inertial.propagate import (
+    add_noise,
+    angular_rate,
+    clear_increments,
+    corrected,
+    decay_to_prior,
+    integrate,
+    propagate_covariance,
+    specific_force,
+    velocity_variance,
+)
+from linkpose.filters.inertial.rest import (
+    follow_rest,
+    follow_steadiness,
+    update_bias_from_rest,
+    update_bias_from_steadiness,
+)
+from linkpose.filters.inertial.state import BA, BG, MG, PSI, SIZE, D, Floats, Record, V, Z
+from linkpose.filters.inertial.update import sub_covariance
+
+# Least interval between two updates (s). A faster pace gains nothing: what the models leave over is correlated.
+_UPDATE_INTERVAL_S = 0.035
+# Without a rate for longer, a moving link has turned by more than its tilt can be guessed to: align to gravity anew.
+_LONGEST_BLIND_S = 0.3
+# Identical readings for less than this are one reading of a slower sensor, held by the logger (s).
+LONGEST_HOLD_S = 0.1
+_NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
+_JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: a spike, or at least no smooth motion
+_NO_JUMP = cast(bool, np.bool_(False))  # the compiler would take a Python constant for a type of its own
+_STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
+# Start in motion: angular acceleration (rad/s²) at rest, and per rad/s of rate (1/s).
+_START_RAD_S2, _SWING_PER_S = 3.0, 5.0
+# The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
+_LOST, _LOST_M2_S2 = 0.5, 0.01
+_LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
+_UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the height is not known
+
+
+@compiled
+def process(
+    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint32], dead: NDArray[np.bool_],
+    imu: ImuCalibration, parameters: Record, states: Record, out: Record,
+) -> None:  # fmt: skip
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
+
+    Shapes: time_s (N,) s; accel (N, 3) m/s²; gyro (N, 3) rad/s; flags (N,); dead (N,), True where the sensor is frozen.
+    """
+    s, q = states[0], parameters[0]
+    for i in range(len(time_s)):
+        has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
+        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
+        has_force, has_rate = has_force and not dead[i], has_rate and not dead[i]
+        good, first, h = has_force and has_rate, math.isnan(s.time), time_s[i] - s.time
+        if good and first and math.isfinite(time_s[i]):
+            _begin(s, force, rate, imu, q)
+            _take_sample(s, time_s[i], force, rate)
+        elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
+            _bridge(s, h, rate, imu)
+            _align(s, force, rate, imu, q)
+            _take_sample(s, time_s[i], force, rate)
+        elif 0.0 < h < math.inf:
+            good = _advance(s, time_s[i], dead[i], has_force, force, has_rate, rate, imu, q) and good
+        else:
+            good = False
+        s.rejected += 0 if good else 1
+        _report(s, time_s[i], imu, out[i])
+
+
+@inner
+def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
+    """Continue from this sample, with nothing accumulated."""
+    s.time = s.turned_at = time_s
+    s.angle_variance = s.blind_s = s.no_force_s = s.clipped_s = 0.0
+    vec.store(s.force, force)
+    vec.store(s.rate, rate)
+    vec.store(s.newest_rate, rate)
+    vec.store(s.angle, (0.0, 0.0, 0.0))
+    vec.store(s.force_change, (0.0, 0.0, 0.0))
+    clear_increments(s)
+
+
+@inner
+def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
+    """Mean and covariance from one sample and the priors."""
+    for i in range(SIZE):
+        s.nominal[i] = s.start_mean[i]
+        for j in range(SIZE):
+            s.covariance[i, j] = s.start_covariance[i, j]
+    s.distance = _distance(s)
+    if s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0:
+        vec.store(s.tilt, vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0))
+        vec.store(s.north, heading_axis(vec.load(s.tilt)))
+    s.residual_square, s.reach_square = 0.5 * q.first_residual**2, 0.5
+    s.rest_s = 0.0
+    for i in range(3):
+        for j in range(3):
+            s.spread[i, j] = 0.0
+    _align(s, force, rate, imu, q)
+
+
+@inner
+def _align(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
+    """Tilt from the force, velocity from the model, as if nothing had been known of them."""
+    rotation = angular_rate(s, rate)
+    if q.has_joint:
+        d = vec.load(s.j2s)
+        # The acceleration that there may be: of a link that starts to turn, that swings, that whirls.
+        reach = vec.dot(d, d) + vec.trace(sub_covariance(s.covariance, D))
+        speed = vec.dot(rotation, rotation) + vec.trace(sub_covariance(s.covariance, BG))
+        accel = imu.accel_variance + reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
+        align_to_gravity(s, force, accel, vec.cross(rotation, d), speed * reach + 1e-4)
+        return
+    s.speed_square = max(q.first_speed_m_s**2, s.speed_square)  # what has been measured of it stays
+    align_to_gravity(s, force, imu.accel_variance + unknown_accel(force, rate), (0.0, 0.0, 0.0), s.speed_square)
+    vec.store(s.swing, (0.0, 0.0, 0.0))
+    vec.store(s.mean_force, force)
+    vec.store(s.mean_rate, rate)
+    s.unsteadiness = 1.0
+
+
+@inner
+def _bridge(s: Record, h: float, rate: Vec, imu: ImuCalibration) -> None:
+    """Heading across a gap, at the mean of the rates at its ends."""
+    turn = angular_rate(s, vec.scale(0.5, vec.axpy(1.0, vec.load(s.newest_rate), rate)))
+    integrate(s, vec.scale(h, turn), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+    gap = min(max(h, s.blind_s), 3.0)
+    add_noise(s, rotation_variance(gap, gap, imu), 0.0)
+    s.rest_s = 0.0
+
+
+@inner
+def _advance(
+    s: Record, time_s: float, dead: bool, has_force: bool, force: Vec, has_rate: bool, rate: Vec, imu: ImuCalibration,
+    q: Record,
+) -> bool:  # fmt: skip
+    """One sample later. False where its reading is rejected as a spike."""
+    before_force, before_rate, newest = vec.load(s.force), vec.load(s.rate), vec.load(s.newest_rate)
+    had_rate = s.blind_s == 0.0
+    h = time_s - s.time
+    # A saturated reading is the nearest there is; a missing one is replaced by the last.
+    clipped = not has_force and is_bounded(force) and not dead
+    s.clipped_s = s.clipped_s + h if clipped else 0.0
+    s.no_force_s = 0.0 if has_force or clipped else s.no_force_s + h
+    force = force if has_force or clipped else before_force
+    rate = rate if has_rate or is_bounded(rate) else newest
+    waits = has_force and has_rate and h < LONGEST_HOLD_S and _same(force, before_force)
+    jerk = vec.minus(rate, newest)
+    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
+    if time_s > s.turned_at and not (waits and (jumped or _same(rate, newest))):
+        _turn(s, time_s - s.turned_at, has_rate, rate, jumped, imu)
+    if waits:
+        return True
+    change = vec.minus(force, before_force)
+    jumped = q.has_joint > 0.0 and (jumped or vec.dot(change, change) > _JUMP_M_S2**2)
+    if jumped and s.span > 0.0:  # so that this reading is judged alone
+        _update(s, had_rate, _NO_JUMP, before_rate, before_rate, imu, q)
+    _integrate(s, h, force, change, imu)
+    if has_force and has_rate:
+        follow_rest(s, force, rate, h, imu)
+    if not q.has_joint:
+        follow_speed(s, vec.scale(h, angular_rate(s, rate)), force, h, q)
+        if has_force and has_rate:
+            follow_steadiness(s, force, rate, h, imu, q)
+    taken = True
+    if jumped or s.span > _UPDATE_INTERVAL_S:
+        taken = _update(s, has_rate, jumped, before_rate, rate, imu, q)
+    if not taken:
+        # A spike: its effect on this step is uncertain, and the next step does without it.
+        add_noise(s, 0.0, 0.25 * h * h * vec.dot(change, change))
+        rate, force, change = before_rate, before_force, (0.0, 0.0, 0.0)
+    s.time = s.turned_at = time_s
+    s.angle_variance = 0.0
+    vec.store(s.angle, (0.0, 0.0, 0.0))
+    vec.store(s.force, force)
+    vec.store(s.rate, rate)
+    vec.store(s.newest_rate, rate)
+    vec.store(s.force_change, change)
+    _restart_if_lost(s, force, rate, imu, q)
+    return taken
+
+
+@inner
+def _turn(s: Record, step: float, has_rate: bool, rate: Vec, jumped: bool, imu: ImuCalibration) -> None:
+    """Sum the rotation, gyro bias included, up to a new rate, and its variance."""
+    s.blind_s = blind_for(s.blind_s, step, has_rate, _LONGEST_BLIND_S)
+    newest = vec.load(s.newest_rate)
+    angle = vec.axpy(0.5 * step, newest, vec.load(s.angle))
+    vec.store(s.angle, vec.axpy(0.5 * step, newest if jumped else rate, angle))
+    s.angle_variance += rotation_variance(step, s.blind_s, imu)
+    if jumped:
+        jerk = vec.minus(rate, newest)
+        s.angle_variance += 0.25 * step * step * vec.dot(jerk, jerk)
+    s.turned_at += step
+    vec.store(s.newest_rate, rate)
+
+
+@inner
+def _integrate(s: Record, h: float, force: Vec, change: Vec, imu: ImuCalibration) -> None:
+    """Advance the mean by a step `h`, and accumulate what the covariance needs of it."""
+    before = vec.load(s.force)
+    bend = vec.minus(change, vec.load(s.force_change))
+    turn = corrected(s.nominal, MG, vec.axpy(-h, vec.load(s.gyro_bias), vec.load(s.angle)))
+    begin, end = specific_force(s, before), specific_force(s, force)
+    integrate(s, turn, begin, end, bend if s.no_force_s == 0.0 else (0.0, 0.0, 0.0), h)
+    s.span += h
+    s.rotation_variance += s.angle_variance
+    s.velocity_variance += velocity_variance(s, change, bend, h, imu)
+    vec.store(s.turned, vec.axpy(1.0, turn, vec.load(s.turned)))
+    vec.store(s.impulse, vec.axpy(0.5 * h, vec.axpy(1.0, before, force), vec.load(s.impulse)))
+
+
+@inner
+def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> bool:
+    """Bring the covariance up to the mean and apply the measurements. False where the reading is rejected."""
+    h, impulse, taken = s.span, vec.load(s.impulse), True
+    lasting = max(2.0 * q.correlation_s / h, 1.0)
+    rotation = lasting * q.gyro_misfit**2 * vec.dot(vec.load(s.turned), vec.load(s.turned))
+    velocity = lasting * q.accel_misfit**2 * vec.dot(impulse, impulse)
+    force = _steady_force(s, vec.scale(1.0 / h, impulse), imu)
+    propagate_covariance(s, force, rotation, velocity, q.gyro_bias_walk_rad_s**2 * h)
+    clear_increments(s)
+    for i in range(D, PSI):
+        s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[D, D] * h
+    decay_to_prior(s, h)
+    if q.has_joint:
+        update_bias_from_rest(s)
+        if has_rate:
+            taken = update_joint_velocity(s, jumped, before, rate, h, imu, q)
+    else:
+        update_free_velocity(s, h, q)
+        if has_rate and s.no_force_s + s.clipped_s == 0.0:
+            update_bias_from_steadiness(s, rate, h, imu, q)
+    s.distance = _distance(s)
+    return taken
+
+
+@inner
+def _steady_force(s: Record, force: Vec, imu: ImuCalibration) -> Vec:
+    """The force, as far as it has moved by more than noise does.
+
+    At rest, a force with its noise would update the accelerometer's matrix: the same noise is in v.
+    """
+    slack = _STEADY_SIGMAS * math.sqrt(imu.accel_variance)
+    steady = vec.load(s.steady_force)
+    ahead = vec.minus(force, steady)
+    distance = math.sqrt(vec.dot(ahead, ahead))
+    if distance > slack:
+        steady = vec.axpy(1.0 - slack / distance, ahead, steady)
+        vec.store(s.steady_force, steady)
+    return steady
+
+
+@inner
+def _distance(s: Record) -> float:
+    """Half the χ² of the estimated sensor errors under the prior; the gyro bias is left out: it may be any."""
+    square = 0.0
+    for i in range(BA, D):
+        square += s.nominal[i] * s.nominal[i] / s.prior[i]
+    return 0.5 * square
+
+
+@inner
+def _restart_if_lost(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
+    """Begin anew where the state is impossible; align anew, keeping what was learned, where the tilt is lost."""
+    bg, ba, d = vec.load(s.gyro_bias), vec.load(s.accel_bias), vec.load(s.j2s)
+    attitude = vec.trace(sub_covariance(s.covariance, Z))
+    possible = (
+        vec.dot(bg, bg) < q.largest_bias_rad_s**2
+        and vec.dot(ba, ba) < _LARGEST_ACCEL_BIAS_M_S2**2
+        and vec.dot(d, d) < _LARGEST_J2S_M**2
+        and s.distance < s.largest_distance
+        and attitude < 1e6
+        and math.isfinite(s.nominal[V] + s.nominal[V + 1] + s.nominal[V + 2] + s.tilt[0])
+        and math.isfinite(vec.trace(sub_covariance(s.covariance, V)) + vec.trace(sub_covariance(s.covariance, D)))
+    )
+    lost = q.has_joint > 0.0 and s.residual_square > _LOST * max(s.reach_square, _LOST_M2_S2)
+    if possible and not lost:
+        return
+    s.restarts += 1
+    clear_increments(s)
+    _begin(s, force, rate, imu, q)
+
+
+@inner
+def _same(a: Vec, b: Vec) -> bool:
+    return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
+
+
+@inner
+def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
+    """The estimate at the time of the stamp: the readings' delay, and a step that waits, are extrapolated."""
+    bias = vec.load(s.gyro_bias)
+    ahead = vec.scale(imu.delay, vec.minus(vec.load(s.newest_rate), bias))
+    if s.time < time_s < math.inf:  # while the step waits
+        ahead = vec.axpy(1.0, vec.load(s.angle), ahead)
+        ahead = vec.axpy(time_s - s.turned_at, vec.load(s.newest_rate), ahead)
+        ahead = vec.axpy(s.time - time_s, bias, ahead)
+    ahead = corrected(s.nominal, MG, ahead)
+    tilt, north = vec.turn_back(ahead, vec.load(s.tilt)), vec.turn_back(ahead, vec.load(s.north))
+    west, d = vec.cross(tilt, north), vec.load(s.j2s)
+    vec.store(row.tilt, tilt)
+    row.height, row.x, row.y = vec.dot(tilt, d), vec.dot(north, d), vec.dot(west, d)
+    row.height_std = _height_std(s, tilt, d, vec.axpy(1.0, vec.load(s.turned), ahead))
+    row.yaw = math.atan2(west[0], north[0])
+    row.yaw_std = _yaw_std(s, tilt, north, west)
+    row.distance = s.distance
+    if math.isnan(s.time) or max(s.blind_s, s.no_force_s) > _NO_SENSOR_S:
+        vec.store(row.tilt, (math.nan, math.nan, math.nan))
+        row.height = row.height_std = row.x = row.y = row.yaw = row.yaw_std = math.nan
+    elif vec.quadratic(sub_covariance(s.covariance, D), tilt) > _UNKNOWN_HEIGHT_M**2:
+        row.height = row.height_std = row.x = row.y = math.nan
+
+
+@inner
+def _yaw_std(s: Record, tilt: Vec, north: Vec, west: Vec) -> float:
+    """σ of the yaw, atan2(Y_x, X_x) (rad).
+
+    The attitude error is the rotation θ = ψ Z − Z × δZ, which turns X by X × θ and Y by Y × θ.
+    """
+    scale = 1.0 / max(north[0] * north[0] + west[0] * west[0], 1e-4)
+    slope = (0.0, west[0] * north[2] - north[0] * west[2], north[0] * west[1] - west[0] * north[1])
+    slope = vec.scale(scale, slope)
+    along, across = vec.dot(slope, tilt), vec.cross(tilt, slope)
+    p, variance = s.covariance, vec.quadratic(sub_covariance(s.covariance, Z), across)
+    variance += along * along * p[PSI, PSI]
+    for i in range(3):
+        variance += 2.0 * along * across[i] * p[Z + i, PSI]
+    return math.sqrt(max(variance, 0.0))
+
+
+@inner
+def _height_std(s: Record, tilt: Vec, d: Vec, turned: Vec) -> float:
+    """σ of Zᵀd (m), the sensor having `turned` (rad) since the covariance was propagated: δ(Zᵀd) = dᵀδZ + Zᵀδd."""
+    p, lever = s.covariance, vec.turn_back(vec.scale(-1.0, turned), d)
+    variance = vec.quadratic(sub_covariance(p, Z), lever) + vec.quadratic(sub_covariance(p, D), tilt)
+    for i in range(3):
+        for j in range(3):
+            variance += 2.0 * lever[i] * tilt[j] * p[Z + i, D + j]
+    return math.sqrt(max(variance, 0.0))

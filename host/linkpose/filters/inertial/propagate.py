@@ -1,0 +1,211 @@
+"""Propagation of mean and covariance between corrections.
+
+The mean advances at each sample: the exact rotation of the mean rate over the step, the velocity by the trapezoid with
+its ends corrected. The covariance follows some 25 times in a second, over the accumulated increments.
+"""
+
+from __future__ import annotations
+
+import math
+
+from linkpose.compiling import inner
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import GRAVITY, ImuCalibration
+from linkpose.filters._vector import Vec
+from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, Floats, Record, V, Z
+
+# Acceleration that a step without a force may hold (m/s², 1σ): a blow. The velocity is then unknown after a few
+# samples, which is the intention. Doubling it changes nothing visible.
+GAP_ACCEL_M_S2 = 200.0
+# A saturated reading is the nearest value that there is. How far the true one is beyond it grows with the time clipped:
+# a swinging link of 1 m at 6 rad/s changes its acceleration by some 100 m/s² in a second (m/s³, 1σ).
+_CLIPPED_M_S3 = 100.0
+# And it may be a glitch: this share of its change since the last reading counts as σ.
+_CLIPPED_SHARE = 0.5
+_BEND = 1.0 / 12.0  # trapezoid against a parabola: share of the force's second difference (Euler-Maclaurin)
+_BENT = 1.0 / 24.0  # parabola against a cubic: share of the third difference, which the second bounds
+# Interval between two decays of the sensor errors (s): it saves time only, decay constants are 200 s and more.
+_DECAY_INTERVAL_S = 0.5
+
+
+@inner
+def corrected(mean: Floats, matrix: int, reading: Vec) -> Vec:
+    """(I − M) reading, with M in the mean from index `matrix` on."""
+    m, x, y, z = matrix, reading[0], reading[1], reading[2]
+    return (
+        x - mean[m] * x - mean[m + 1] * y - mean[m + 2] * z,
+        y - mean[m + 3] * x - mean[m + 4] * y - mean[m + 5] * z,
+        z - mean[m + 6] * x - mean[m + 7] * y - mean[m + 8] * z,
+    )
+
+
+@inner
+def specific_force(s: Record, reading: Vec) -> Vec:
+    """f = (I − M_a) s_A − b_a (m/s²)."""
+    return vec.minus(corrected(s.nominal, MA, reading), vec.load(s.accel_bias))
+
+
+@inner
+def angular_rate(s: Record, reading: Vec) -> Vec:
+    """ω = (I − M_g) (s_G − b_g) (rad/s)."""
+    return corrected(s.nominal, MG, vec.minus(reading, vec.load(s.gyro_bias)))
+
+
+@inner
+def rotate_attitude(s: Record, turn: Vec) -> None:
+    """Z and X after the sensor has turned by `turn` (rad), orthonormal again."""
+    tilt = vec.unit(vec.turn_back(turn, vec.load(s.tilt)))
+    north = vec.turn_back(turn, vec.load(s.north))
+    vec.store(s.tilt, tilt)
+    vec.store(s.north, vec.unit(vec.axpy(-vec.dot(north, tilt), tilt, north)))
+
+
+@inner
+def integrate(s: Record, turn: Vec, begin: Vec, end: Vec, bend: Vec, h: float) -> None:
+    """Attitude and velocity after a step `h` that turns the sensor by `turn`, with f `begin` and `end` at its ends.
+
+    `bend` is the second difference of f. Summed over many steps its share is the Euler-Maclaurin correction of the
+    trapezoid, the first difference at either end.
+    """
+    g = -GRAVITY
+    v = vec.axpy(0.5 * h, vec.axpy(g, vec.load(s.tilt), begin), vec.load(s.velocity))
+    v = vec.turn_back(turn, v)
+    rotate_attitude(s, turn)
+    v = vec.axpy(0.5 * h, vec.axpy(g, vec.load(s.tilt), end), v)
+    vec.store(s.velocity, vec.axpy(-_BEND * h, bend, v))
+
+
+@inner
+def velocity_variance(s: Record, change: Vec, bend: Vec, h: float, imu: ImuCalibration) -> float:
+    """Variance (m²/s²) of the velocity gained over a step: noise, and a second difference that may change."""
+    unknown = _BENT * math.sqrt(vec.dot(bend, bend))
+    if s.clipped_s > 0.0:
+        unknown += _CLIPPED_M_S3 * s.clipped_s + _CLIPPED_SHARE * math.sqrt(vec.dot(change, change))
+    if s.no_force_s > 0.0:
+        unknown = GAP_ACCEL_M_S2
+    return (imu.accel_variance + min(unknown, GAP_ACCEL_M_S2) ** 2) * h * h
+
+
+@inner
+def fill_transition(s: Record, rate: Vec, force: Vec) -> None:
+    """Rows of the transition matrix F for the errors of Z, v and ψ over the accumulated increments.
+
+    `rate` (rad/s) and `force` (m/s²) are the mean readings, which multiply M_g and M_a. With R = exp(−[turned×]),
+
+        δZ' = R δZ + h Z × δω                                 δω = −δb_g − δM_g s_G
+        δv' = R δv − g h R δZ + h (v × δω + δf)               δf = −δb_a − δM_a s_A
+        ψ' = ψ + h Zᵀδω
+    """
+    f, h, x = s.transition, s.span, s.nominal
+    for i in range(7):
+        for j in range(SIZE):
+            f[i, j] = 0.0
+    turn = vec.load(s.turned)
+    for k in range(3):
+        column = vec.turn_back(turn, (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0))
+        for c in range(3):
+            f[Z + c, Z + k] = column[c]
+            f[V + c, V + k] = column[c]
+            f[V + c, Z + k] = -GRAVITY * h * column[c]
+    f[6, PSI] = 1.0
+    for c in range(3):
+        a, b = (c + 1) % 3, (c + 2) % 3
+        f[V + c, BA + c] = -h
+        f[6, BG + c] = -h * x[Z + c]
+        for first in range(0, 6, 3):  # Z × δω, v × δω
+            f[first + c, BG + b] = -h * x[first + a]
+            f[first + c, BG + a] = h * x[first + b]
+        for k in range(3):
+            f[V + c, MA + 3 * c + k] = -h * force[k]
+            f[6, MG + 3 * c + k] = -h * x[Z + c] * rate[k]
+            for first in range(0, 6, 3):
+                f[first + c, MG + 3 * b + k] = -h * x[first + a] * rate[k]
+                f[first + c, MG + 3 * a + k] = h * x[first + b] * rate[k]
+
+
+@inner
+def apply_transition(s: Record) -> None:
+    """P ← F P Fᵀ; only the rows and columns of Z, v and ψ change."""
+    p, f, w = s.covariance, s.transition, s.work
+    for i in range(7):
+        for j in range(SIZE):
+            w[i, j] = 0.0
+        for k in range(SIZE):
+            share = f[i, k]
+            if share != 0.0:
+                for j in range(SIZE):
+                    w[i, j] += share * p[k, j]
+    for i in range(7):
+        row = i if i < 6 else PSI
+        for j in range(6, PSI):
+            p[row, j] = p[j, row] = w[i, j]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(SIZE):
+                total += w[i, k] * f[j, k]
+            p[row, j if j < 6 else PSI] = p[j if j < 6 else PSI, row] = total
+
+
+@inner
+def add_noise(s: Record, rotation: float, velocity: float) -> None:
+    """Add the noise of a step: variances, on each axis, of its rotation (rad²) and of the velocity gained (m²/s²).
+
+    A wrong rotation n turns all: δZ += Z × n, δv += v × n, ψ += Zᵀn.
+    """
+    p, z, v = s.covariance, vec.load(s.tilt), vec.load(s.velocity)
+    zz, zv, vv, heading = vec.dot(z, z), vec.dot(z, v), vec.dot(v, v), vec.cross(v, z)
+    p[PSI, PSI] += rotation * zz
+    for i in range(3):
+        p[Z + i, Z + i] += rotation * zz
+        p[V + i, V + i] += rotation * vv + velocity
+        p[Z + i, V + i] += rotation * zv
+        p[V + i, Z + i] += rotation * zv
+        p[V + i, PSI] += rotation * heading[i]
+        p[PSI, V + i] += rotation * heading[i]
+        for j in range(3):
+            p[Z + i, Z + j] -= rotation * z[i] * z[j]
+            p[V + i, V + j] -= rotation * v[i] * v[j]
+            p[Z + i, V + j] -= rotation * v[i] * z[j]
+            p[V + j, Z + i] -= rotation * v[i] * z[j]
+
+
+@inner
+def propagate_covariance(s: Record, force: Vec, rotation: float, velocity: float, bias_walk: float) -> None:
+    """P ← F P Fᵀ + Q over the accumulated increments.
+
+    `force` (m/s²) is the mean reading; `rotation` (rad²), `velocity` (m²/s²) and `bias_walk` ((rad/s)²) are added to
+    the variances of the readings' noise.
+    """
+    fill_transition(s, vec.scale(1.0 / s.span, vec.load(s.turned)), force)
+    apply_transition(s)
+    add_noise(s, s.rotation_variance + rotation, s.velocity_variance + velocity)
+    for i in range(BG, BA):
+        s.covariance[i, i] += bias_walk
+
+
+@inner
+def clear_increments(s: Record) -> None:
+    """Start to accumulate anew."""
+    s.span = s.rotation_variance = s.velocity_variance = 0.0
+    vec.store(s.turned, (0.0, 0.0, 0.0))
+    vec.store(s.impulse, (0.0, 0.0, 0.0))
+
+
+@inner
+def decay_to_prior(s: Record, h: float) -> None:
+    """Return the estimated sensor errors, gyro bias excepted, towards their start: a first-order Gauss-Markov process.
+
+    An error of the model therefore does not stay in them for ever.
+    """
+    s.undecayed_s += h
+    if s.undecayed_s <= _DECAY_INTERVAL_S:
+        return
+    p, kept = s.covariance, math.exp(-s.undecayed_s / s.decay_s)
+    s.undecayed_s = 0.0
+    for i in range(BA, D):
+        s.nominal[i] = s.start_mean[i] + kept * (s.nominal[i] - s.start_mean[i])
+        for j in range(SIZE):
+            p[i, j] *= kept
+        for j in range(SIZE):
+            p[j, i] *= kept
+        p[i, i] += (1.0 - kept * kept) * s.prior[i]

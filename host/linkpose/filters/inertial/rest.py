@@ -1,0 +1,80 @@
+"""Rest as a measurement of the gyro bias: by a test of stillness, and without a threshold by steadiness."""
+
+from __future__ import annotations
+
+from linkpose.compiling import inner
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import GRAVITY, ImuCalibration
+from linkpose.filters._vector import Vec
+from linkpose.filters.inertial.state import BA, BG, Record
+from linkpose.filters.inertial.update import constrain_attitude, sub_covariance, update_scalar
+
+_REST_S = 0.5  # of stillness before the mean rate counts as the bias (s): longer than a turning point of a slow swing
+_REST_STD_RAD_S = 0.001  # rate of a link that is held still (1σ): a hand's tremor through a metre of lever
+_REST_SIGMAS = 5.0  # within which the readings must stay: one sound sample in 10⁶ ends a rest
+_TURN_SIGMAS = 3.0  # a mean rate this far from the bias estimate is a turn at constant rate
+_GATE = 25.0  # χ² with one degree of freedom: five standard deviations
+
+
+@inner
+def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> None:
+    """Measure how long neither force nor rate has left its noise."""
+    still = s.rest_s
+    change = vec.minus(force, vec.load(s.rest_force))
+    drift = vec.axpy(-1.0, vec.load(s.rest_rate_sum), vec.scale(still, rate))
+    width = 3.0 * _REST_SIGMAS**2
+    steady = vec.dot(change, change) < width * imu.accel_variance
+    steady = steady and vec.dot(drift, drift) < width * (imu.gyro_variance + _REST_STD_RAD_S**2) * still * still
+    if still > 0.0 and not steady:
+        s.rest_s = 0.0
+        return
+    if still == 0.0:
+        vec.store(s.rest_force, force)
+        vec.store(s.rest_rate_sum, (0.0, 0.0, 0.0))
+    s.rest_s = still + h
+    vec.store(s.rest_rate_sum, vec.axpy(h, rate, vec.load(s.rest_rate_sum)))
+
+
+@inner
+def update_bias_from_rest(s: Record) -> None:
+    """The gyro bias is the mean rate since the rest began, where that adds to what is known and is possible."""
+    p, variance = s.covariance, _REST_STD_RAD_S**2
+    if s.rest_s <= _REST_S or vec.trace(sub_covariance(p, BG)) <= 6.0 * variance:
+        return
+    for j in range(3):
+        innovation = s.rest_rate_sum[j] / s.rest_s - s.nominal[BG + j]
+        if innovation * innovation > _TURN_SIGMAS**2 * (p[BG + j, BG + j] + variance):
+            return
+    for j in range(3):
+        update_scalar(s, BG + j, s.rest_rate_sum[j] / s.rest_s - s.nominal[BG + j], variance)
+    constrain_attitude(s)
+
+
+@inner
+def follow_steadiness(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration, q: Record) -> None:
+    """Measure by how much rate and force have changed over the memory."""
+    keep = min(h / q.steady_memory_s, 1.0)
+    mean_force, mean_rate = vec.load(s.mean_force), vec.load(s.mean_rate)
+    moved, turned = vec.minus(force, mean_force), vec.minus(rate, mean_rate)
+    vec.store(s.mean_force, vec.axpy(keep, moved, mean_force))
+    vec.store(s.mean_rate, vec.axpy(keep, turned, mean_rate))
+    # A force that turns by so much in this time is that rate of turn.
+    leaning = max(vec.dot(moved, moved) - 6.0 * imu.accel_variance, 0.0) / (GRAVITY * q.steady_memory_s) ** 2
+    s.unsteadiness += keep * (vec.dot(turned, turned) + leaning - s.unsteadiness)
+
+
+@inner
+def update_bias_from_steadiness(s: Record, rate: Vec, h: float, imu: ImuCalibration, q: Record) -> None:
+    """s_G = b_g + e: the less rate and force change, the smaller e."""
+    p = s.covariance
+    moving = max(s.unsteadiness - 6.0 * imu.gyro_variance, 0.0)
+    variance = q.swing_share**2 * moving + q.least_turn_rad_s**2
+    steady = vec.load(s.mean_rate)
+    if vec.dot(steady, steady) > q.largest_bias_rad_s**2:
+        return  # no bias reaches this: a turn at constant rate
+    noise = variance * max(2.0 * q.steady_memory_s / h, 1.0)
+    for k in range(BG, BA):
+        innovation = rate[k - BG] - s.nominal[k]
+        if innovation * innovation < _GATE * (p[k, k] + variance):  # a bias does not jump
+            update_scalar(s, k, innovation, noise)
+    constrain_attitude(s)

@@ -1,0 +1,178 @@
+"""State, parameters and memory layout of the inertial core.
+
+Frames: n is fixed with Z up; its X axis points where the sensor's x axis pointed, seen from above, at the first sample.
+s is the sensor's frame. The mean holds, all in s:
+
+    Z, X   n's Z and X axes (unit vectors)          Ż = −ω × Z
+    v      velocity of the sensor (m/s)             v̇ = −ω × v + f − g Z
+    b_g    gyro bias (rad/s)                        ω = (I − M_g) (s_G − b_g)
+    b_a    accelerometer bias (m/s²)                f = (I − M_a) s_A − b_a
+    M_a, M_g   scale, cross-axis sensitivity and misalignment of each sensor, nine numbers each
+    d      J2S (m): the vector from the joint centre to the sensor; zero where there is no joint
+
+All errors are additive, that of Z too: given the angular rate, Z and v propagate linearly and the measurements are
+linear in them, so that even a tilt of which nothing is known converges like any linear Kalman filter. ‖Z‖ = 1 is kept
+beside. The error of X is a rotation ψ about Z (rad). The covariance is of these 34 errors, in the order of the
+constants below.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Record = Any  # one record of STATE, ESTIMATE or PARAMETERS; a pointer in compiled code
+
+
+def _index(k: int) -> int:
+    """A NumPy integer: the compiler would take each Python integer for a type of its own."""
+    return cast(int, np.int64(k))
+
+
+# First index of each part of the state.
+Z, V, BG, BA, MA, MG, D, PSI = (_index(k) for k in (0, 3, 6, 9, 12, 21, 30, 33))
+SIZE = 34
+
+_VECTOR = ("f8", (3,))
+_MATRIX = ("f8", (SIZE, SIZE))
+
+_FIELDS = np.dtype(
+    [
+        # Nominal state.
+        ("time", "f8"),  # of the last integrated sample (s); NaN before the first
+        ("north", *_VECTOR),  # X
+        ("nominal", "f8", (SIZE,)),  # Z, v, b_g, b_a, M_a, M_g, d; ψ is zero outside an update
+        ("covariance", *_MATRIX),
+        # Priors.
+        ("start_mean", "f8", (SIZE,)),
+        ("start_covariance", *_MATRIX),
+        ("prior", "f8", (SIZE,)),  # variances of the sensor error parameters
+        ("decay_s", "f8"),  # time constant with which they return to the prior (s)
+        ("undecayed_s", "f8"),  # time since they last did (s)
+        ("distance", "f8"),  # half the χ² of the estimated sensor errors under the prior
+        ("largest_distance", "f8"),  # beyond it the state is impossible
+        # Last readings.
+        ("force", *_VECTOR),  # specific force at `time` (m/s²)
+        ("force_change", *_VECTOR),  # over the last step (m/s²)
+        ("rate", *_VECTOR),  # angular rate at `time` (rad/s)
+        ("newest_rate", *_VECTOR),  # may be newer than `time` while a held force is waited out (rad/s)
+        ("turned_at", "f8"),  # time of the newest rate (s)
+        ("angle", *_VECTOR),  # ∫ rate since `time`, gyro bias included (rad)
+        ("angle_variance", "f8"),  # each axis (rad²)
+        ("blind_s", "f8"),  # how long no usable rate has arrived (s)
+        ("no_force_s", "f8"),  # how long no force has arrived (s)
+        ("clipped_s", "f8"),  # how long the accelerometer has been saturated (s)
+        # Increments accumulated since the last propagation of the covariance.
+        ("span", "f8"),  # s
+        ("turned", *_VECTOR),  # rotation (rad)
+        ("impulse", *_VECTOR),  # ∫ force (m/s)
+        ("rotation_variance", "f8"),  # each axis (rad²)
+        ("velocity_variance", "f8"),  # each axis (m²/s²)
+        # Memory of the measurement models.
+        ("rest_s", "f8"),  # how long the sensor has been at rest (s)
+        ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
+        ("rest_rate_sum", *_VECTOR),  # ∫ rate over the rest (rad)
+        ("steady_force", *_VECTOR),  # force without its noise (m/s²)
+        ("residual_square", "f8"),  # mean square of the joint constraint's excess residual (m²/s²)
+        ("reach_square", "f8"),  # mean of ‖ω‖² ‖d‖² (m²/s²)
+        ("spread", "f8", (3, 3)),  # mean of ω ωᵀ (rad²/s²)
+        ("swing", *_VECTOR),  # velocity that the acceleration of the last second adds up to (m/s)
+        ("speed_square", "f8"),  # variance of the sensor's own velocity (m²/s²)
+        ("mean_force", *_VECTOR),  # over the last tenth of a second (m/s²)
+        ("mean_rate", *_VECTOR),  # rad/s
+        ("unsteadiness", "f8"),  # mean square change of rate and tilt (rad²/s²)
+        # Scratch.
+        ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
+        ("jacobian", "f8", (3, SIZE)),
+        ("work", "f8", (7, SIZE)),
+        # Counters.
+        ("rejected", "i8"),
+        ("restarts", "i8"),
+    ],
+    align=True,
+)
+
+
+def _with_parts(dtype: np.dtype[Any], whole: str, parts: dict[str, int]) -> np.dtype[Any]:
+    """The record with names for vectors of three inside one of its arrays of floats."""
+    names = list(dtype.names or ())
+    offsets = [dtype.fields[name][1] for name in names] if dtype.fields else []
+    begin = offsets[names.index(whole)]
+    return np.dtype(
+        {
+            "names": names + list(parts),
+            "formats": [dtype[name] for name in names] + [np.dtype(_VECTOR)] * len(parts),
+            "offsets": offsets + [begin + 8 * int(k) for k in parts.values()],
+            "itemsize": dtype.itemsize,
+        },
+        align=True,
+    )
+
+
+STATE = _with_parts(_FIELDS, "nominal", {"tilt": Z, "velocity": V, "gyro_bias": BG, "accel_bias": BA, "j2s": D})
+
+ESTIMATE = np.dtype(
+    [
+        ("height", "f8"),  # Zᵀd (m)
+        ("height_std", "f8"),
+        ("tilt", *_VECTOR),
+        ("x", "f8"),  # m
+        ("y", "f8"),
+        ("yaw", "f8"),  # rad
+        ("yaw_std", "f8"),
+        ("distance", "f8"),  # `distance` of the state
+    ],
+    align=True,
+)
+
+
+class SensorErrors(NamedTuple):
+    """How far the sensors may be off: standard deviations of one axis."""
+
+    gyro_bias_rad_s: float
+    gyro_scale: float
+    gyro_cross: float
+    accel_bias_m_s2: float
+    accel_scale: float
+    accel_cross: float
+    decay_s: float  # time constant with which what was estimated returns to the prior (s)
+
+    def variances(self) -> Floats:
+        """Prior variance of each state (34,); 0 for attitude, velocity, J2S and heading."""
+        accel = np.where(np.eye(3, dtype=bool), self.accel_scale, self.accel_cross)
+        gyro = np.where(np.eye(3, dtype=bool), self.gyro_scale, self.gyro_cross)
+        biases = 3 * [self.gyro_bias_rad_s] + 3 * [self.accel_bias_m_s2]
+        return np.concatenate([np.zeros(6), biases, accel.ravel(), gyro.ravel(), np.zeros(4)]) ** 2
+
+
+def record_of(parameters: NamedTuple) -> Any:
+    """Parameters as an array of one record, which compiled code reads by name through one pointer."""
+    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
+    return np.array([tuple(parameters)], dtype=dtype).view(np.recarray)
+
+
+def fresh_state(
+    errors: SensorErrors, j2s_m: tuple[float, float, float], j2s_std_m: float, largest_distance: float = np.inf
+) -> Any:
+    """An array of one state record before the first sample; J2S is assumed accurate to `j2s_std_m` on each axis.
+
+    `largest_distance`: half the χ² of the sensor errors beyond which the filter begins anew.
+    """
+    states = np.zeros(1, STATE).view(np.recarray)
+    state: Any = states[0]
+    state.time = np.nan
+    state.prior[:] = errors.variances()
+    state.start_mean[D:PSI] = j2s_m
+    state.start_covariance[:] = np.diag(state.prior + np.repeat([0.0, j2s_std_m**2, 0.0], [D, 3, 1]))
+    state.decay_s = errors.decay_s
+    state.largest_distance = largest_distance
+    return states
+
+
+def roll_pitch_deg(tilt: Floats) -> tuple[Floats, Floats]:
+    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖) (degrees, (N,)) of tilts (N, 3) of any length."""
+    roll = np.arctan2(tilt[:, 1], tilt[:, 2])
+    return np.degrees(roll), np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2])))

@@ -1,0 +1,99 @@
+"""Figures, files and the style that all plots share."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from linkpose.errors import CannotWrite, FileError, FileExists
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = (".png", ".svg", ".pdf")
+
+# Okabe and Ito's palette, which colour-blind readers can tell apart: one colour per filter, in every plot.
+_BLUE, _PURPLE, _RED, _ORANGE, _GREEN, _SKY = "#0072B2", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#56B4E9"
+_GREY = "#8A8A8A"
+COLOURS = {
+    "joint-inertial": _BLUE, "tilt-inertial": _PURPLE, "joint": _RED, "tilt": _ORANGE, "imu-baro": _GREEN,
+    "baro": _GREY, "planar-ekf": _BLUE, "planar-ukf": _PURPLE, "mice": _ORANGE, "chain": _BLUE,
+    "ekf": _BLUE, "ukf": _PURPLE, "mcl": _GREEN, "scan": _RED,
+}  # fmt: skip
+AXES_COLOURS = {"x": _RED, "y": _GREEN, "z": _BLUE}
+OTHERS = (_SKY, _GREEN, _ORANGE, _RED)  # of series that are no filter: mice, beacons
+TRUTH: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.1, "zorder": 5}
+REFERENCES = ("truth", "reference")  # labels of what is drawn as TRUTH
+BAND_ALPHA = 0.18
+_BEST = ("joint-inertial", "planar-ekf", "chain")  # drawn thick
+_BESIDES = ("-", ":", "-.")  # the second and third file
+
+
+def new_figure(width_inches: float, height_inches: float) -> Figure:
+    """An empty figure."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_inches, height_inches), layout="constrained")
+
+
+def line_style(name: str, file: int = 0) -> dict[str, Any]:
+    """How a filter is drawn; `file` numbers the files that are drawn together."""
+    colour = COLOURS.get(name) or OTHERS[sum(name.encode()) % len(OTHERS)]
+    return {
+        "color": colour,
+        "linewidth": 2.0 if name in _BEST else 1.0,
+        "linestyle": _BESIDES[min(file, len(_BESIDES) - 1)],
+        "zorder": 3 if name in _BEST else 2,
+    }
+
+
+def finish(axes: Axes, label: str) -> None:
+    """Label of the y axis, grid, and no frame above and right."""
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.25, linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.margins(x=0.0)
+
+
+def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -> None:
+    """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
+    rank = {label: i for i, label in enumerate(best_first)}
+
+    def place(item: tuple[object, str]) -> int:
+        return -1 if item[1] in REFERENCES and best_first else rank.get(item[1], len(rank))
+
+    order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
+    once = {label: handle for handle, label in order}
+    if once:
+        axes.legend(
+            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False,
+            fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
+        )  # fmt: skip
+
+
+def check_output(path: Path | None, force: bool) -> None:
+    """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
+    if path is None:
+        return
+    if path.suffix.lower() not in FORMATS:
+        raise FileError(path, f"{path} is no picture that linkpose writes; its name must end in {', '.join(FORMATS)}")
+    if path.exists() and not force:
+        raise FileExists(path)
+    if not path.absolute().parent.is_dir():
+        raise CannotWrite(path, f"there is no folder {path.absolute().parent}")
+
+
+def save(figure: Figure, path: Path, force: bool) -> None:
+    """Writes the picture in the format that the file's ending names. Raises FileError as `check_output` does, and
+    where the file cannot be written.
+    """
+    check_output(path, force)
+    # Two pictures of the same data are the same file.
+    metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}
+    try:
+        figure.savefig(path, dpi=130, metadata=metadata.get(path.suffix.lower()))
+    except (OSError, ValueError) as error:
+        raise CannotWrite(path, str(error)) from error

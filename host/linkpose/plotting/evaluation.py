@@ -1,0 +1,150 @@
+"""The plot of an evaluation: errors with ±2σ, the distribution of error/σ, and the table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose import filters
+from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
+from linkpose.plotting.lines import band, draw, shade
+from linkpose.plotting.panels import bound_view
+from linkpose.quantities import unit_text
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from linkpose.evaluation.errors import Errors
+    from linkpose.evaluation.scores import Evaluation, Score
+
+_VECTOR_PARTS = {"position": ("x", "y", "z"), "velocity": ("vx", "vy")}
+_TABLE_ROW_INCHES = 0.21
+_BINS = np.linspace(-4, 4, 41)
+
+
+def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
+    """One row for each quantity: errors of the filters over time, and how error/σ is distributed; the table below.
+
+    Filters whose height comes from the air pressure are in the table only, unless there are no others.
+    """
+    shown = _shown(found.scores)
+    names = _quantities(shown)
+    rows = sum(len(score.errors) for score in found.scores)
+    table_inches = 0.5 + _TABLE_ROW_INCHES * (rows + 1)
+    figure = new_figure(11.0, 0.7 + 2.1 * len(names) + table_inches)
+    offset = found.scores[0].time_offset_s
+    aligned = f"   ·   clocks aligned by {offset:+.4f} s" if offset else ""
+    figure.suptitle(f"{estimate} against {reference}{aligned}", fontsize=10, x=0.01, ha="left")
+    grid = figure.add_gridspec(
+        len(names) + 1, 2, width_ratios=[2.6, 1], height_ratios=[2.1] * len(names) + [table_inches]
+    )
+    first: Axes | None = None
+    for row, name in enumerate(names):
+        has_sigma = any(name in s.errors and s.errors[name].statistics().nees is not None for s in shown)
+        axes = figure.add_subplot(grid[row, 0] if has_sigma else grid[row, :], sharex=first)
+        first = first or axes
+        _errors(axes, shown, name)
+        if row == len(names) - 1:
+            axes.set_xlabel("time (s)")
+        if has_sigma:
+            _histogram(figure.add_subplot(grid[row, 1]), shown, name)
+    _table(figure.add_subplot(grid[-1, :]), found.scores)
+    return figure
+
+
+def _shown(scores: Sequence[Score]) -> list[Score]:
+    quiet = [s for s in scores if not ((of := filters.capabilities(s.filter)) and of.is_barometric)]
+    return quiet or list(scores)
+
+
+def _quantities(scores: Sequence[Score]) -> list[str]:
+    """Names in the order of the first filter that has them, the height first; a vector in place of its components."""
+    names = list(dict.fromkeys(name for score in scores for name in score.errors))
+    for vector, parts in _VECTOR_PARTS.items():
+        if vector in names:
+            names = [name for name in names if name not in parts]
+    return names
+
+
+def _errors(axes: Axes, scores: Sequence[Score], name: str) -> None:
+    unit, drawn, stds = "", list[Floats](), list[Floats]()
+    for score in scores:
+        of = score.errors.get(name)
+        if of is None:
+            continue
+        unit = unit_text(of.unit)
+        label = f"{score.filter} {of.statistics().rmse:.3g} {unit} rms"
+        draw(axes, of.time_s, of.error, label=label, **line_style(score.filter))
+        drawn.append(of.error)
+        if of.std is not None and not stds:
+            stds.append(of.std)
+            colour = str(line_style(score.filter)["color"])
+            band(axes, of.time_s, np.zeros(len(of.time_s)), of.std, colour, f"±2σ {score.filter}")
+    first = next(score.errors[name] for score in scores if name in score.errors)
+    shade(axes, first.time_s, ~np.isfinite(first.error))
+    axes.axhline(0.0, color="black", linewidth=0.6)
+    bound_view(axes, drawn, stds)
+    finish(axes, f"{name} error ({unit})")
+    legend_above(axes, 4)
+
+
+def _histogram(axes: Axes, scores: Sequence[Score], name: str) -> None:
+    """Density of error/σ of each filter beside the normal one."""
+    for score in scores:
+        of = score.errors.get(name)
+        if of is None or of.std is None:
+            continue
+        share = of.statistics().within_2sigma
+        values = _normalised(of)
+        if share is None or not len(values):
+            continue
+        density = np.histogram(np.clip(values, _BINS[0], _BINS[-1]), _BINS, density=True)[0]
+        style = line_style(score.filter)
+        axes.stairs(
+            density,
+            _BINS,
+            color=style["color"],
+            linewidth=style["linewidth"],
+            label=f"{score.filter} {100 * share:.0f} %",
+        )
+    at = np.linspace(_BINS[0], _BINS[-1], 200)
+    axes.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi), color="black", linestyle="--", linewidth=1.0)
+    axes.axvspan(-2, 2, color="black", alpha=0.06, linewidth=0)
+    finish(axes, "density")
+    axes.set_xlabel("error / σ; legend: share within ±2σ (95 % expected)", fontsize=7)
+    legend_above(axes, 2)
+
+
+def _normalised(of: Errors) -> Floats:
+    std = of.std if of.std is not None else np.full(len(of.error), np.nan)
+    known = np.isfinite(of.error) & np.isfinite(std)
+    return np.asarray(of.error[known] / np.maximum(std[known], of.least_std))
+
+
+def _table(axes: Axes, scores: Sequence[Score]) -> None:
+    rows, colours = [], []
+    for score in scores:
+        for name, value in score.statistics().items():
+            unit = unit_text(score.errors[name].unit)
+            figures = [f"{v:.3g}" for v in (value.rmse, value.mean, value.worst, value.p95)]
+            sigma = ["", ""]
+            if value.nees is not None and value.within_2sigma is not None:
+                sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
+            rows.append([score.filter, f"{name} ({unit})", *figures, *sigma, str(value.rows)])
+            colours.append(str(line_style(score.filter)["color"]))
+    head = ["filter", "quantity", "RMSE", "mean", "worst", "95 %", "NEES", "within ±2σ", "rows"]
+    axes.axis("off")
+    table = axes.table(rows, colLabels=head, loc="upper center", cellLoc="right", edges="open")
+    table.auto_set_font_size(False)
+    table.set_fontsize(8)
+    for row, colour in enumerate(colours, 1):
+        table[row, 0].get_text().set_color(colour)
+    for (row, column), cell in table.get_celld().items():
+        cell.set_height(1.0 / (len(rows) + 1))
+        cell.visible_edges = "B" if row == 0 else ""
+        cell.set_text_props(ha="left" if column < 2 else "right")
+        cell.PAD = 0.02

@@ -1,0 +1,102 @@
+"""The papers' figures, from `linkpose.experiments`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose.plotting.canvas import OTHERS, TRUTH, finish, legend_above, line_style, new_figure
+from linkpose.plotting.lines import draw
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from linkpose.experiments.link import Traces
+    from linkpose.experiments.mice import PaperRun
+    from linkpose.experiments.variants import Variant
+
+_SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
+_WHOLE = 3  # the Test of which Figure 2 shows the whole run
+_MICE_SHOWN_S = 4.0
+
+
+def paper_figure_2(runs: Sequence[Traces]) -> Figure:
+    """Heights of all methods on Tests 1 to 3, as Figure 2 of [Link]: five seconds of Tests 1 and 2, all of Test 3.
+
+    The axes are scaled to the truth and the inertial filters; barometric heights leave the picture where they are off.
+    """
+    from linkpose.experiments.link import title
+
+    figure = new_figure(10.0, 9.5)
+    figure.suptitle("Height of the sensor over the joint ([Link], Figure 2), simulated, seed 0", fontsize=10)
+    for axes, run in zip(figure.subplots(len(runs), 1), runs, strict=True):
+        best_first = ["joint-inertial", "joint", "tilt", "imu-baro", "baro"]
+        for name in reversed(best_first):
+            style = line_style(name) | ({"alpha": 0.4, "linewidth": 0.7} if name == "baro" else {})
+            draw(axes, run.time_s, 100 * run.height_m[name], label=title(name), **style)
+        draw(axes, run.time_s, 100 * run.truth_m, label="truth", **TRUTH)
+        finish(axes, f"Test {run.test}: height (cm)")
+        inside = np.full(len(run.time_s), True)
+        if run.test != _WHOLE:
+            axes.set_xlim(*_SHOWN_S)
+            inside = (run.time_s >= _SHOWN_S[0]) & (run.time_s <= _SHOWN_S[1])
+        _scale_to(axes, 100 * np.concatenate([run.truth_m[inside], run.height_m["tilt"][inside]]))
+        if run is runs[0]:
+            legend_above(axes, best_first=[title(name) for name in best_first])
+    figure.axes[-1].set_xlabel("time (s)")
+    return figure
+
+
+def _scale_to(axes: Axes, values: Floats) -> None:
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    margin = max(0.6 * (high - low), 1.0)
+    axes.set_ylim(low - margin, high + margin)
+
+
+def redundant_mice(run: PaperRun) -> Figure:
+    """Velocity of each mouse and of all together, as Figures 2 and 3 of [Mice]."""
+    figure = new_figure(11.0, 7.0)
+    axes = figure.subplots(3, 2, sharex=True, sharey="row")
+    labels = ("$v_x$ (cm/s)", "$v_y$ (cm/s)", "ω (rad/s)")
+    fused_style = line_style("planar-ekf")
+    for j, (label, scale) in enumerate(zip(labels, (100.0, 100.0, 1.0), strict=True)):
+        single = run.single[..., j] - (run.single[..., j].mean(axis=0) - run.truth[j] if j == 2 else 0.0)
+        for mouse in range(run.single.shape[1]):
+            style = {"color": OTHERS[mouse % len(OTHERS)], "linewidth": 0.7}
+            axes[j, 0].plot(run.time_s, scale * single[:, mouse], label=f"mouse {mouse + 1}", **style)
+        axes[j, 1].plot(run.time_s, scale * run.fused[:, j], color=fused_style["color"], linewidth=1.0, label="fused")
+        for place in axes[j]:
+            place.axhline(scale * run.truth[j], label="truth", **TRUTH)
+            finish(place, "")
+        axes[j, 0].set_ylabel(label)
+    for place, title in zip(axes[0], ("Each mouse alone (Figure 2)", "Least squares (Figure 3)"), strict=True):
+        place.set_title(title, fontsize=10, pad=20)
+        legend_above(place)
+    for place in axes[-1]:
+        place.set_xlabel("time (s)")
+        place.set_xlim(0, _MICE_SHOWN_S)
+    return figure
+
+
+def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> Figure:
+    """Position error of each variant: a dot for each seed, a bar for the mean."""
+    figure = new_figure(10.0, 1.3 + 0.2 * len(compared))
+    axes = figure.add_subplot()
+    for row, variant in enumerate(compared):
+        errors = [score.position_rmse_m for score in variant.scores]
+        colour = line_style(variant.filter)["color"]
+        axes.plot(errors, [row] * len(errors), "o", color=colour, alpha=0.5, markersize=4, label=variant.filter)
+        axes.plot([variant.position_rmse_m()], [row], "|", color=colour, markersize=11, markeredgewidth=2)
+    axes.set_yticks(range(len(compared)), labels, fontsize=7)
+    axes.set_xscale("log")
+    axes.set_xlabel("position error, rms of a run (m); bars: mean over the seeds")
+    axes.set_title(title, fontsize=10, pad=20)
+    finish(axes, "")
+    axes.margins(x=0.05)
+    axes.invert_yaxis()
+    legend_above(axes)
+    return figure

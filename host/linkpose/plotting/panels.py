@@ -1,0 +1,140 @@
+"""Panels over time that several plots have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
+from linkpose.plotting.lines import band, draw, shade
+from linkpose.plotting.sources import Sources, Track, pairs
+from linkpose.quantities import YAW, Quantity, unit_text
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def has(sources: Sources, *wanted: Quantity) -> bool:
+    """Whether any filter, or where there is none the reference, has one of these quantities."""
+    return any(track.has(q) for track in sources.tracks or sources.all for q in wanted)
+
+
+def shade_unknown(axes: Axes, tracks: Sequence[Track]) -> None:
+    """Shades gaps of the first file, and where none of its filters gives a value."""
+    first = [track for track in tracks if track.file == tracks[0].file and track.values] if tracks else []
+    if first:
+        known = np.logical_or.reduce([np.isfinite(v) for track in first for v in track.values.values()])
+        shade(axes, first[0].time_s, ~np.asarray(known, dtype=np.bool_))
+
+
+def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, period: float | None = None) -> None:
+    """A quantity of all filters with the reference; ±2σ of the best filter. Worse filters lie behind better ones."""
+    drawn = list(pairs(sources.tracks, quantity))
+    for track, value in reversed(drawn):
+        draw(axes, track.time_s, value, period, label=track.label, **line_style(track.name, track.file))
+    if drawn and quantity in drawn[0][0].std:
+        best, value = drawn[0]
+        colour = str(line_style(best.name)["color"])
+        band(axes, best.time_s, value, best.std[quantity], colour, f"±2σ {best.label}")
+    if sources.reference is not None and sources.reference.has(quantity):
+        track = sources.reference
+        value = track.values[quantity]
+        if quantity is YAW and drawn:
+            value = _from_start_of(drawn[0][0], track)
+        draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
+    view_values(axes, [value for _, value in drawn])
+    shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
+    finish(axes, quantity.axis_label)
+    if legend:
+        legend_above(axes, best_first=[track.label for track, _ in drawn])
+
+
+def _from_start_of(estimate: Track, reference: Track) -> Floats:
+    """The reference's yaw, turned to agree with the estimate's where both begin: no filter measures north."""
+    ours, theirs = estimate.values[YAW], reference.values[YAW]
+    known = np.flatnonzero(np.isfinite(ours))
+    seen = np.flatnonzero(np.isfinite(theirs))
+    if not len(known) or not len(seen):
+        return theirs
+    at = seen[np.argmin(np.abs(reference.time_s[seen] - estimate.time_s[known[0]]))]
+    return np.asarray((theirs - theirs[at] + ours[known[0]] + 180.0) % 360.0 - 180.0)
+
+
+def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
+    """Limits the y axis to the values: ±2σ of a filter that has just started is wider than all motion."""
+    known = [value[np.isfinite(value)] for value in values_drawn]
+    together = np.concatenate([k for k in known if len(k)]) if any(len(k) for k in known) else np.zeros(0)
+    if len(together) and together.max() > together.min():
+        low, high = np.quantile(together, [0.0005, 0.9995])
+        margin = 0.08 * (high - low)
+        axes.set_ylim(low - margin, high + margin)
+
+
+def errors(axes: Axes, sources: Sources, name: str) -> None:
+    """Errors of a scored quantity with ±2σ about zero; the legend gives each filter's RMSE."""
+    unit, order = "", list[str]()
+    drawn: list[Floats] = []
+    stds: list[Floats] = []
+    for track in sources.tracks:
+        score = sources.scores.get((track.file, track.name))
+        of = score.errors.get(name) if score else None
+        if of is None:
+            continue
+        unit = unit_text(of.unit)
+        text = f"{track.label} {of.statistics().rmse:.3g} {unit} rms"
+        draw(axes, of.time_s, of.error, label=text, **line_style(track.name, track.file))
+        drawn.append(of.error)
+        if of.std is not None and not order:
+            stds.append(of.std)
+            colour = str(line_style(track.name)["color"])
+            band(axes, of.time_s, np.zeros(len(of.time_s)), of.std, colour, f"±2σ {track.label}")
+        order.append(text)
+    axes.axhline(0.0, color="black", linewidth=0.6)
+    bound_view(axes, drawn, stds)
+    shade_unknown(axes, sources.tracks)
+    finish(axes, f"{name} error ({unit})")
+    legend_above(axes, best_first=order)
+
+
+def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
+    """Without a reference: differences from the best filter, and its ±2σ, in the unit of errors."""
+    drawn = [(track, value) for track, value in pairs(sources.tracks, quantity) if track.file == 0]
+    best, middle = drawn[0]
+    scale = quantity.error.scale / quantity.value.scale
+    order = [f"{best.label} (best)"]
+    differences: list[Floats] = []
+    draw(axes, best.time_s, 0 * middle, label=order[0], **line_style(best.name))
+    for track, value in drawn[1:]:
+        difference = scale * (value - middle)
+        differences.append(difference)
+        rms = float(np.sqrt(np.nanmean(difference**2))) if np.isfinite(difference).any() else np.nan
+        order.append(f"{track.label} {rms:.3g} {unit_text(quantity.error.unit)} rms from it")
+        draw(axes, track.time_s, difference, label=order[-1], **line_style(track.name))
+    if quantity in best.std:
+        colour = str(line_style(best.name)["color"])
+        band(axes, best.time_s, 0 * middle, scale * best.std[quantity], colour, f"±2σ {best.label}")
+    stds = [scale * best.std[quantity]] if quantity in best.std else []
+    bound_view(axes, differences, stds)
+    shade_unknown(axes, sources.tracks)
+    finish(axes, f"from best ({unit_text(quantity.error.unit)})")
+    legend_above(axes, best_first=order)
+
+
+def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> None:
+    """Limits the y axis to 99.5 % of the errors and 90 % of ±2σ, so that a short transient flattens nothing."""
+    sizes = [np.quantile(known, 0.995) for value in errors if len(known := np.abs(value[np.isfinite(value)]))]
+    sizes += [2 * np.quantile(known, 0.9) for std in stds if len(known := std[np.isfinite(std)])]
+    limit = 1.2 * max(map(float, sizes), default=0.0)
+    if limit > 0:
+        axes.set_ylim(-limit, limit)
+
+
+def note_hidden(sources: Sources) -> str:
+    """What the plot leaves out, and how it is drawn; "" where nothing is left out."""
+    if not sources.hidden:
+        return ""
+    names = ", ".join(sources.hidden)
+    return f"not drawn, because air pressure noise hides the height: {names} (add --filter {sources.hidden[0]})"

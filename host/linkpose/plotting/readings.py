@@ -1,0 +1,48 @@
+"""The readings of a recording over time, one panel for each kind and sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, finish, legend_above
+from linkpose.plotting.lines import draw, shade
+from linkpose.quantities import Column, split
+from linkpose.recording.table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SENSORS = {"": "", "imu2": " of sensor 2"}
+
+
+def time_panels(table: Table) -> list[tuple[float, Callable[[Axes], None]]]:
+    """Share of the height and what draws it, of each panel that has a reading."""
+    panels: dict[str, list[tuple[str, Column]]] = {}
+    for column, value in table.columns.items():
+        part = split(column)
+        if part is None or not part.quantity.is_reading or not np.isfinite(value).any():
+            continue
+        panels.setdefault(f"{part.quantity.panel}{_SENSORS.get(part.prefix, '')}", []).append((column, part))
+    return [(1.8, _panel(table, name, columns)) for name, columns in panels.items()]
+
+
+def _panel(table: Table, name: str, columns: list[tuple[str, Column]]) -> Callable[[Axes], None]:
+    return lambda axes: _draw(axes, table, name, columns)
+
+
+def _draw(axes: Axes, table: Table, name: str, columns: list[tuple[str, Column]]) -> None:
+    time_s = table.columns["time_s"]
+    unknown = np.ones(len(time_s), np.bool_)
+    for i, (column, part) in enumerate(columns):
+        label = part.quantity.label if part.prefix in _SENSORS else f"{part.prefix} {part.quantity.label}"
+        colour = AXES_COLOURS.get(part.quantity.label, OTHERS[i % len(OTHERS)])
+        value = table.columns[column] * part.quantity.value.scale
+        unknown &= ~np.isfinite(value)
+        draw(axes, time_s, value, label=label, color=colour, linewidth=0.9)
+    shade(axes, time_s, unknown)
+    finish(axes, f"{name}\n({columns[0][1].quantity.value.unit})")
+    if len(columns) > 1:
+        legend_above(axes, 8)

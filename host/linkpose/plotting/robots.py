@@ -1,0 +1,212 @@
+"""Paths of robots with what surrounds them, and what belongs to them over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
+from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
+from linkpose.plotting.panels import shade_unknown, view_values
+from linkpose.plotting.sources import Sources, Track
+from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from linkpose.localization.grid import GridMap
+
+_MARKS = 12  # heading ticks and ellipses along a path
+_MOST_MICE = 4
+_MOST_CELLS = 3000  # of a map, along a side
+
+TimePanel = tuple[float, Callable[["Axes"], None]]
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What lies under a robot's path, in its map's frame."""
+
+    grid: GridMap | None = None
+    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m); further axes are ignored
+    rejected_xy_m: Floats | None = None  # (N, 2) where measurements were rejected
+
+
+def path_panel(sources: Sources, scene: Scene | None) -> Callable[[Axes], None] | None:
+    """What draws the paths; None where there is none. A link's horizontal motion is no path."""
+    tracks = [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
+    return (lambda axes: _path(axes, tracks, scene or Scene())) if tracks else None
+
+
+def time_panels(sources: Sources) -> list[TimePanel]:
+    """Speed, unwrapped heading and the mice left out, as far as there are any."""
+    found: list[TimePanel] = []
+    if any(track.has(VX) for track in sources.all):
+        found.append((1.8, lambda axes: _over_time(axes, sources, _speed, "speed (m/s)")))
+    if any(track.has(HEADING) for track in sources.all):
+        found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading, unwrapped (°)")))
+    for track in sources.tracks:
+        if track.has(EXCLUDED) and bool((track.values[EXCLUDED] > 0).any()):
+            found.append((0.9, _mice_panel(track)))
+    return found
+
+
+def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
+    _draw_scene(axes, scene)
+    for track in reversed(tracks):
+        style = line_style(track.name, track.file) if track.name else TRUTH
+        _, x, y = broken(track.time_s, track.values[X], track.values[Y])
+        keep = slice(None, None, max(1, len(x) // MOST_POINTS))
+        axes.plot(x[keep], y[keep], label=track.label, **style)
+        _mark(axes, track, str(style["color"]))
+    axes.set_aspect("equal", "datalim")
+    axes.set_box_aspect(1.0)
+    axes.set_xlabel("x (m)")
+    finish(axes, "y (m)")
+    axes.margins(0.05)
+    legend_above(axes, 3, [track.label for track in tracks])
+
+
+def _draw_scene(axes: Axes, scene: Scene) -> None:
+    if scene.grid is not None:
+        _draw_map(axes, scene.grid)
+    if scene.beacons:
+        places = np.array([list(place)[:2] for place in scene.beacons.values()])
+        axes.plot(*places.T, "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
+        for name, place in zip(scene.beacons, places, strict=True):
+            axes.annotate(name, place, xytext=(4, 4), textcoords="offset points", fontsize=7)
+    if scene.rejected_xy_m is not None and len(scene.rejected_xy_m):
+        axes.plot(*scene.rejected_xy_m.T, "x", color=OTHERS[3], markersize=4, label="measurement rejected", zorder=4)
+
+
+def _draw_map(axes: Axes, grid: GridMap) -> None:
+    """Cells that stop beams, in grey. The map's own axes may be turned against those of the path."""
+    from matplotlib.transforms import Affine2D
+
+    _, x, y, turn = grid.geometry.tolist()
+    width, height = grid.size_m
+    cells = grid.blocked[:: _stride(grid.blocked.shape[0]), :: _stride(grid.blocked.shape[1])]
+    image = axes.imshow(
+        cells, cmap="Greys", vmin=0, vmax=2, extent=(0, width, 0, height), origin="lower", interpolation="nearest"
+    )
+    image.set_zorder(0)
+    placed = Affine2D().rotate(turn).translate(x, y)
+    image.set_transform(placed + axes.transData)
+    corners = placed.transform(np.array([(0, 0), (width, 0), (width, height), (0, height)]))
+    axes.update_datalim(corners)
+
+
+def _stride(cells: int) -> int:
+    """Of a map that is larger than any picture, every n-th cell."""
+    return max(1, cells // _MOST_CELLS)
+
+
+def _mark(axes: Axes, track: Track, colour: str) -> None:
+    """Start, heading ticks and ±2σ ellipses along a path."""
+    from matplotlib.patches import Ellipse
+
+    x, y = track.values[X], track.values[Y]
+    known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+    axes.plot(x[known[0]], y[known[0]], "o", color=colour, markersize=6, markerfacecolor="white", zorder=6)
+    if not track.name:
+        return
+    at = known[np.linspace(0, len(known) - 1, min(_MARKS, len(known))).astype(int)]
+    if HEADING in track.values:
+        angle = np.radians(track.values[HEADING][at])
+        axes.quiver(
+            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.007, scale=20, zorder=4
+        )
+    if X in track.std and Y in track.std:
+        for i in at:
+            sx, sy = float(track.std[X][i]), float(track.std[Y][i])
+            if np.isfinite(sx) and np.isfinite(sy):
+                axes.add_patch(
+                    Ellipse((x[i], y[i]), 4 * sx, 4 * sy, facecolor=colour, edgecolor=colour, alpha=0.25, zorder=2)
+                )
+        axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
+
+
+def _speed(track: Track) -> tuple[Floats, Floats | None] | None:
+    """Speed, and its σ along the motion."""
+    if not track.has(VX):
+        return None
+    if not track.has(VY):
+        return np.abs(track.values[VX]), track.std.get(VX)
+    return np.hypot(track.values[VX], track.values[VY]), track.std.get(VX)
+
+
+def _heading(track: Track) -> tuple[Floats, Floats | None] | None:
+    if not track.has(HEADING):
+        return None
+    heading = track.values[HEADING].copy()
+    known = np.isfinite(heading)
+    heading[known] = np.unwrap(heading[known], period=360.0)
+    return heading, track.std.get(HEADING)
+
+
+def _over_time(
+    axes: Axes, sources: Sources, of: Callable[[Track], tuple[Floats, Floats | None] | None], label: str
+) -> None:
+    """A quantity of all tracks; ±2σ of the best."""
+    drawn = [(track, found) for track in sources.tracks if (found := of(track)) is not None]
+    for track, (value, _) in reversed(drawn):
+        draw(axes, track.time_s, value, label=track.label, **line_style(track.name, track.file))
+    for track, (value, std) in drawn[:1]:
+        if std is not None:
+            band(axes, track.time_s, value, std, str(line_style(track.name)["color"]), f"±2σ {track.label}")
+    reference = of(sources.reference) if sources.reference is not None else None
+    if reference is not None and sources.reference is not None:
+        draw(axes, sources.reference.time_s, reference[0], label=sources.reference.label, **TRUTH)
+    view_values(axes, [value for _, (value, _) in drawn])
+    shade_unknown(axes, sources.tracks)
+    finish(axes, label)
+
+
+def _mice_panel(track: Track) -> Callable[[Axes], None]:
+    return lambda axes: _mice(axes, track)
+
+
+def _mice(axes: Axes, track: Track) -> None:
+    """A bar for each stretch in which a mouse was left out."""
+    bits = np.nan_to_num(track.values[EXCLUDED]).astype(np.int64)
+    shown = max(int(bits.max()).bit_length(), 1)
+    for mouse in range(min(shown, _MOST_MICE)):
+        out = (bits >> mouse & 1).astype(np.int8)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], out, [0]]))).reshape(-1, 2)
+        last = len(out) - 1
+        bars = [(track.time_s[a], track.time_s[min(b, last)] - track.time_s[a]) for a, b in edges.tolist()]
+        axes.broken_barh(bars, (mouse + 0.6, 0.8), color=line_style(track.name)["color"])
+    axes.set_yticks(range(1, shown + 1))
+    axes.set_ylim(0.4, shown + 0.6)
+    finish(axes, f"left out by\n{track.label}")
+
+
+def rotation(axes: Axes, sources: Sources) -> None:
+    """The rotation of a ball joint as a rotation vector (°): its direction is the axis, its length the angle."""
+    for track in sources.all:
+        if not track.has(*CHAIN_ROTATION):
+            continue
+        w, x, y, z = (track.values[q] for q in CHAIN_ROTATION)
+        vector = _rotation_vector(w, np.stack([x, y, z]))
+        for axis, value in zip("xyz", vector, strict=True):
+            style: dict[str, Any] = {"color": AXES_COLOURS[axis], "linewidth": 1.6}
+            label = f"{track.label} {axis}"
+            if not track.name:
+                style, label = dict(TRUTH), track.label
+            draw(axes, track.time_s, value, 360.0, label=label, **style)
+    shade_unknown(axes, sources.tracks)
+    finish(axes, "rotation of the joint (°)")
+    legend_above(axes)
+
+
+def _rotation_vector(w: Floats, v: Floats) -> Floats:
+    """(3, N) in degrees, of the rotation by at most 180°."""
+    sign = np.where(w < 0, -1.0, 1.0)
+    length = np.linalg.norm(v, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(length > 0, 2 * np.arctan2(length, np.abs(w)) / length, 2.0)
+    return np.degrees(sign * v * factor)

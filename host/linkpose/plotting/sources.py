@@ -1,0 +1,176 @@
+"""What a plot draws: the filters of the estimates, the reference, and how they are named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from linkpose import filters
+from linkpose.errors import LinkposeError
+from linkpose.evaluation.scores import Score, evaluate
+from linkpose.evaluation.series import interval
+from linkpose.plotting.canvas import REFERENCES
+from linkpose.plotting.lines import gaps, lost_samples
+from linkpose.quantities import Quantity, by_filter, split, std_column
+from linkpose.recording.table import Table
+from linkpose.sensors.measurements import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The quantities of one filter, or of the reference, in the units in which they are shown."""
+
+    name: str  # the filter; "" of the reference
+    label: str
+    file: int  # number of its file among the estimates
+    time_s: Floats  # (N,)
+    values: dict[Quantity, Floats]  # (N,) each
+    std: dict[Quantity, Floats]
+
+    def has(self, *wanted: Quantity) -> bool:
+        """Whether all of these have a value somewhere."""
+        return all(q in self.values and bool(np.isfinite(self.values[q]).any()) for q in wanted)
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """Everything that one plot draws."""
+
+    tracks: list[Track]  # of filters, best first
+    reference: Track | None  # on the clock of the first estimate
+    scores: dict[tuple[int, str], Score]  # by file and filter; empty without a reference
+    hidden: list[str]  # filters that are not drawn
+    remarks: list[str]
+
+    @property
+    def all(self) -> list[Track]:
+        """The filters, then the reference."""
+        return [*self.tracks, *([self.reference] if self.reference else [])]
+
+
+def is_recording(table: Table) -> bool:
+    """Whether it holds readings of sensors."""
+    parts = [split(column) for column in table.columns]
+    return table.kind == "recording" or any(part is not None and part.quantity.is_reading for part in parts)
+
+
+def is_reference(table: Table) -> bool:
+    """Whether it holds quantities of no filter."""
+    return table.kind in ("truth", "motive") or not by_filter(table.columns)
+
+
+def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
+    """Of estimates and references. Without `wanted`, the filters whose height comes from the air pressure are hidden.
+
+    Raises LinkposeError where a wanted filter is in no file.
+    """
+    estimates = [table for table in tables if not is_reference(table)]
+    references = [table for table in tables if is_reference(table)]
+    found = [name for table in estimates for name in by_filter(table.columns)]
+    missing = [name for name in wanted if name not in found]
+    if missing:
+        raise LinkposeError(f"no file has the filter {', '.join(missing)}; there are {', '.join(dict.fromkeys(found))}")
+    shown = _shown(list(dict.fromkeys(found)), wanted)
+    tracks = [
+        _track(table, name, columns, i, len(estimates) > 1)
+        for i, table in enumerate(estimates)
+        for name, columns in by_filter(table.columns).items()
+        if name in shown
+    ]
+    tracks.sort(key=lambda track: (_rank(track.name), track.file))
+    scores, offset_s, remarks = _scores(estimates, references[0]) if references else ({}, 0.0, [])
+    reference = _reference(references[0], offset_s) if references else None
+    hidden = [name for name in dict.fromkeys(found) if name not in shown]
+    return Sources(tracks, reference, scores, hidden, remarks)
+
+
+def _shown(found: list[str], wanted: Sequence[str]) -> list[str]:
+    """The wanted filters; without any, all but the barometric ones, unless there are no others."""
+    if wanted:
+        return list(wanted)
+    quiet = [name for name in found if not ((of := filters.capabilities(name)) and of.is_barometric)]
+    return quiet or found
+
+
+def _rank(name: str) -> int:
+    """Place among the filters, the best first."""
+    return filters.NAMES.index(name) if name in filters.NAMES else len(filters.NAMES)
+
+
+def _track(table: Table, name: str, columns: dict[Quantity, str], file: int, several: bool) -> Track:
+    values = {q: _shown_value(table, column, q) for q, column in columns.items()}
+    std = {}
+    for q, column in columns.items():
+        sigma = std_column(column)
+        if sigma in table.columns and not q.std:
+            std[q] = _shown_value(table, sigma or "", q)
+    label = f"{name} ({table.path.stem})" if several else name
+    return Track(name, label, file, table.columns["time_s"], values, std)
+
+
+def _shown_value(table: Table, column: str, quantity: Quantity) -> Floats:
+    value = table.columns[column]
+    return np.where(np.isfinite(value), value * quantity.value.scale, np.nan)
+
+
+def _reference(table: Table, offset_s: float) -> Track:
+    values = {}
+    for column in table.columns:
+        part = split(column)
+        if part is not None and not part.is_std and part.prefix in ("", "chain"):
+            values[part.quantity] = _shown_value(table, column, part.quantity)
+    label = REFERENCES[0] if table.kind == "truth" else REFERENCES[1]
+    return Track("", label, 0, table.columns["time_s"] - offset_s, values, {})
+
+
+def _scores(estimates: Sequence[Table], reference: Table) -> tuple[dict[tuple[int, str], Score], float, list[str]]:
+    """Scores of all estimates, the reference's offset to the first one's clock, and why there are none."""
+    found: dict[tuple[int, str], Score] = {}
+    offset_s, remarks = 0.0, []
+    for i, table in enumerate(estimates):
+        try:
+            scores = evaluate(table, reference).scores
+        except LinkposeError as reason:
+            remarks.append(f"no errors are drawn: {reason}")
+            continue
+        offset_s = scores[0].time_offset_s if i == 0 else offset_s
+        found |= {(i, score.filter): score for score in scores}
+    return found, offset_s, remarks
+
+
+def title(tables: Sequence[Table]) -> str:
+    """File, length, rate and losses of each file but references that come with an estimate."""
+    named = [table for table in tables if not is_reference(table)] or list(tables)
+    return "\n".join(_describe(table) for table in named)
+
+
+def _describe(table: Table) -> str:
+    time_s = table.columns["time_s"]
+    step = interval(time_s)
+    length = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    words = [table.path.name, _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
+    holes = len(gaps(time_s))
+    closing = table.closing or {}
+    lost = closing.get("lost")
+    lost = lost if isinstance(lost, int) else lost_samples(time_s)
+    words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {_gaps(holes)}")
+    return "   ·   ".join(word for word in words if word)
+
+
+def _gaps(count: int) -> str:
+    return "1 gap" if count == 1 else f"{count} gaps"
+
+
+def _length(seconds: float) -> str:
+    if seconds < 600:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.2f} h"
+
+
+def pairs(tracks: Sequence[Track], quantity: Quantity) -> Iterator[tuple[Track, Floats]]:
+    """The tracks that have the quantity somewhere."""
+    for track in tracks:
+        if track.has(quantity):
+            yield track, track.values[quantity]

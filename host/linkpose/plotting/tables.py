@@ -1,0 +1,170 @@
+"""The plot of any of linkpose's CSV files: a link, a chain, a robot, or the readings of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from linkpose.errors import LinkposeError
+from linkpose.plotting import panels, readings, robots
+from linkpose.plotting.canvas import new_figure
+from linkpose.plotting.sources import Sources, gather, is_recording, title
+from linkpose.quantities import (
+    ANGLE,
+    CHAIN_ROTATION,
+    HEIGHT,
+    HEIGHT1,
+    HEIGHT2,
+    PITCH,
+    ROLL,
+    ROTATION,
+    YAW,
+    Quantity,
+)
+from linkpose.recording.table import Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+_WIDTH_INCHES = 10.0
+_INCHES = 1.05  # per unit of height
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One panel over time: its share of the height, and what draws it."""
+
+    share: float
+    draw: Callable[[Axes], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the figure: panels with a common time axis, and a path beside them for a robot."""
+
+    panels: list[Panel]
+    path: Callable[[Axes], None] | None = None
+
+    @property
+    def height(self) -> float:
+        """Of the section, in units of _INCHES."""
+        over_time = sum(panel.share for panel in self.panels)
+        return max(over_time, 5.5) if self.path else over_time
+
+
+def plot_tables(
+    tables: Sequence[Table], wanted: Sequence[str] = (), scene: robots.Scene | None = None
+) -> tuple[Figure, list[str]]:
+    """Recordings, estimates and references in one figure, and remarks on what it leaves out.
+
+    `wanted` names the filters to draw; without it, barometric filters are left out. `scene` is drawn under a robot's
+    path. Raises LinkposeError for a file that holds nothing to draw.
+    """
+    for table in tables:
+        table.require("time_s")
+    sources = gather([table for table in tables if not is_recording(table)], wanted)
+    sections = [section for section in (_robot(sources, scene), _link(sources), _chain(sources)) if section]
+    sections += [section for table in tables if is_recording(table) and (section := _readings(table))]
+    if not sections:
+        raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
+    figure = new_figure(_WIDTH_INCHES, 0.8 + _INCHES * sum(section.height for section in sections))
+    figure.suptitle(title(tables), fontsize=10, x=0.01, ha="left")
+    parts = figure.subfigures(len(sections), 1, squeeze=False, height_ratios=[s.height for s in sections])
+    for part, section in zip(parts[:, 0], sections, strict=True):
+        _lay_out(part, section)
+    note = panels.note_hidden(sources)
+    if note:
+        figure.supxlabel(note, fontsize=8, x=0.01, ha="left", color="#555555")
+    return figure, [*sources.remarks, *([note] if note else [])]
+
+
+def _lay_out(part: SubFigure, section: Section) -> None:
+    """Panels below each other with one time axis; a path to the left of them."""
+    rows = len(section.panels)
+    shares = [panel.share for panel in section.panels]
+    if section.path is not None:
+        grid = part.add_gridspec(
+            max(rows, 1), 2 if rows else 1, height_ratios=shares or [1.0], width_ratios=[1.35, 1.0][: 2 if rows else 1]
+        )
+        section.path(part.add_subplot(grid[:, 0]))
+    else:
+        grid = part.add_gridspec(rows, 1, height_ratios=shares)
+    first: Any = None
+    for row, panel in enumerate(section.panels):
+        axes = part.add_subplot(grid[row, -1], sharex=first)
+        first = first or axes
+        panel.draw(axes)
+        axes.tick_params(labelbottom=row == rows - 1)
+    if first is not None:
+        axes.set_xlabel("time (s)")
+
+
+def _link(sources: Sources) -> Section | None:
+    """Height (largest), its error, roll, pitch, yaw."""
+    if not panels.has(sources, HEIGHT, ROLL, PITCH):
+        return None
+    found = []
+    if panels.has(sources, HEIGHT):
+        found.append(Panel(3.0, lambda axes: panels.values(axes, sources, HEIGHT, legend=True)))
+        if _scored(sources, HEIGHT):
+            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "height")))
+        elif _estimated(sources, HEIGHT):
+            found.append(Panel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
+    for quantity in (ROLL, PITCH, YAW):
+        if panels.has(sources, quantity):
+            found.append(Panel(1.5, _values(sources, quantity, legend=not found)))
+    return Section(found)
+
+
+def _chain(sources: Sources) -> Section | None:
+    """Angle of a hinge or rotation of a ball joint (largest), its error, and the heights."""
+    found = []
+    if panels.has(sources, ANGLE):
+        found.append(Panel(3.0, _values(sources, ANGLE, legend=True)))
+        if _scored(sources, ANGLE):
+            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "angle")))
+    if any(track.has(*CHAIN_ROTATION) for track in sources.tracks or sources.all):
+        if not found:
+            found.append(Panel(3.0, lambda axes: robots.rotation(axes, sources)))
+        if _scored(sources, ROTATION):
+            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "rotation")))
+    for quantity in (HEIGHT1, HEIGHT2):
+        if panels.has(sources, quantity):
+            found.append(Panel(1.5, _values(sources, quantity, legend=not found)))
+    return Section(found) if found else None
+
+
+def _robot(sources: Sources, scene: robots.Scene | None) -> Section | None:
+    """The path, then speed, heading and the mice left out over time."""
+    path = robots.path_panel(sources, scene)
+    over_time = [Panel(share, draw) for share, draw in robots.time_panels(sources)]
+    return Section(over_time, path) if path or over_time else None
+
+
+def _readings(table: Table) -> Section | None:
+    found = [Panel(share, draw) for share, draw in readings.time_panels(table)]
+    return Section(found) if found else None
+
+
+def _values(sources: Sources, quantity: Quantity, legend: bool) -> Callable[[Axes], None]:
+    return lambda axes: panels.values(axes, sources, quantity, legend, _wrap(quantity))
+
+
+def _wrap(quantity: Quantity) -> float | None:
+    """Period of an angle in the unit in which it is shown."""
+    return quantity.period * quantity.value.scale if quantity.period is not None else None
+
+
+def _scored(sources: Sources, quantity: Quantity) -> bool:
+    shown = {(track.file, track.name) for track in sources.tracks}
+    return any(quantity.name in score.errors for key, score in sources.scores.items() if key in shown)
+
+
+def _estimated(sources: Sources, quantity: Quantity) -> bool:
+    """Whether a filter shows more than its line: σ, or another filter to compare with."""
+    tracks = [track for track in sources.tracks if track.has(quantity) and track.file == 0]
+    return len(tracks) > 1 or any(bool(np.isfinite(t.std[quantity]).any()) for t in tracks if quantity in t.std)
