@@ -25,7 +25,8 @@ from _report import RECORDINGS
 
 from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD, Reading, flaser_angles, format_reading
-from linkpose.localization.grid import GridMap, load_map
+from linkpose.localization.grid import GridMap
+from linkpose.localization.maps import load_map
 
 PLAZA_RMS_M = {"Plaza1": 0.40, "Plaza2": 0.59}  # what a tuned EKF of others reached
 MRCLAM_RMS_M, LABYRINTH_RMS_M = 0.17, 0.15

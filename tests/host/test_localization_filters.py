@@ -14,6 +14,7 @@ from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.kalman import (
+    CONSTANT_VELOCITY,
     HOLONOMIC,
     PLANAR_TWIST,
     SUBMERSIBLE,
@@ -23,14 +24,21 @@ from linkpose.localization.kalman import (
     Transform,
 )
 from linkpose.localization.linalg import wrap_angle
-from linkpose.localization.localizer import Settings, localize
+from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
 from linkpose.localization.odometry import with_mice_odometry
+from linkpose.localization.settings import Settings
 from linkpose.simulation.indoor import office_map
 from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, simulate_underwater
 
 CONTROL, HOLD = np.array([0.8, 0.2]), np.array([0.1, 0.1])
-MOTIONS = {"unicycle": UNICYCLE, "holonomic": HOLONOMIC, "submersible": SUBMERSIBLE, "planar_twist": PLANAR_TWIST}
+MOTIONS = {
+    "constant_velocity": CONSTANT_VELOCITY,
+    "unicycle": UNICYCLE,
+    "holonomic": HOLONOMIC,
+    "submersible": SUBMERSIBLE,
+    "planar_twist": PLANAR_TWIST,
+}
 
 
 def predicted(model, state, parameters, size, grid=None):
@@ -139,7 +147,7 @@ def test_motion_jacobians(name, turn):
 
 MEASUREMENTS = {
     "beacon_range": (models.BEACON_RANGE, [[4.0, 1, 2, 5, 7, 8], [0, 9, -1, -1, -1, 8]], 2),
-    "landmark": (models.LANDMARK, [[4.0, 1], [-3, 2]], 4),
+    "landmark": (models.LANDMARK, [[4.0, 1, 7, 8], [-3, 2, -1, 8]], 4),
     "direct": (models.DIRECT, [[2.0, -1], [0, 1]], 2),
     "mouse_velocity": (models.MOUSE_VELOCITY, [[0.1, 0.05], [-0.1, 0.2]], 4),
     "rate_gyro": (models.RATE_GYRO, [[0.0, 0]], 1),
@@ -169,7 +177,13 @@ def test_beam_slopes_of_a_plain_wall():
 
 
 def test_model_numbers_differ():
-    motions = [models.UNICYCLE, models.HOLONOMIC, models.SUBMERSIBLE, models.PLANAR_TWIST]
+    motions = [
+        models.UNICYCLE,
+        models.HOLONOMIC,
+        models.SUBMERSIBLE,
+        models.PLANAR_TWIST,
+        models.CONSTANT_VELOCITY,
+    ]
     sensors = [
         models.BEAMS,
         models.BEACON_RANGE,
@@ -178,7 +192,7 @@ def test_model_numbers_differ():
         models.MOUSE_VELOCITY,
         models.RATE_GYRO,
     ]
-    assert sorted(motions) == [0, 1, 2, 3]
+    assert sorted(motions) == [0, 1, 2, 3, 4]
     assert sorted(sensors) == [0, 1, 2, 3, 4, 5]
 
 
@@ -188,7 +202,9 @@ def test_angles_cross_the_half_turn(name):
     results = []
     for heading in (0.0, math.pi):
         c, s = math.cos(heading), math.sin(heading)
-        landmark = np.array([[-4.0 * c - 0.5 * s, -4.0 * s + 0.5 * c]])  # behind the robot: the bearing is near π, too
+        landmark = np.array(
+            [[-4.0 * c - 0.5 * s, -4.0 * s + 0.5 * c, -1, -1]]
+        )  # behind the robot: the bearing is near π, too
         bearing = wrap_angle(math.atan2(0.5, -4.0) + 0.1)
         measured = np.array([4.1, bearing])
         sight = Measurement(models.LANDMARK, measured, np.diag([0.04, 0.01]), landmark, 2, (False, True))
