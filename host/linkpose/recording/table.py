@@ -17,7 +17,6 @@ from linkpose.errors import CannotRead, FileFormatError
 from linkpose.recording.delimited import Cells, split_cells, to_utf8
 from linkpose.sensors.measurements import Floats
 
-
 _PLAIN_HEADER = re.compile(rb"[^\";\t]*[A-Za-z_][^\";\t]*")
 
 
