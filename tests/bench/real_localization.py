@@ -2,8 +2,9 @@
 
     python tests/bench/real_localization.py [--data FOLDER] [--json]
 
-FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A recording that is not there is named and left out. The options of each are what a user would type who knows the
-sensors: nothing is tuned in the code.
+FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
+recording that is not there is named and left out. Each recording is run with the default options and with those of a
+user who knows the sensors.
 """
 
 from __future__ import annotations
