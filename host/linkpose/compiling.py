@@ -35,8 +35,7 @@ _SOURCES = (
     "errors.py",
     "filters/**/*.py",
     "localization/**/*.py",
-    "recording/__init__.py",
-    "recording/fixedpoint.py",
+    "recording/**/*.py",
     "sensors/**/*.py",
     "wire/**/*.py",
 )
@@ -161,10 +160,6 @@ compiled = _decorator(True)
 inlined = _decorator(False, inline="always")
 # Without wrappers for Python and without a file of its own: both cost half of the time to compile.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-
-
-# The name under which the writer of estimates as text is marked: every run needs it, whatever its filters.
-TEXT = "text"
 
 
 def mark_compiled(name: str) -> None:

@@ -13,7 +13,7 @@ from linkpose.errors import LinkposeError
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import GridMap, no_map
-from linkpose.localization.kalman import UNICYCLE, FilterName, KalmanFilter
+from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
 from linkpose.localization.noise import check_correlation
@@ -24,10 +24,12 @@ from linkpose.localization.track import Track
 from linkpose.localization.vehicle import (
     CONTROLS,
     DIVING,
+    at_their_height,
     control_holds,
     first_pose,
     kinds_of,
     noise_root,
+    place_from_ranges,
     start_state,
     vehicle_of,
 )
@@ -109,10 +111,14 @@ class Localizer:
         self.settings = settings
         kinds = kinds_of(head)
         self.vehicle = vehicle_of(kinds)
+        if self.vehicle is CONSTANT_VELOCITY:
+            beacons = at_their_height(beacons)
         self.control_kind = CONTROLS.get(self.vehicle.model, "")
         motion = self.vehicle.extended(constant_states(settings.estimate, list(beacons)))
         self.prior = first_pose(head) if settings.start is None else None
         start = settings.start if self.prior is None else _pose_of(self.prior)
+        if start is None and self.vehicle is CONSTANT_VELOCITY:
+            start = place_from_ranges(head, beacons)
         depth = next((event.values[0] for event in head if isinstance(event, Event) and event.kind == "depth"), 0.0)
         state, std = start_state(start or (0.0, 0.0, 0.0), depth, settings, motion)
         kalman: FilterName = "ukf" if name == "ukf" else "ekf"
@@ -276,7 +282,7 @@ def check(
         raise LinkposeError(f"{origin} holds no range rows from which a scale or bias follows; leave out --estimate")
     if name == "mcl" and "scan" not in kinds:
         raise LinkposeError(f"{origin} holds no laser scans, which --filter mcl needs; use --filter ekf")
-    if settings.start is None and first_pose(log) is None and not (name == "scan-match" and "scan" in kinds):
+    if not _has_start(log, name, settings, beacons, kinds):
         raise LinkposeError("the log does not state where the robot starts; add --start X,Y,HEADING (m, m, rad)")
     for event in log:
         if isinstance(event, Event) and event.kind in NAMED and event.beacon not in beacons:
@@ -290,6 +296,14 @@ def check(
         2 if vehicle_of(kinds) is UNICYCLE else 3,
         "the correlation of the motion's noises",
     )
+
+
+def _has_start(log: Log, name: Method, settings: Settings, beacons: Beacons, kinds: set[str]) -> bool:
+    """Whether the start is given, or can be found."""
+    if settings.start is not None or first_pose(log) is not None or (name == "scan-match" and "scan" in kinds):
+        return True
+    known = all(event.beacon in beacons for event in log if isinstance(event, Event) and event.kind == "range")
+    return vehicle_of(kinds) is CONSTANT_VELOCITY and known and place_from_ranges(log, beacons) is not None
 
 
 def most_at_once(log: Log) -> int:

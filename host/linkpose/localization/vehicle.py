@@ -19,9 +19,12 @@ from linkpose.localization.kalman import (
 from linkpose.localization.linalg import Floats
 from linkpose.localization.noise import equicorrelated
 from linkpose.localization.settings import CONSTANTS, Pose, Settings
+from linkpose.localization.tables import Beacons
 
 DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
 CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
+FIRST_S = 5.0  # of ranges from which a tag's first place is fitted; a walk of a few metres at the most
+FIT_STEPS = 20
 FASTEST_M_S = 2.0  # standard deviation of a tag's velocity at the start, on each axis: a walk
 
 
@@ -60,6 +63,36 @@ def first_pose(log: Log) -> Event | None:
     """The pose that the log states for its own first instant."""
     first = (event for event in log if isinstance(event, Event) and event.time_s == log[0].time_s)
     return next((event for event in first if event.kind == "pose"), None)
+
+
+def at_their_height(beacons: Beacons) -> Beacons:
+    """The beacons with heights relative to their mean: a tag without a known height is taken to be there."""
+    mean = sum(place[2] for place in beacons.values()) / max(len(beacons), 1)
+    return {name: (x, y, z - mean) for name, (x, y, z) in beacons.items()}
+
+
+def place_from_ranges(log: Log, beacons: Beacons) -> Pose | None:
+    """Where a tag is at the log's start, from the first ranges to at least three beacons; None where there are fewer.
+
+    The ranges of FIRST_S are fitted by Gauss-Newton from each beacon and from their centre; the best fit counts.
+    """
+    first = [e for e in log if isinstance(e, Event) and e.kind == "range" and e.time_s <= log[0].time_s + FIRST_S]
+    latest = {event.beacon: event.values[0] for event in reversed(first)}
+    if len(latest) < 3:
+        return None
+    places = np.array([beacons[name] for name in latest])
+    ranges = np.array(list(latest.values()))
+    fits = []
+    for start in (places.mean(axis=0), *places):
+        place = np.array([start[0] + 0.1, start[1] - 0.1])
+        for _ in range(FIT_STEPS):
+            off = place - places[:, :2]
+            distance = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
+            slopes = off / distance[:, np.newaxis]
+            place = place + np.linalg.lstsq(slopes, ranges - distance, rcond=None)[0]
+        fits.append((float(np.sum((ranges - distance) ** 2)), float(place[0]), float(place[1])))
+    _, x, y = min(fits)
+    return (x, y, 0.0) if np.isfinite([x, y]).all() else None
 
 
 def start_state(pose: Pose, depth_m: float, settings: Settings, motion: Motion) -> tuple[Floats, Floats]:
