@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from linkpose.errors import CannotRead, FileFormatError, MissingLibrary
+from linkpose.recording.csvfile import metadata_path
 from linkpose.recording.delimited import Cells, split_cells, to_utf8
 from linkpose.sensors.measurements import Floats
 
@@ -66,11 +67,27 @@ def read_table(path: Path, kind: str | None = None) -> Table:
     else:
         data = to_utf8(data)
         table = _read_own(path, data) or _read_other(path, data)
+    if not table.kind:
+        table = _with_metadata_beside(table)
     if kind is not None and table.kind not in ("", kind):
         raise FileFormatError(path, f"{path} is a linkpose {table.kind}, not a {kind}")
     if "time_s" in table.columns:
         check_times(path, table.columns["time_s"], table.first_line)
     return table
+
+
+def _with_metadata_beside(table: Table) -> Table:
+    """The table with the kind and the metadata that NAME.meta.json beside NAME.csv holds, if it is there."""
+    beside = metadata_path(table.path)
+    if not beside.is_file():
+        return table
+    content = _json(beside, read_bytes(beside).decode("utf-8", "replace"), 1)
+    metadata, closing = content.get("metadata"), content.get("closing")
+    if not isinstance(metadata, dict) or not isinstance(content.get("kind"), str):
+        raise FileFormatError(beside, f"{beside} has no kind or no metadata; write it again, or remove it")
+    return replace(
+        table, kind=content["kind"], metadata=metadata, closing=closing if isinstance(closing, dict) else None
+    )
 
 
 def _read_own(path: Path, data: bytes) -> Table | None:
