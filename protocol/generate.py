@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import binascii
 import json
+import re
 import struct
 import sys
 import tomllib
@@ -544,6 +545,9 @@ def vectors(schema: dict) -> str:
 def readme(schema: dict) -> str:
     """protocol/README.md: the handwritten text, then the generated tables."""
     text = README.read_text(encoding="utf-8")
+    version = f"{schema['protocol']['major']}.{schema['protocol']['minor']}"
+    numbers = f"**This is protocol {version}, schema_crc {schema_crc(schema):#010x}.**"
+    text = re.sub(r"\*\*This is protocol .*?\*\*", numbers, text, count=1)
     lines = [text[: text.index(TABLES_HEADING)] + TABLES_HEADING, f"<!-- {NOTE} -->"]
     for message in schema["message"]:
         way = "board → host" if message["direction"] == "board_to_host" else "host → board"

@@ -13,7 +13,6 @@ namespace {
 // HELLO goes out at boot when all sensors are set up or found absent, and after this time at the latest.
 constexpr uint32_t kGreetUs = 300000;
 constexpr uint32_t kStatusUs = 1000000;
-constexpr uint16_t kNotHung = 0xFFFF;
 
 // Which firmware this is. It stands in the flash as it goes out in HELLO, behind a mark that `linkpose flash` looks for in
 // a .hex before it writes it. The members are the first of wire::Hello.
@@ -37,6 +36,15 @@ const Identity kIdentity PROGMEM = {
     LINKPOSE_SOURCE_REVISION,
 };
 
+wire::DeviceState state_of(Ps2Mouse::Presence presence) {
+  switch (presence) {
+    case Ps2Mouse::Presence::kStarting: return wire::DeviceState::kStarting;
+    case Ps2Mouse::Presence::kRunning: return wire::DeviceState::kOk;
+    case Ps2Mouse::Presence::kLost: return wire::DeviceState::kFailed;
+    default: return wire::DeviceState::kAbsent;
+  }
+}
+
 }  // namespace
 
 void Link::note_pass(uint32_t us) {
@@ -51,7 +59,7 @@ void Link::run() {
 
 void Link::configure(const wire::Configure& settings) {
   sampler_.configure(settings);
-  mice_.configure(settings.sample_rate_hz, settings.mouse_counts_per_mm);
+  mice_.configure(settings.mouse_counts_per_mm);
 }
 
 void Link::receive() {
@@ -68,7 +76,7 @@ void Link::receive() {
 }
 
 void Link::greet() {
-  if (greeted_ || !((sampler_.sensors_settled() && mice_.settled()) || clock::now_us() > kGreetUs)) return;
+  if (greeted_ || !((sampler_.sensors_settled() && mice_.probed()) || clock::now_us() > kGreetUs)) return;
   greeted_ = true;
   send_hello();
 }
@@ -78,7 +86,7 @@ void Link::send_hello() {
   wire::Hello hello;
   memcpy_P(&hello, &kIdentity.protocol_major, kIdentityInHello);
   hello.reset_cause = board::reset_cause();
-  hello.hung_at = kNotHung;
+  hello.hung_at = board::hung_at();
   hello.streaming = sampler_.streaming();
   hello.sections = sampler_.sections();
   hello.sample_rate_hz = settings.sample_rate_hz;
@@ -93,9 +101,8 @@ void Link::send_hello() {
   memcpy(hello.baro_words, sampler_.baro().calibration(), sizeof hello.baro_words);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    const bool found = mouse.id() != Ps2Mouse::kNoId;
-    const wire::DeviceState state = found ? wire::DeviceState::kOk : wire::DeviceState::kAbsent;
-    hello.mice[i] = {static_cast<uint8_t>(state), mouse.id(), 0, mouse.counts_per_mm(), mouse.report_rate_hz(), 0};
+    hello.mice[i] = {static_cast<uint8_t>(state_of(mouse.presence())), mouse.id(), mouse.status(),
+                     mouse.counts_per_mm(), mouse.report_rate_hz(), mouse.lacks()};
   }
   uart::put(wire::Hello::kType, &hello, wire::Hello::size(Mice::kPorts));
 }
@@ -122,11 +129,11 @@ void Link::send_status() {
   status.loop_worst_us = longest_pass_us;
   status.stack_free = board::free_stack();
   status.cpu_load = static_cast<uint16_t>(awake_us / (elapsed_us / 1000));
-  status.vcc_mv = 0;
+  status.vcc_mv = board::supply_mv();
   sampler_.count(status.devices);
   for (uint8_t i = 0; i < Mice::kPorts; i++) {
     const Ps2Mouse& mouse = mice_.mouse(i);
-    status.mice[i] = {mouse.parity_errors(), mice_.resyncs(i), mouse.resets(), 0};
+    status.mice[i] = {mouse.parity_errors(), mouse.resyncs(), mouse.resets(), mice_.take_poll_us(i)};
   }
   uart::put(wire::Status::kType, &status, wire::Status::size(Mice::kPorts));
 }

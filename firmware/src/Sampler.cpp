@@ -31,12 +31,13 @@ uint8_t* append(uint8_t* end, const Part& part) {
   return end + sizeof part;
 }
 
-wire::DeviceState state_of(bool present, bool ok, bool ever_found, bool unsupported) {
+template <typename Driver>
+wire::DeviceState state_of(const Driver& driver, bool ok, bool unsupported) {
   using wire::DeviceState;
   if (unsupported) return DeviceState::kUnsupported;
-  if (present && ok) return DeviceState::kOk;
-  if (ever_found) return DeviceState::kFailed;
-  return present ? DeviceState::kStarting : DeviceState::kAbsent;
+  if (driver.present() && ok) return DeviceState::kOk;
+  if (driver.settled() && driver.ever_found()) return DeviceState::kFailed;
+  return driver.present() || !driver.settled() ? DeviceState::kStarting : DeviceState::kAbsent;
 }
 
 wire::Hello::Device device_of(wire::DeviceKind kind, uint8_t address, uint8_t id, uint8_t family,
@@ -45,7 +46,7 @@ wire::Hello::Device device_of(wire::DeviceKind kind, uint8_t address, uint8_t id
 }
 
 wire::Hello::Device device_of(const Mpu6050& imu) {
-  wire::DeviceState state = state_of(imu.present(), imu.healthy(), imu.ever_found(), imu.unsupported());
+  wire::DeviceState state = state_of(imu, imu.healthy(), imu.unsupported());
   const bool unknown = imu.family().kind == ImuFamily::kUnknown;
   if (state == wire::DeviceState::kOk && unknown) state = wire::DeviceState::kUnverified;
   return device_of(wire::DeviceKind::kImu, imu.address(), imu.id(), imu.family().kind, state);
@@ -201,9 +202,9 @@ void Sampler::describe(wire::Hello::Device* devices) const {
   devices[0] = device_of(imus_[0]);
   devices[1] = device_of(imus_[1]);
   devices[2] = device_of(wire::DeviceKind::kBarometer, baro_.address(), baro_.id(), baro_.family(),
-                         state_of(baro_.present(), baro_.valid(), baro_.ever_found(), baro_.unsupported()));
+                         state_of(baro_, baro_.valid(), baro_.unsupported()));
   devices[3] = device_of(wire::DeviceKind::kMagnetometer, mag_.address(), mag_.id(), mag_.family(),
-                         state_of(mag_.present(), mag_.valid(), mag_.ever_found(), false));
+                         state_of(mag_, mag_.valid(), false));
 }
 
 void Sampler::count(wire::Status::Device* devices) const {
@@ -251,11 +252,11 @@ void Sampler::send_sample() {
   uint32_t flags = 0;
   uint8_t* end = body + sizeof head;
   if (head.sections & wire::sections::kImu) end = append_imu(0, end, flags);
-  if (head.sections & wire::sections::kImu2) end = append_imu(1, end, flags);
   if (head.sections & wire::sections::kBaro) end = append_baro(end, flags);
+  if (head.sections & wire::sections::kImu2) end = append_imu(1, end, flags);
   if (head.sections & wire::sections::kMag) end = append_mag(end, flags);
   // Some mice answer earlier than others: their movement is put off until it is that of all over the same interval.
-  const bool mice_read = tick_.serves_mice;
+  const bool mice_read = tick_.has_mice;
   head.flags = flags | mice_.flags(mice_read);
   const uint8_t count = head.sections / kOneMouse;
   for (uint8_t i = 0; i < count; i++) {

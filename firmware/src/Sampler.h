@@ -25,7 +25,9 @@ class Sampler {
 
   const wire::Configure& settings() const { return settings_; }
   bool streaming() const { return streaming_; }
-  bool sensors_settled() const { return imus_[0].settled() && baro_.settled(); }
+  bool sensors_settled() const {
+    return imus_[0].settled() && imus_[1].settled() && baro_.settled() && mag_.settled();
+  }
   bool healthy() const { return imus_[0].healthy() && baro_.present(); }
   uint32_t ticks_missed() const { return ticks_missed_; }
   // Of the next SAMPLE: HELLO's field `sections`, and the size of the body.

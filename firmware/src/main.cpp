@@ -23,18 +23,19 @@ void setup() {
   board::power_down_unused();
   board::start_watchdog();
   board::begin_led();
+  board::begin_supply();
   idle::begin();
   twi::begin();
   uart::begin();
-  mice.begin(kDefaults.sample_rate_hz);
+  mice.begin();
   clock::begin(kDefaults.sample_rate_hz);
 }
 
 void loop() {
   const uint32_t woken_us = clock::now_us();
   board::feed_watchdog();
+  mice.run();  // before the SAMPLE of this tick is made
   sampler.run();
-  mice.run();
   host.run();
   led.run();
   board::scan_stack();

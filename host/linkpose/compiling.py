@@ -40,8 +40,7 @@ _SOURCES = (
     "errors.py",
     "filters/**/*.py",
     "localization/**/*.py",
-    "recording/__init__.py",
-    "recording/fixedpoint.py",
+    "recording/**/*.py",
     "sensors/**/*.py",
     "wire/**/*.py",
 )
@@ -222,3 +221,22 @@ compiled = _decorator(True)
 inlined = _decorator(False, inline="always")
 # Without wrappers for Python and without a file of its own: both cost half of the time to compile.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
+def mark_compiled(name: str) -> None:
+    """Notes that all machine code of a filter is kept, so that later runs load it."""
+    folder = _the_folder()
+    if folder is not None:
+        with contextlib.suppress(OSError):
+            (folder / f"{name}.compiled").touch()
+
+
+def is_compiled(name: str) -> bool:
+    """Whether the machine code of a filter is kept, and loading it takes a moment only."""
+    folder = _the_folder()
+    return folder is not None and (folder / f"{name}.compiled").exists()
+
+
+def can_keep_code() -> bool:
+    """Whether there is a folder for machine code: without one, another process cannot compile for this one."""
+    return _the_folder() is not None

@@ -1,12 +1,256 @@
-"""Failures that are reported to the user, and text that is safe to print."""
+"""The errors that linkpose raises. Each one carries its facts as attributes, and its text is a complete sentence.
+
+The text names what happened and why. What to type on the command line is added there (`linkpose.cli.cures`), because a
+Python program has no flags.
+"""
 
 from __future__ import annotations
 
+import difflib
 import unicodedata
+from collections.abc import Sequence
+from typing import Any
 
 
 class LinkposeError(Exception):
-    """A failure that the user can read: one sentence that says what, why and what to type. Exit status 1."""
+    """The base of all errors that a user can cause or cure. On the command line: one sentence, exit status 1."""
+
+
+# ---- files ----
+
+
+class FileError(LinkposeError):
+    """A file cannot be read or written, or does not hold what it should. `path`; `line` where a line is known."""
+
+    def __init__(self, path: object, text: str, line: int | None = None) -> None:
+        super().__init__(text)
+        self.path = str(path)
+        self.line = line
+
+
+class FileFormatError(FileError):
+    """The content of a file cannot be read: not a number, a missing column, another version."""
+
+
+class FileExists(FileError):
+    """An output file exists already and is kept."""
+
+    def __init__(self, path: object) -> None:
+        super().__init__(path, f"{path} exists already")
+
+
+class CannotRead(FileError):
+    """The operating system does not give a file's content. `reason` is its own."""
+
+    def __init__(self, path: object, reason: str | None, what: str = "") -> None:
+        super().__init__(path, f"cannot read {what + ' ' if what else ''}{path}: {reason}")
+        self.reason = reason
+
+
+class CannotWrite(FileError):
+    """The operating system does not take a file's content. `reason` is its own."""
+
+    def __init__(self, path: object, reason: str | None, what: str = "") -> None:
+        super().__init__(path, f"cannot write {what + ' ' if what else ''}{path}: {reason}")
+        self.reason = reason
+
+
+class MissingLibrary(LinkposeError):
+    """A file format needs a library that is not installed. `library` is its name."""
+
+    def __init__(self, library: str, path: object) -> None:
+        super().__init__(f'{path} needs the library {library}. Install it: pip install "linkpose[files]"')
+        self.library, self.path = library, str(path)
+
+
+class TooFewRows(LinkposeError):
+    """Less than half of a filter's estimates have a reference: a score would be that of another run than the user's.
+
+    `rows` of `known` estimates have one, between `common_s` (from, to).
+    """
+
+    def __init__(
+        self, name: str, paths: tuple[object, object], rows: tuple[int, int], common_s: tuple[float, float]
+    ) -> None:
+        self.filter, (self.rows, self.known), self.common_s = name, rows, common_s
+        super().__init__(
+            f"only {self.rows} of {self.known} estimates of {name} in {paths[0]} have a reference in {paths[1]}, "
+            "less than half"
+        )
+
+
+# ---- ports and boards ----
+
+
+class PortError(LinkposeError):
+    """A serial port cannot be opened. `port` is its name."""
+
+    def __init__(self, port: str, text: str) -> None:
+        super().__init__(text)
+        self.port = port
+
+
+class PortNotFound(PortError):
+    """There is no port of this name."""
+
+    def __init__(self, port: str) -> None:
+        super().__init__(port, f"there is no port {port}")
+
+
+class NotASerialPort(PortError):
+    """The name is that of a file or device which is not a serial port."""
+
+    def __init__(self, port: str) -> None:
+        super().__init__(port, f"{port} is not a serial port")
+
+
+class PortBusy(PortError):
+    """Another program has the port open. `holder` names it where the system knows."""
+
+    def __init__(self, port: str, holder: str | None = None) -> None:
+        super().__init__(port, f"{port} is in use by {holder or 'another program'}. Close it and try again")
+        self.holder = holder
+
+
+class PermissionDenied(PortError):
+    """The user may not open the port. `group` owns it."""
+
+    def __init__(self, port: str, group: str) -> None:
+        super().__init__(
+            port,
+            f"no permission to open {port}. Join the group that owns it with `sudo usermod -aG {group} $USER` "
+            "and log in again",
+        )
+        self.group = group
+
+
+class NoBoardFound(LinkposeError):
+    """No port was named, and none of the ports of this machine is an UNO. `ports` lists them.
+
+    `simulated_will_do` says whether a simulated board would serve the purpose.
+    """
+
+    def __init__(self, ports: Sequence[Any], simulated_will_do: bool = True) -> None:
+        self.ports, self.simulated_will_do = tuple(ports), simulated_will_do
+        listed = describe_ports(self.ports)
+        super().__init__(f"no UNO is connected; the ports are: {listed}" if ports else "no serial port is connected")
+
+
+class SeveralBoardsFound(LinkposeError):
+    """No port was named, and several ports are UNOs. `ports` lists those."""
+
+    def __init__(self, ports: Sequence[Any]) -> None:
+        self.ports = tuple(ports)
+        super().__init__(f"{len(ports)} boards are connected: {describe_ports(self.ports)}")
+
+
+def describe_ports(ports: Sequence[Any]) -> str:
+    """Ports in a sentence."""
+    return ", ".join(f"{port.port} ({port.description or 'no description'})" for port in ports)
+
+
+class BoardError(LinkposeError):
+    """The board does not do what it should: it refuses a command, is silent, or is another one."""
+
+
+class NoFirmware(BoardError):
+    """No linkpose firmware answers at the port. `heard` is what came instead (bytes)."""
+
+    def __init__(self, port: str, heard: bytes, text: str) -> None:
+        super().__init__(f"{port}: {text}")
+        self.port, self.heard = port, heard
+
+
+class WrongFirmware(BoardError):
+    """The board's firmware and this linkpose do not understand each other. `is_older` says which side is old."""
+
+    def __init__(self, text: str, is_older: bool) -> None:
+        super().__init__(text)
+        self.is_older = is_older  # True: the firmware, False: linkpose
+
+
+# ---- filters ----
+
+
+class UnknownFilter(LinkposeError):
+    """No filter has this `name`; `known` are the names there are."""
+
+    def __init__(self, name: str, known: Sequence[str]) -> None:
+        near = difflib.get_close_matches(name, known, 1)
+        hint = f"did you mean {near[0]}?" if near else f"the filters are {', '.join(known)}"
+        super().__init__(f"there is no filter {name!r}; {hint}")
+        self.name, self.known = name, tuple(known)
+
+
+class CannotRun(LinkposeError):
+    """The rig or the sensors do not allow a filter."""
+
+
+class MissingJ2S(CannotRun):
+    """The filter needs J2S, the vector from the joint centre to the sensor, and the rig does not contain it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"{name} needs J2S, the vector from the joint centre to the sensor")
+        self.filter = name
+
+
+class UncertainJ2S(CannotRun):
+    """The filter needs a J2S that is known; the rig's is a first guess. `estimators` estimate it."""
+
+    def __init__(self, name: str, estimators: Sequence[str]) -> None:
+        super().__init__(f"{name} needs a J2S that is known; {', '.join(estimators)} is the filter that estimates it")
+        self.filter, self.estimators = name, tuple(estimators)
+
+
+class SensorMissing(CannotRun):
+    """The filter needs a sensor that gives no value."""
+
+    def __init__(self, name: str, sensor: str) -> None:
+        super().__init__(f"{name} needs the {sensor}, which does not answer: check its wiring")
+        self.filter, self.sensor = name, sensor
+
+
+class FilterCannotRun(LinkposeError):
+    """A filter that was asked for cannot run. `filter` is its name, `reason` the error that says why."""
+
+    def __init__(self, name: str, reason: CannotRun) -> None:
+        super().__init__(f"the filter {name} cannot run: {reason}")
+        self.filter, self.reason = name, reason
+
+
+class NoFilterRuns(LinkposeError):
+    """None of the filters can run. `reasons` says why, filter by filter."""
+
+    def __init__(self, reasons: dict[str, CannotRun]) -> None:
+        listed = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+        super().__init__(f"no filter can run on this ({listed})")
+        self.reasons = reasons
+
+
+class NotPositiveDefinite(LinkposeError):
+    """A covariance is no longer positive definite. `matrix` is its name, `where` the filter."""
+
+    def __init__(self, matrix: str, where: str) -> None:
+        super().__init__(f"the {matrix} of {where} is no longer positive definite")
+        self.matrix, self.where = matrix, where
+
+
+class NoUsableData(LinkposeError):
+    """No inertial sensor and no mouse gave usable data."""
+
+
+# ---- values ----
+
+
+class InvalidValue(LinkposeError, ValueError):
+    """An argument is out of range or of a wrong shape. `name` is the argument's."""
+
+    def __init__(self, name: str, text: str) -> None:
+        super().__init__(f"{name} {text}")
+        self.name = name
+
+
+# ---- text ----
 
 
 def printable(text: object, most: int | None = None) -> str:

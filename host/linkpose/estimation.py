@@ -1,21 +1,30 @@
-"""Measurements in, estimates out: the filters side by side, live and over a recording."""
+"""Measurements in, estimates out: the filters run side by side, live and over a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from linkpose import filters, quantities
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns
+from linkpose.precompile import TEXT
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
-from linkpose.sensors.conversion import TIME_DECIMALS
-from linkpose.sensors.devices import Sensors
+from linkpose.recording.reader import Recording, load_recording
+from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
+from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import Rig
+from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
+
+if TYPE_CHECKING:
+    import pandas
+
+    from linkpose.board import Board
 
 
 def sensors_of(measurements: Measurements) -> Sensors:
@@ -31,12 +40,12 @@ def mice_of(measurements: Measurements) -> int:
 
 
 class FoundJ2s(NamedTuple):
-    """J2S that was not known, as the motion has told it."""
+    """J2S (the vector from the joint centre to the sensor) as a filter has estimated it, in the sensor's axes."""
 
     mean_m: Floats  # (3,)
     std_m: Floats  # (3,) of each axis
     worst_std_m: float  # in the direction that is known least
-    worst_axis: str  # x, y or z, the one that this direction is nearest to
+    worst_axis: str  # x, y or z, the axis nearest to this direction
 
     @staticmethod
     def of(mean_m: Floats, covariance_m2: Floats) -> FoundJ2s:
@@ -45,31 +54,50 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+# A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
+_SCALE_Z, _SCALE_LEAST = 3.0, 0.01
+
+
 class Estimator:
     """Runs filters over consecutive blocks of measurements."""
 
     def __init__(self, names: Sequence[str], rig: Rig, sensors: Sensors, mice: int = 0) -> None:
         """The filters of these names, or all that can run when there is none; `mice` is how many ports have one.
 
-        Raises LinkposeError when a named one cannot run, or none at all; `left_out` tells why others do not.
+        Raises UnknownFilter, FilterCannotRun when a named filter cannot run, NoFilterRuns when none can. `left_out`
+        maps each filter that cannot run to the reason.
         """
         self._rig = rig
-        self.left_out: dict[str, str] = {}
+        self.left_out: dict[str, CannotRun] = {}
         self.filters: list[filters.Filter] = []
-        for name in dict.fromkeys(names or filters.NAMES):
+        for name in dict.fromkeys(name.replace("_", "-") for name in names or filters.NAMES):
             try:
                 self.filters.append(filters.create(name, rig, sensors, mice))
-            except filters.CannotRun as reason:
+            except CannotRun as reason:
                 if names:
-                    raise LinkposeError(f"the filter {name} cannot run: {reason}") from None
-                self.left_out[name] = str(reason)
+                    raise FilterCannotRun(name, reason) from None
+                self.left_out[name] = reason
         if not self.filters:
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
-            raise LinkposeError(f"no filter can run on this ({reasons})")
+            raise NoFilterRuns(self.left_out)
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
-        self._decimals = np.array(
-            [TIME_DECIMALS, *(quantities.decimals(name) for name in self.columns[1:])], dtype=np.int64
-        )
+        self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
+
+    @staticmethod
+    def for_board(names: Sequence[str], board: Board) -> Estimator:
+        """An estimator for a connected board's stream. Raises as the constructor does."""
+        settings = BoardSettings.of(board.hello)
+        rig = board.rig.with_delay_of(settings.dlpf)
+        return Estimator(names, rig, found(board.hello), settings.mouse_ports)
+
+    @staticmethod
+    def for_measurements(names: Sequence[str], rig: Rig, measurements: Measurements) -> Estimator:
+        """An estimator for the sensors and mice that gave values. Raises as the constructor does."""
+        return Estimator(names, rig, sensors_of(measurements), mice_of(measurements))
+
+    @property
+    def rig(self) -> Rig:
+        """The rig in force."""
+        return self._rig
 
     def smooth(self) -> None:
         """Puts a smoother in the place of each filter that has one: from here on, `process` takes a whole recording.
@@ -102,6 +130,19 @@ class Estimator:
                 return FoundJ2s.of(*f.j2s_m)
         return None
 
+    @property
+    def mice_scale(self) -> tuple[float, float] | None:
+        """Counts per metre of the mice relative to the rig file, and its standard deviation, where they differ.
+
+        None where no filter compares the mice with the gyro, or where the difference is not significant.
+        """
+        for f in self.filters:
+            if isinstance(f, filters.FindsMiceScale):
+                factor, std = f.scale_change
+                if abs(factor - 1.0) > max(_SCALE_Z * std, _SCALE_LEAST):
+                    return factor, std
+        return None
+
     def text(self, estimates: Floats) -> str:
         """Estimates as lines of CSV."""
         return format_rows(estimates, self._decimals)
@@ -118,8 +159,209 @@ class Estimator:
         ]
 
 
+class LiveEstimator:
+    """An estimator whose filters may become ready while measurements arrive already.
+
+    A filter that is not ready yet catches up from the buffered measurements, so every estimate is the same, to the last
+    digit, as if all filters had run from the first sample on. Rows are complete when all filters have processed them.
+    """
+
+    def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
+        """`is_ready` says of a filter's name, and of precompile.TEXT, whether it can run now; if so, it always can."""
+        self._filters = estimator.filters
+        self._width = [len(f.columns) for f in estimator.filters]
+        self._is_ready = is_ready
+        self._blocks: list[Measurements] = []  # not yet processed by all filters
+        self._results: list[list[Floats]] = [[] for _ in self._filters]  # of these blocks, filter by filter
+
+    def process(self, block: Measurements) -> tuple[Floats, Floats]:
+        """Takes the next block, which may be empty. Returns the rows that are complete now, and the newest row.
+
+        Complete rows come in order, none is left out; the newest row (columns,) has NaN for filters that are not ready,
+        and is empty before the first sample.
+        """
+        if len(block):
+            self._blocks.append(block)
+        for f, results in zip(self._filters, self._results, strict=True):
+            if len(results) < len(self._blocks) and self._is_ready(f.name):
+                results.extend(f.process(waiting) for waiting in self._blocks[len(results) :])
+        return self._complete_rows(), self._newest
+
+    def finish(self) -> Floats:
+        """The rows that were not complete yet. All filters must be ready, or are compiled now."""
+        self._is_ready = lambda _: True
+        rows, _ = self.process(Measurements.from_imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3))))
+        return rows
+
+    def _complete_rows(self) -> Floats:
+        count = min((len(results) for results in self._results), default=0)
+        self._newest = self._newest_row()
+        if not count or not self._is_ready(TEXT):
+            return np.empty((0, 1 + sum(self._width)))
+        rows = [
+            np.column_stack([block.time_s, *(results[i] for results in self._results)])
+            for i, block in enumerate(self._blocks[:count])
+        ]
+        del self._blocks[:count]
+        for results in self._results:
+            del results[:count]
+        return np.concatenate(rows)
+
+    def _newest_row(self) -> Floats:
+        if not self._blocks:
+            return np.empty(0)
+        parts = [self._blocks[-1].time_s[-1:]]
+        for width, results in zip(self._width, self._results, strict=True):
+            caught_up = len(results) == len(self._blocks)
+            parts.append(results[-1][-1] if caught_up else np.full(width, np.nan))
+        return np.concatenate(parts)
+
+
 class EstimateWriter(CsvFile):
     """An estimate CSV under way. Raises LinkposeError as `CsvFile` does."""
 
     def __init__(self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool) -> None:
         super().__init__(path, "estimate", head, columns, force)
+
+
+class FilterEstimates:
+    """The columns of one filter as attributes: `height_m`, `height_std_m`, …, each (N,) float64."""
+
+    def __init__(self, columns: dict[str, Floats]) -> None:
+        self._columns = columns
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Their names, without the filter's."""
+        return tuple(self._columns)
+
+    def __getattr__(self, name: str) -> Floats:
+        try:
+            return self.__dict__["_columns"][name]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(f"no {name}; there are {', '.join(self.columns)}") from None
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *self._columns]
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What `estimate` returns: a table of N rows, one per sample.
+
+    `estimates["joint_inertial_height_m"]` and `estimates.joint_inertial.height_m` are the same column, (N,) float64.
+    NaN means that the value is not known. Each quantity has its standard deviation beside it (`height_std_m`).
+    """
+
+    columns: tuple[str, ...]  # time_s, then <filter>_<quantity>_<unit>
+    values: Floats  # (N, len(columns))
+    filters: tuple[str, ...]  # that ran, best first
+    rejected: dict[str, int]  # filter -> samples that it could not use
+    left_out: dict[str, CannotRun]  # filter -> why it did not run
+    found_j2s: FoundJ2s | None  # J2S where it was to be estimated
+    rig: Rig  # that was in force
+
+    @property
+    def time_s(self) -> Floats:
+        """(N,) time of each row, s."""
+        return self["time_s"]
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def __getitem__(self, column: str) -> Floats:
+        try:
+            return self.values[:, self.columns.index(column)]
+        except ValueError:
+            raise KeyError(f"no column {column}; there are {', '.join(self.columns)}") from None
+
+    def __getattr__(self, name: str) -> FilterEstimates:
+        columns = self.__dict__.get("columns", ())
+        found = {c: at for at, c in enumerate(columns) if (split := quantities.split(c)) and split.prefix == name}
+        if not found:
+            raise AttributeError(f"no filter {name}; there are {', '.join(self.__dict__.get('filters', ()))}")
+        return FilterEstimates({c.removeprefix(f"{name}_"): self.values[:, at] for c, at in found.items()})
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A pandas.DataFrame with the same columns. Raises ImportError if pandas is not installed."""
+        import pandas
+
+        return pandas.DataFrame(self.values, columns=list(self.columns))
+
+    def save(self, path: str | PathLike[str], *, force: bool = False) -> None:
+        """Writes an estimate CSV, as `linkpose estimate -o` does. Raises FileExists (unless `force`), CannotWrite."""
+        head = {"filters": list(self.filters), "rig": self.rig.as_dict()}
+        decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
+        with EstimateWriter(Path(path), head, self.columns, force) as writer:
+            writer.write(format_rows(self.values, decimals))
+            writer.close({"rows": len(self), "rejected": self.rejected})
+
+
+def estimate(
+    source: Recording | Measurements | str | PathLike[str],
+    filters: Sequence[str] | None = None,
+    *,
+    j2s_m: Sequence[float] | Literal["auto"] | None = None,
+    j2s_std_m: float | None = None,
+    rig: Rig | str | PathLike[str] | None = None,
+    smooth: bool = False,
+) -> Estimates:
+    """Runs filters over a recording or over measurements, and returns their estimates.
+
+    Args:
+        source: what `load` returned, `Measurements`, or the path of a recording.
+        filters: names such as "joint-inertial"; None: all that the sensors and the rig support.
+        j2s_m: J2S, the vector from the joint centre to the sensor in the sensor's axes (m); "auto" estimates it from
+            the motion. None: the rig's.
+        j2s_std_m: standard deviation of `j2s_m`, each axis (m). Default: 0.1 mm.
+        rig: sensor placement and calibration, or the path of a rig.toml. None: the recording's own.
+        smooth: use a smoother, which also uses later measurements, for each filter that has one.
+
+    Raises:
+        UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError.
+    """
+    recording = load_recording(source) if isinstance(source, str | PathLike) else source
+    own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
+    measurements = recording if isinstance(recording, Measurements) else recording.measurements
+    in_force = as_rig(rig, own).with_delay_of(dlpf)
+    joint = _joint(j2s_m, j2s_std_m)
+    if joint is not None:
+        in_force = replace(in_force, joint=joint)
+    estimator = Estimator.for_measurements(filters or (), in_force, measurements)
+    if smooth:
+        estimator.smooth()
+    values = estimator.process(measurements)
+    return Estimates(
+        tuple(estimator.columns),
+        values,
+        tuple(f.name for f in estimator.filters),
+        {f.name: f.rejected for f in estimator.filters},
+        estimator.left_out,
+        estimator.found_j2s,
+        in_force,
+    )
+
+
+def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | None) -> Joint | None:
+    """The joint that the arguments of `estimate` describe. Raises InvalidValue."""
+    if j2s_m is None or isinstance(j2s_m, str):
+        if j2s_std_m is not None:
+            raise InvalidValue("j2s_std_m", "describes a J2S that is given: give j2s_m too")
+        if j2s_m not in (None, "auto"):
+            raise InvalidValue("j2s_m", f'is {j2s_m!r}; it must be three numbers (m) or "auto"')
+        return None if j2s_m is None else UNKNOWN_JOINT
+    vector = np.asarray(j2s_m, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InvalidValue("j2s_m", f"is {j2s_m!r}; it must be three finite numbers (m)")
+    if j2s_std_m is None:
+        return Joint(to_vector(vector))
+    if not 0 < j2s_std_m < np.inf:
+        raise InvalidValue("j2s_std_m", f"is {j2s_std_m!r}; it must be above 0 (m)")
+    return Joint(to_vector(vector), j2s_std_m)
+
+
+def _decimals(column: str) -> int:
+    return TIME_DECIMALS if column == "time_s" else quantities.decimals(column)

@@ -130,8 +130,8 @@ ANGLE = _degrees("angle", "joint angle")
 QW, QX, QY, QZ = (_part_of_rotation(axis) for axis in "wxyz")
 # σ of the whole rotation of a chain's joint, the only figure that says how sure the quaternion is.
 ROTATION = _degrees("rotation", "joint rotation")
-HEIGHT1 = _length("height1", "height of sensor 1 over the fixed joint", "height")
-HEIGHT2 = _length("height2", "height of sensor 2 over the fixed joint", "height")
+HEIGHT1 = _length("height1", "height of sensor 1", "height")
+HEIGHT2 = _length("height2", "height of sensor 2", "height")
 
 _AXES = ("x", "y", "z")
 _READINGS = (

@@ -16,9 +16,8 @@ from _report import Row, report
 
 from linkpose.estimation import EstimateWriter, Estimator
 from linkpose.filters import ALL_SENSORS
-from linkpose.recording.writer import RecordingWriter, metadata
-from linkpose.sensors.conversion import Converter, Settings
-from linkpose.sensors.measurements import Measurements
+from linkpose.recording.writer import RecordingWriter, layout_of, metadata
+from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.simulation import board
 from linkpose.simulation.link import LinkRun
@@ -31,22 +30,22 @@ def main() -> None:
     run = LinkRun(duration_s=SAMPLES / 100)
     frames = [encode(sample) for sample in run.samples()]
     hello = board.hello(board.DEFAULTS)
-    settings = Settings.of(hello)
+    settings = BoardSettings.of(hello)
     with tempfile.TemporaryDirectory() as folder:
         decoder, timeline, clock = StreamDecoder(), Timeline(100), BoardClock()
         converter, estimator = Converter(settings), Estimator([], run.rig, ALL_SENSORS)
         estimator.warm_up()
         head = metadata(hello, settings, "bench", run.rig, {})
-        recording = RecordingWriter(Path(folder, "r.csv"), head, 0, force=False)
+        recording = RecordingWriter(Path(folder, "r.csv"), head, layout_of(settings), force=False)
         estimates = EstimateWriter(Path(folder, "e.csv"), head, estimator.columns, force=False)
         took = []
         for frame in frames:
             began = time.perf_counter()
             for sample in decoder.feed(frame):
                 place = timeline.place(sample, clock, 0.0)
-                rows = [converter.row(sample, *place)]
-                recording.write_rows(rows)
-                estimates.write(estimator.text(estimator.process(Measurements.of(rows))))
+                block = converter.convert_placed([sample], [place])
+                recording.write_block(block)
+                estimates.write(estimator.text(estimator.process(block.measurements)))
             took.append(1e6 * (time.perf_counter() - began))
     name = f"{len(estimator.filters)} filters"
     report(

@@ -25,7 +25,10 @@ CAPTURE_FRAMES = 60_000
 
 def our_stream(count: int, mice: int) -> bytes:
     moved = tuple(value for port in range(mice) for value in (3 * port, -port))
-    return b"".join(encode(sample._replace(mice=moved)) for sample in LinkRun(duration_s=count / 100).samples())
+    return b"".join(
+        encode(sample._replace(mice=moved, sections=sample.sections | mice << 4))
+        for sample in LinkRun(duration_s=count / 100).samples()
+    )
 
 
 def peer_stream(count: int, mice: int) -> bytes:

@@ -10,10 +10,12 @@ import pytest
 from hypothesis import settings
 
 from linkpose.cli import main, patience
+from linkpose.device.ports import register_scheme
 
 # The first example may wait for a compiler.
 settings.register_profile("linkpose", deadline=None)
 settings.load_profile("linkpose")
+register_scheme("linkpose.simulation")  # tests open sim:// through the device layer too
 
 
 class Result(NamedTuple):

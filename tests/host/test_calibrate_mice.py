@@ -13,6 +13,7 @@ from linkpose.calibration.mice import calibrate_mice, with_calibration
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.rig import Mouse, Rig
+from linkpose.simulation.drive import Move
 from linkpose.simulation.mice import Fault, MiceRun, ring
 from linkpose.wire.messages import SampleFlags
 
@@ -51,7 +52,7 @@ def test_a_line_of_unknown_length_will_do_where_the_turn_tells_the_scale(mice):
 def test_one_mouse_needs_the_length():
     run, line = driven("line", mice=ring(1))
     _, turn = driven("turn", mice=ring(1))
-    with pytest.raises(LinkposeError, match="give it with --length"):
+    with pytest.raises(LinkposeError, match="measure the length of the line"):
         calibrate_mice([turn, line], run.rig, None)
 
 
@@ -131,3 +132,21 @@ def test_the_command_completes_the_rig_file(linkpose, tmp_path):
     for row, mouse in zip(rows, rig.mouse, strict=True):
         assert mouse.counts_per_m == pytest.approx(row["counts_per_m"], abs=0.01)
         assert mouse.angle_deg == pytest.approx(row["angle_deg"], abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_ten_turns_with_an_uncalibrated_gyro_are_counted(seed):
+    run, line = driven("line", seed)
+    ten = MiceRun(seed, 44.0, errors="datasheet", drive=Move((0.0, 0.0, 20 * np.pi), 44.0))
+    turns = Recording(Path("turns.csv"), ten.measurements(), ten.rig, 100.0, {}, [])
+    for i, mouse in enumerate(calibrate_mice([line, turns], run.rig, LENGTH_M)):
+        assert mouse.counts_per_m == pytest.approx(run.true_counts_per_m[i], rel=0.003)
+        assert mouse.angle_deg == pytest.approx(run.true_angle_deg[i], abs=0.2)
+
+
+def test_more_turns_than_such_a_gyro_can_count_are_refused():
+    run, line = driven("line")
+    many = MiceRun(3, 60.0, drive=Move((0.0, 0.0, 28 * np.pi), 60.0))
+    turns = Recording(Path("turns.csv"), many.measurements(), many.rig, 100.0, {}, [])
+    with pytest.raises(LinkposeError, match="has 14 full turns"):
+        calibrate_mice([line, turns], run.rig, LENGTH_M)

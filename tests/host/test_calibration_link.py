@@ -268,7 +268,7 @@ def saved(path: Path, block: Measurements, accel_unit: float = 1.0) -> str:
     ("sides", "says"),
     [
         (SIX_SIDES[:1], "1 rest in 1 attitude\n"),
-        (SIX_SIDES, "no residual from 6 attitudes, which always fit"),
+        (SIX_SIDES, "6 attitudes always fit; record more to get a residual"),
         (np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]), "residual 0.00"),
     ],
 )
@@ -311,12 +311,31 @@ def test_a_sensor_that_is_not_calibrated_is_said_and_calibrated_on_request(tmp_p
     CliRunner().invoke(simulate_link.command, ["-o", str(rec), "--truth", str(truth), "--errors", "datasheet"])
     typed = [str(rec), "--rig", str(rig_file)]
     told = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
-    assert "the sensor is not calibrated: add --imu" in told.stderr
+    assert "are not saved. Add --imu to save them." in told.stderr
+    assert "The rig file does not calibrate the sensor: add --imu" in told.stderr
     assert Rig.load(rig_file).imu.gyro_bias_rad_s == (0.0, 0.0, 0.0)
     asked = CliRunner().invoke(joint_command.command, [*typed, "--imu", "--json"], catch_exceptions=False)
-    assert "not calibrated" not in asked.stderr
+    assert "not saved" not in asked.stderr and "does not calibrate" not in asked.stderr
     rig, shown = Rig.load(rig_file), json.loads(asked.stdout)
     assert list(rig.imu.gyro_bias_rad_s) == shown["gyro_bias_rad_s"]
     assert list(rig.imu.accel_scale) == shown["accel_scale"] != [1.0, 1.0, 1.0]
     again = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
-    assert "not calibrated" not in again.stderr
+    assert "not saved" in again.stderr and "does not calibrate" not in again.stderr
+
+
+def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
+    """`simulate link --rests` and then `calibrate imu`, as each names the next command."""
+    rec, truth, rig_file = tmp_path / "rec.csv", tmp_path / "truth.csv", tmp_path / "rig.toml"
+    typed = ["-o", str(rec), "--truth", str(truth), "--rests", "--errors", "datasheet", "--duration", "40"]
+    made = CliRunner().invoke(simulate_link.command, typed, catch_exceptions=False)
+    assert f"next: linkpose calibrate imu {rec} --rig rig.toml" in made.stderr
+    found = CliRunner().invoke(
+        imu_command.command, [str(rec), "--rig", str(rig_file), "--json"], catch_exceptions=False
+    )
+    assert json.loads(found.stdout)["attitudes"] == 6
+    assert f"next: linkpose calibrate joint SWING.csv --rig {rig_file}" in found.stderr
+    errors = LinkRun(1, 0, 40.0, errors="datasheet", rests=True).imu_errors
+    assert Rig.load(rig_file).imu.gyro_bias_rad_s == pytest.approx(errors.gyro_bias_rad_s, abs=1e-3)
+    assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)
+    with pytest.raises(LinkposeError, match="six rests do not fit 10 s: simulate 23 s or more"):
+        LinkRun(1, 0, 10.0, rests=True)

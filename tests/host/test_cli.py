@@ -45,7 +45,7 @@ def test_json_estimates_have_the_csvs_keys_and_end_with_the_summary(linkpose, tm
     done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1, "-o", out, "--json")
     *estimates, summary = map(json.loads, done.out.splitlines())
     assert summary["event"] == "summary"
-    assert summary.keys() == {"event", "samples", "lost", "corrupt", "gaps", "duration_s", "rate_hz"}
+    assert summary.keys() >= {"event", "samples", "lost", "corrupt", "gaps", "duration_s", "rate_hz", "sensors"}
     header, *lines = rows(out)
     assert [list(estimate) for estimate in estimates] == [header.split(",")] * 100
     for estimate, line in zip(estimates, lines, strict=True):
@@ -68,7 +68,7 @@ def test_a_filter_that_cannot_run_is_named_with_its_reason(linkpose, refused, tm
     recording.write_text("".join(lines))
     done = linkpose("estimate", recording, "-o", tmp_path / "e.csv")
     assert done.status == 0
-    assert "joint needs J2S" in done.err and "--j2s X,Y,Z" in done.err
+    assert "joint-inertial needs J2S" in done.err and "--j2s X,Y,Z" in done.err
     names = read_table(tmp_path / "e.csv", "estimate").columns
     assert "tilt_roll_deg" in names and "joint_height_m" not in names
     assert "the filter joint cannot run" in refused("estimate", recording, "--filter", "joint")
@@ -125,10 +125,10 @@ def closing_line(path: Path) -> dict:
 def test_j2s_auto_is_estimated_and_told_live_and_over_the_recording(linkpose, refused, tmp_path):
     live, recording, replay = tmp_path / "live.csv", tmp_path / "rec.csv", tmp_path / "replay.csv"
     done = linkpose(
-        "estimate", "--live", "--port", SIM, "--duration", 30, "--j2s", "auto", "-o", live, "--record", recording
+        "estimate", "--live", "--port", SIM, "--duration", 30, "--j2s", "auto", "-o", live, "--record", recording, "-v"
     )
     assert done.status == 0
-    assert "without joint: joint needs a J2S that is known" in done.err
+    assert "not running: joint: joint needs a J2S that is known" in done.err
     found = closing_line(live)
     assert found["j2s_m"] == pytest.approx([-0.09, -0.04, 1.65], abs=0.01)
     assert all(0 < std < 0.01 for std in found["j2s_std_m"])
@@ -235,7 +235,7 @@ def test_nothing_heavy_is_imported_for_help_ports_info_and_record():
     code = (
         "import sys; import linkpose.cli; from linkpose.cli import COMMANDS\n"
         "import linkpose.cli.ports, linkpose.cli.info, linkpose.cli.record, linkpose.cli.live\n"
-        "import linkpose.device.session, linkpose.recording.writer, linkpose.recording.csvfile\n"
+        "import linkpose.device.ports, linkpose.recording.csvfile\n"
         "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib', 'rich') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=HOST)
@@ -257,7 +257,8 @@ def test_the_boards_settings_are_put_in_force_and_recorded(linkpose, refused, tm
     assert table.columns["accel_z_m_s2"][0] == pytest.approx(9.8, abs=0.5)
     done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1, "--rate", 50, "-o", tmp_path / "e.csv")
     assert done.status == 0 and len(read_table(tmp_path / "e.csv")) == 50
-    assert "refused CONFIGURE: sample rate out of range" in refused("record", "--port", SIM, "--rate", 77)
+    said = refused("record", "--port", SIM, "--rate", 77)
+    assert "not a rate of the board" in said and "50, 64, 80, 100, 125" in said
     assert "--live" in refused("estimate", out, "--rate", 50)
 
 
@@ -324,6 +325,20 @@ def test_the_environment_may_name_the_port(monkeypatch, linkpose):
 def test_ports_json(monkeypatch, linkpose):
     monkeypatch.setattr(ports, "find_ports", lambda: [UNO, OTHER])
     listed = [json.loads(line) for line in linkpose("ports", "--json").out.splitlines()]
-    assert [list(port) for port in listed] == [["port", "description", "vid", "pid", "serial", "is_uno", "busy"]] * 2
+    assert [list(port) for port in listed] == [
+        ["port", "description", "vid", "pid", "serial", "is_uno", "busy", "location", "chip"]
+    ] * 2
     assert listed[0]["is_uno"] and not listed[1]["is_uno"]
     assert "UNO" in linkpose("ports").out
+
+
+def test_a_mistyped_name_is_answered_with_the_nearest(refused):
+    assert "Did you mean estimate?" in refused("estimat")
+    assert "did you mean joint-inertial?" in refused("estimate", "--live", "--port", SIM, "--filter", "joint-inertal")
+
+
+def test_a_person_reads_one_device_a_line_with_units(linkpose):
+    lines = linkpose("info", "--port", SIM).out.splitlines()
+    assert any(line.split() == ["sample", "rate", "100", "Hz"] for line in lines)
+    assert any("MPU-6050 at 0x68 (id 0x68): ok" in line for line in lines)
+    assert not any("0x69" in line for line in lines)

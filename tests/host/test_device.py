@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import threading
 import time
 import types
@@ -11,17 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pty_board import PtyBoard
+from pty_board import PtyBoard, link_run
 from serial.tools import list_ports_common
 
 from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
+from linkpose.errors import CannotWrite
+from linkpose.recorder import Recorder
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
-from linkpose.wire.frames import encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello
+from linkpose.sensors.rig import Rig
+from linkpose.simulation.board import DEFAULTS, SimulatedBoard
+from linkpose.wire.frames import StreamDecoder, encode
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping, Sample
 
 
 @pytest.fixture
@@ -53,10 +58,10 @@ def framed(payload: bytes) -> bytes:
     [
         (b"", "the board is silent"),
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
-        (random.Random(3).randbytes(60), "only noise came"),
-        (b"\xff\xfe\xff\xfc" * 10, "only noise came"),
-        (framed(OLD_HELLO), "the board's firmware is old: it speaks protocol 0.9, this linkpose 2.0"),
-        (framed(NEW_HELLO), "this linkpose is old: it speaks protocol 2.0, the board's firmware 3.0"),
+        (random.Random(3).randbytes(60), "only noise was received"),
+        (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
+        (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
     ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
 )
@@ -104,7 +109,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     with PtyBoard(tmp_path / "port"):
         first = Session(str(tmp_path / "port"), print)
         next(iter(first.stream()))
-        first._link.close()  # as a killed program leaves it: no STOP
+        first._connection.close()  # as a killed program leaves it: no STOP
         with Session(str(tmp_path / "port"), print) as second:
             assert isinstance(second.hello, Hello)
             seqs = [p.place.seq for placements in second.stream(0.3) for p in placements]
@@ -117,7 +122,7 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
     how long anything takes.
     """
-    from linkpose.cli.live import Recorder
+    from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
     said: list[str] = []
@@ -125,7 +130,7 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
         behind = None
         for placements in session.stream():
-            recorder.take(placements)
+            recorder.convert(placements)
             timeline = session.timeline
             if waiting and waiting[0][0](said, timeline.samples):
                 waiting.pop(0)[1]()
@@ -341,3 +346,126 @@ def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_pat
                 time.sleep(1.0)  # a slow disk
             seqs += [p.place.seq for p in placements]
     assert seqs == list(range(150))
+
+
+class Forgetful(SimulatedBoard):
+    """A board that is reset, and whose HELLO gets lost, each time that it has answered a PING after a CONFIGURE."""
+
+    def __init__(self, resets: int) -> None:
+        super().__init__(link_run)
+        self.resets = resets
+        self._configured = False
+
+    def _answer(self, message, now_us):
+        answers = super()._answer(message, now_us)
+        self._configured |= isinstance(message, Configure)
+        if self.resets and self._configured and isinstance(message, Ping):
+            self.resets -= 1
+            self._configured = False
+            self._settings = DEFAULTS
+            self._run = link_run(DEFAULTS)
+        return answers
+
+
+@pytest.mark.parametrize("resets", [1, 2])
+def test_a_reset_between_configure_and_start_is_noticed(tmp_path, monkeypatch, resets):
+    """The values are never scaled by settings that the board does not have: 200 Hz and 16 g are streamed in the end."""
+    board = Forgetful(resets)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200, accel_range_g=16))
+        samples = [p.sample for placements in session.stream(0.2) for p in placements]
+    assert len(samples) == 40
+    assert np.mean([sample.accel_z for sample in samples]) == pytest.approx(2048, rel=0.1)  # 1 g at 16 g
+
+
+def test_a_board_that_is_reset_again_and_again_is_named(tmp_path, monkeypatch):
+    board = Forgetful(1000)
+    monkeypatch.setattr("pty_board.SimulatedBoard", lambda _: board)
+    with PtyBoard(tmp_path / "port"), Session(str(tmp_path / "port"), print) as session:
+        session.configure(session.settings._replace(sample_rate_hz=200))
+        with pytest.raises(session_module.LinkposeError, match="reset again and again"):
+            next(iter(session.stream(0.2)))
+
+
+class SpoiledSamples:
+    """Changes samples on their way to the host, from the n-th on."""
+
+    def __init__(self, first: int, change) -> None:
+        self._first, self._change, self._count = first, change, 0
+        self._decoder = StreamDecoder()
+
+    def __call__(self, data: bytes) -> bytes:
+        return b"".join(self._pass_on(message) for message in self._decoder.feed(data))
+
+    def _pass_on(self, message) -> bytes:
+        if isinstance(message, Sample):
+            self._count += 1
+            if self._count > self._first:
+                return self._change(message, self._count)
+        return encode(message)
+
+
+def lines_of(port: Path, words: str, most: int = 400) -> list[str]:
+    """Messages of a session up to the first with these words."""
+    said: list[str] = []
+    with Session(str(port), said.append) as session:
+        for _ in session.stream():
+            if any(words in line for line in said) or session.timeline.samples > most:
+                break
+    return said
+
+
+def test_a_stream_that_turns_to_noise_is_reported(tmp_path):
+    noise = random.Random(1).randbytes(30)
+    with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, lambda message, count: noise)):
+        said = lines_of(tmp_path / "port", "noise")
+    assert re.fullmatch(r"no sample for 1.5 s, only \d+ bytes of noise; asking the board", said[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda message, count: encode(message._replace(t_us=5_000_000)), "stands still"),
+        (lambda message, count: encode(message._replace(t_us=message.t_us + 3_000_000)), "jumped by 3.00 s"),
+    ],
+    ids=["frozen", "jumping"],
+)
+def test_a_board_clock_that_stands_still_or_jumps_is_reported_once(tmp_path, change, words):
+    with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, change)):
+        said = lines_of(tmp_path / "port", words)
+    assert sum(words in line for line in said) == 1
+
+
+def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
+    from linkpose.simulation import board as simulated
+
+    ours = simulated.hello(simulated.DEFAULTS)
+    other = ours._replace(devices=(ours.devices[0]._replace(id=0x70), *ours.devices[1:]))
+    changed = threading.Event()
+
+    def spoil(data: bytes) -> bytes:
+        return data.replace(encode(ours), encode(other)) if changed.is_set() else data
+
+    port = tmp_path / "port"
+    refusal = pytest.raises(session_module.AnotherBoard, match="0x70 instead of 0x68")
+    with PtyBoard(port, spoil=spoil) as board, Session(str(port), print) as session, refusal:
+        for _ in session.stream():
+            if session.timeline.samples > 10 and not changed.is_set():
+                changed.set()
+                board.reset(says_hello=False)
+
+
+def test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence(tmp_path):
+    out = tmp_path / "r.csv"
+    refusal = pytest.raises(CannotWrite, match="it was removed while it was being written")
+    with Session("sim://link?speed=20", print) as session, Recorder(session, out, Rig()) as recorder, refusal:
+        for placements in session.stream(20):
+            recorder.convert(placements)
+            if session.timeline.samples > 10:
+                Recorder(session, out, Rig(), force=True).close("duration")  # a second program, with --force
+
+
+def test_a_recording_is_not_called_a_raw_capture(refused, tmp_path):
+    assert "is not a name for a recording" in refused("record", tmp_path / "x.bin", "--port", "sim://link")
+    assert not (tmp_path / "x.bin").exists()

@@ -14,7 +14,8 @@ from scipy.stats import chi2
 from linkpose import filters
 from linkpose.errors import LinkposeError
 from linkpose.experiments.mice import redundancy
-from linkpose.filters.mice import MiceFilter, MiceParameters, fault_limit
+from linkpose.filters.mice import MiceFilter, MiceParameters
+from linkpose.filters.mice.faults import fault_limit
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig

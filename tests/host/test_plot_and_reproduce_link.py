@@ -13,6 +13,7 @@ from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
+from linkpose.localization.grid import GridMap
 from linkpose.plotting import lines
 from linkpose.plotting.canvas import COLOURS
 from linkpose.recording.table import read_table
@@ -20,8 +21,9 @@ from linkpose.recording.table import read_table
 PNG = b"\x89PNG"
 
 
-def write(path, columns):
-    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=",".join(columns), comments="")
+def write(path, columns, kind="estimate"):
+    head = f"# linkpose {kind} 1\n# {{}}\n" + ",".join(columns)
+    np.savetxt(path, np.column_stack(list(columns.values())), delimiter=",", header=head, comments="")
     return str(path)
 
 
@@ -47,7 +49,7 @@ def link_files(tmp_path, n=600, **more):
         columns |= {f"{name}_height_m": height + error * np.cos(9 * t), f"{name}_height_std_m": np.full(n, error)}
         columns |= {f"{name}_roll_deg": 10 * np.sin(t)}
     truth = {"time_s": t, "height_m": height, "roll_deg": 10 * np.sin(t), "yaw_deg": 0 * t}
-    paths = (write(tmp_path / "e.csv", columns | more), write(tmp_path / "t.csv", truth))
+    paths = (write(tmp_path / "e.csv", columns | more), write(tmp_path / "t.csv", truth, "truth"))
     return [read_table(Path(path)) for path in paths]
 
 
@@ -57,7 +59,9 @@ def test_a_link_with_its_truth_shows_height_error_and_tilt(tmp_path):
     assert labels == ["height over the joint (m)", "height error (cm)", "roll (°)"]  # no filter estimates the yaw
     height, error, _ = figure.axes
     assert drawn(height) == ["truth", "joint-inertial", "joint", "±2σ joint-inertial"]
-    assert drawn(error) == ["joint-inertial 0.0707 cm rms", "joint 0.707 cm rms", "±2σ joint-inertial"]
+    words = [label.split() for label in drawn(error)]
+    assert [word[0] for word in words] == ["joint-inertial", "joint", "±2σ"] and words[0][2:] == ["cm", "rms"]
+    assert [float(word[1]) for word in words[:2]] == pytest.approx([0.0707, 0.707], rel=0.02)
     assert height.get_position().height > error.get_position().height
     assert all(axes.get_shared_x_axes().joined(height, axes) for axes in figure.axes)
     assert any("imu-baro (add --filter imu-baro)" in remark for remark in remarks)
@@ -119,7 +123,7 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     columns = {"time_s": t, **{f"planar_ekf_{k}": v for k, v in (pose | motion).items()}}
     columns |= {"planar_ekf_x_std_m": np.full(400, 0.01), "planar_ekf_y_std_m": np.full(400, 0.02)}
     columns |= {"mice_excluded": np.where((t > 1) & (t < 2), 2.0, 0.0)}
-    paths = (write(tmp_path / "e.csv", columns), write(tmp_path / "t.csv", {"time_s": t} | pose | motion))
+    paths = (write(tmp_path / "e.csv", columns), write(tmp_path / "t.csv", {"time_s": t} | pose | motion, "truth"))
     figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
     path, speed, heading, mice = figure.axes
     assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x (m)", "y (m)", 1.0)
@@ -127,8 +131,25 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert {(e.width, e.height) for e in path.patches if hasattr(e, "width")} == {(0.04, 0.08)}
     assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped (°)")
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
-    (bar,) = mice.collections[0].get_paths()
+    (bar,) = mice.collections[1].get_paths()  # of mouse 2
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
+
+
+def test_a_map_and_beacons_lie_under_the_path(tmp_path):
+    """A map whose own axes are turned by 90°: its corners are where map_server puts them."""
+    t = np.arange(50) / 100
+    file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
+    grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
+    scene = plotting.Scene(grid, {"A1": (3.0, 4.0, 9.0)})
+    figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
+    (path,) = figure.axes
+    (image,) = path.images
+    corner = (image.get_transform() - path.transData).transform([(4.0, 2.0)])  # 8 × 4 cells of 0.5 m
+    assert np.allclose(corner, [(-1.0, 6.0)])
+    beacon = next(line for line in path.lines if line.get_label() == "beacons")
+    assert (beacon.get_xdata()[0], beacon.get_ydata()[0]) == (3.0, 4.0)
+    assert [text.get_text() for text in path.texts] == ["A1"]
+    assert path.get_ylim()[1] >= 6.0
 
 
 def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
@@ -136,9 +157,7 @@ def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
     angle = 30 * np.sin(t)
     estimate = {"time_s": t, "chain_angle_deg": angle + 1, "chain_angle_std_deg": np.ones(300)}
     truth = {"time_s": t, "chain_angle_deg": angle}
-    paths = (write(tmp_path / "e.csv", estimate), tmp_path / "t.csv")
-    write(paths[1], truth)
-    paths[1].write_text("# linkpose truth 1\n# {}\n" + paths[1].read_text())
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", truth, "truth"))
     figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
     assert [axes.get_ylabel() for axes in figure.axes] == ["joint angle (°)", "angle error (°)"]
     assert drawn(figure.axes[1])[0] == "chain 1 ° rms"
@@ -197,7 +216,7 @@ def test_the_ending_names_the_format_and_force_replaces(tmp_path, estimate, endi
     with pytest.raises(LinkposeError, match="exists already"):
         CliRunner().invoke(plot.command, [estimate, "-o", str(picture)], catch_exceptions=False)
     assert CliRunner().invoke(plot.command, [estimate, "-o", str(picture), "--force"]).exit_code == 0
-    with pytest.raises(LinkposeError, match=r"ends in \.png, \.svg, \.pdf"):
+    with pytest.raises(LinkposeError, match=r"must end in \.png, \.svg, \.pdf"):
         CliRunner().invoke(plot.command, [estimate, "-o", str(tmp_path / "p.gif")], catch_exceptions=False)
 
 

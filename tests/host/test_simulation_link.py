@@ -146,3 +146,17 @@ def test_data_sheets_example_turned_round():
 def test_what_cannot_be_is_refused(arguments, says):
     with pytest.raises(LinkposeError, match=says):
         LinkRun(**arguments)
+
+
+def test_the_position_of_the_truth_is_the_lever_turned_by_its_angles():
+    """R_ns d with R_ns = Rz(yaw) Ry(pitch) Rx(roll), written out."""
+    run = LinkRun(3, 2, 20.0)
+    truth = run.truth()
+    roll, pitch, yaw = np.radians([truth.roll_deg, truth.pitch_deg, truth.yaw_deg])
+    rx, ry, rz = (np.zeros((len(yaw), 3, 3)) for _ in range(3))
+    for matrix, angle, (i, j) in ((rx, roll, (1, 2)), (ry, pitch, (2, 0)), (rz, yaw, (0, 1))):
+        matrix[:, [0, 1, 2], [0, 1, 2]] = 1.0
+        matrix[:, i, i] = matrix[:, j, j] = np.cos(angle)
+        matrix[:, i, j], matrix[:, j, i] = -np.sin(angle), np.sin(angle)
+    place = rz @ ry @ rx @ np.array(run.j2s_m)
+    assert np.allclose(place, np.column_stack([truth.x_m, truth.y_m, truth.height_m]), atol=1e-12)

@@ -69,7 +69,7 @@ def test_hello_of_an_older_protocol_is_recognised_whatever_its_length():
 
 @pytest.mark.parametrize("mice", range(5))
 def test_what_is_as_long_as_a_sample_and_is_none_is_counted_by_cause(mice):
-    body = bytes(10) + bytes([0x05 | mice << 4]) + bytes(23 + 4 * mice)
+    body = bytes(10) + bytes([0x03 | mice << 4]) + bytes(23 + 4 * mice)
     decoder = StreamDecoder()
     assert decoder.feed(frame_of(b"\x7d" + body) + frame_of(b"\x04" + body) + frame_of(b"\x02" + body + b"\0")) == []
     crossed = encode(sample(7, mice))[:-3] + b"\x11\x22\0"

@@ -11,7 +11,9 @@
 namespace {
 
 constexpr uint16_t FIRST_RUN_OVER = 0xA55A;
-volatile uint16_t run __attribute__((section(".noinit")));  // SRAM survives a reset
+volatile uint16_t run __attribute__((section(".noinit")));  // SRAM and r0 to r31 survive a reset
+volatile uint8_t watchdog_interrupts __attribute__((section(".noinit")));
+uint8_t r2_at_start __attribute__((section(".noinit")));
 
 void put(char c) {
   while (!(UCSR0A & _BV(UDRE0))) {
@@ -100,6 +102,9 @@ void probe_twi() {
 
 // ---- interrupts, timers and sleep ----
 
+extern "C" void keep_r2() __attribute__((naked, used, section(".init0")));
+void keep_r2() { asm volatile("sts %0, r2" ::"i"(&r2_at_start)); }
+
 volatile uint16_t entry_count;  // TCNT1 when the interrupt's first load reads it
 volatile uint8_t entries;
 
@@ -118,6 +123,8 @@ namespace {
 volatile uint8_t pin_changes;
 volatile uint8_t buffer_empties;
 }  // namespace
+
+ISR(WDT_vect) { watchdog_interrupts = watchdog_interrupts + 1; }
 
 ISR(PCINT0_vect) { pin_changes = pin_changes + 1; }
 
@@ -277,11 +284,37 @@ void probe_sleep_with_ticks() {  // seen from outside: ticks of exactly 8000 cyc
   TIMSK1 = 0;
 }
 
+// ---- analogue-to-digital converter ----
+
+uint16_t convert() {
+  TCNT1 = 0;
+  ADCSRA |= _BV(ADSC);
+  while (ADCSRA & _BV(ADSC)) {
+  }
+  return TCNT1;
+}
+
+void probe_adc() {
+  ADMUX = _BV(REFS0) | 0x0E;  // the band gap against AVCC
+  ADCSRA = _BV(ADEN) | _BV(ADPS2);  // a clock of 1 MHz
+  print("adc_first_cycles", convert());
+  print("adc_second_cycles", convert());
+  print("adc_band_gap", ADC);
+  ADMUX = _BV(REFS0);
+  convert();
+  print("adc_open_input", ADC);
+  ADCSRA = 0;
+}
+
+// The first time-out interrupts, the second one resets.
 [[noreturn]] void wait_for_watchdog() {
   run = FIRST_RUN_OVER;
+  watchdog_interrupts = 0;
   wdt_enable(WDTO_15MS);
-  for (;;) {
-  }
+  WDTCSR |= _BV(WDIE);
+  sei();
+  asm volatile("ldi r24, 0xA7\n mov r2, r24\n 1: rjmp 1b\n");
+  __builtin_unreachable();
 }
 
 }  // namespace
@@ -289,6 +322,8 @@ void probe_sleep_with_ticks() {  // seen from outside: ticks of exactly 8000 cyc
 int main() {
   const uint8_t cause = MCUSR;
   MCUSR = 0;
+  MCUSR = 0xFF;
+  const uint8_t cause_after_writing_ones = MCUSR;
   const uint8_t watchdog = WDTCSR;
   wdt_disable();
   UCSR0A = _BV(U2X0);
@@ -298,16 +333,20 @@ int main() {
   if (run == FIRST_RUN_OVER && !(cause & _BV(PORF))) {
     print("second_reset_cause", cause);
     print("watchdog_still_on", (watchdog & _BV(WDE)) != 0);
+    print("watchdog_interrupts", watchdog_interrupts);
+    print("r2_after_reset", r2_at_start);
     print("end", 0);
     for (;;) {
     }
   }
   print("first_reset_cause", cause);
+  print("reset_cause_after_writing_ones", cause_after_writing_ones);
   probe_twi();
   probe_interrupts();
   probe_flags();
   probe_cycles();
   probe_pins();
+  probe_adc();
   probe_transmitter();
   probe_receiver();
   probe_receiver();

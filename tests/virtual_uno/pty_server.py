@@ -48,10 +48,12 @@ class PtyServer:
     def __init__(
         self, uno: VirtualUno, link: Path, *, paced: bool = True, clock_ppm: float = 0.0, reset_on_open: bool = True,
         on_slice: Callable[[], None] | None = None, on_open: Callable[[], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:  # fmt: skip
         """`paced`: by the wall clock, never early; otherwise as fast as the host reads. `clock_ppm`: how much faster
         than the wall clock the board's own runs (an UNO's resonator: up to 5000 either way). `on_slice` is called
-        before every piece of emulated time, `on_open` when a host has opened the port (after the reset)."""
+        before every piece of emulated time, `on_open` when a host has opened the port (after the reset). `clock` (s)
+        takes the place of the wall clock."""
         self.uno, self.link = uno, link
         self.statistics = PtyStatistics()
         self.to_host = self.to_board = Faults()
@@ -59,6 +61,7 @@ class PtyServer:
         self._paced, self._reset_on_open = paced, reset_on_open
         self._clock_rate = 1 + clock_ppm * 1e-6  # seconds of the board a second
         self._on_slice, self._on_open = on_slice, on_open
+        self._clock = clock
         self._actions: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -134,7 +137,7 @@ class PtyServer:
 
     def run(self, duration_s: float | None) -> PtyStatistics:
         """Serves for a duration of the board's time (None: until `end` or `stop`)."""
-        begin_wall, begin_board = time.monotonic(), self.uno.time_s
+        begin_wall, begin_board = self._clock(), self.uno.time_s
         self.statistics.epoch_monotonic_s = begin_wall - begin_board
         while not self._stop.is_set() and (duration_s is None or self.uno.time_s - begin_board < duration_s):
             while not self._actions.empty():
@@ -145,7 +148,7 @@ class PtyServer:
             self._advance(begin_wall, begin_board)
             self._exchange()
             self.statistics.board_s = self.uno.time_s - begin_board
-            self.statistics.wall_s = time.monotonic() - begin_wall
+            self.statistics.wall_s = self._clock() - begin_wall
             if self._paced:
                 late = self.statistics.wall_s - self.statistics.board_s / self._clock_rate
                 self.statistics.max_late_s = max(self.statistics.max_late_s, late)
@@ -162,7 +165,7 @@ class PtyServer:
             time.sleep(_SLICE_S)
             return
         if self._paced:
-            ahead = (time.monotonic() - begin_wall) * self._clock_rate - (self.uno.time_s - begin_board)
+            ahead = (self._clock() - begin_wall) * self._clock_rate - (self.uno.time_s - begin_board)
         if ahead > 0:
             self.uno.run_cycles(round(min(ahead, _LONGEST_RUN_S) * CLOCK_HZ))
 

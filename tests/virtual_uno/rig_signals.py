@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.sensors.devices import Sensors
 from linkpose.simulation import imu
 from linkpose.simulation.baro import PRESSURE_NOISE_PA
 from linkpose.simulation.link import LinkRun
@@ -29,12 +30,29 @@ def imu_rows(run: LinkRun | MiceRun, first: int, count: int) -> tuple[Floats, Fl
     exactly these counts.
     """
     time_s = np.arange(first, first + count) / RATE_HZ
-    counts = run.imu_counts(time_s, first).astype(np.float64)
-    rows = np.empty((count, 7))
+    return time_s, _imu_rows(run, run.imu_counts(time_s, first))
+
+
+def imu2_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
+    """As `imu_rows`, of a run's second sensor, for `VirtualUno.imu2.feed`."""
+    time_s = np.arange(first, first + count) / RATE_HZ
+    return time_s, _imu_rows(run, run.imu2_counts(time_s, first))
+
+
+def _imu_rows(run: LinkRun | MiceRun, raw: NDArray[np.int16]) -> Floats:
+    """Raw counts (N, 7) in g, deg/s and degC."""
+    counts = raw.astype(np.float64)
+    rows = np.empty((len(counts), 7))
     rows[:, :3] = counts[:, :3] * run.accel_range_g / 32768
     rows[:, 3:6] = counts[:, 4:] * run.gyro_range_deg_s / 32768
     rows[:, 6] = counts[:, 3] / _TEMPERATURE_SCALE + _TEMPERATURE_OFFSET
-    return time_s, rows
+    return rows
+
+
+def mag_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
+    """Times (N,) s and the field (N, 3) in µT for `VirtualUno.mag.feed`."""
+    time_s = np.arange(first, first + count) / RATE_HZ
+    return time_s, run.mag_field(time_s, first)
 
 
 def air_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
@@ -82,6 +100,10 @@ class RigFeed:
     def _feed_air(self, first: int, count: int) -> None:
         assert isinstance(self._run, LinkRun)
         self._uno.baro.feed(*air_rows(self._run, first, count), start_s=self.start_s)
+        if self._run.hello_sensors & Sensors.IMU2:
+            self._uno.imu2.feed(*imu2_rows(self._run, first, count), start_s=self.start_s)
+        if self._run.hello_sensors & Sensors.MAG:
+            self._uno.mag.feed(*mag_rows(self._run, first, count), start_s=self.start_s)
 
     def _feed_mice(self, first: int, count: int) -> None:
         assert isinstance(self._run, MiceRun)

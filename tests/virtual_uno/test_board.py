@@ -45,6 +45,7 @@ from linkpose.wire.messages import (
 )
 from virtual_uno import CLOCK_HZ, Faults
 
+NOT_HUNG = 0xFFFF
 MakeBoard = Callable[..., WireLink]
 
 
@@ -510,15 +511,44 @@ def test_boots_without_sensors(board: MakeBoard) -> None:
     assert lost(link.samples) == 0
 
 
-def test_a_program_that_hangs_is_reset(board: MakeBoard) -> None:
-    """The watchdog brings it back, and HELLO says so."""
+def test_a_program_that_hangs_with_interrupts_off_is_reset(board: MakeBoard) -> None:
     link = board()
     link.start()
     link.uno.hang()
-    assert link.boot().reset_cause & ResetCause.WATCHDOG
+    hello = link.boot()
+    assert hello.reset_cause & ResetCause.WATCHDOG
+    assert hello.hung_at == NOT_HUNG
     link.carry_out(Start())
     link.run_ms(100)
     assert len(link.samples) >= 9
+
+
+def test_a_program_that_hangs_restarts_and_reports_where(board: MakeBoard) -> None:
+    """It restarts without a reset: a bootloader that leaves the watchdog on would be reset in a loop."""
+    link = board(mice=[{}])
+    link.start(1500)
+    link.uno.watch(["reset"])
+    at = link.uno.hang(interrupts=True)
+    hello = link.boot()
+    assert hello.reset_cause == ResetCause.WATCHDOG | ResetCause.HUNG
+    assert hello.hung_at == at
+    assert len(link.uno.events()) == 0
+    link.carry_out(Start())
+    link.run_ms(1500)
+    assert valid(link.samples[-1], SampleFlags.IMU_VALID) and valid(link.samples[-1], SampleFlags.MOUSE1_VALID)
+    assert lost(link.samples) == 0
+    link.uno.reset()
+    hello = link.boot()
+    assert (hello.reset_cause, hello.hung_at) == (ResetCause.EXTERNAL, NOT_HUNG)
+
+
+@pytest.mark.parametrize(("supply_v", "band_gap_v"), [(5.0, 1.1), (4.2, 1.1), (5.0, 1.0)])
+def test_supply_voltage_is_measured_against_the_band_gap(board: MakeBoard, supply_v: float, band_gap_v: float) -> None:
+    link = board(adc={"bandGapV": band_gap_v})
+    link.uno.supply(supply_v)
+    link.start()
+    link.run_ms(2100)
+    assert link.status.vcc_mv / 1000 == pytest.approx(supply_v * 1.1 / band_gap_v, abs=0.025)
 
 
 def test_a_wrong_bit_rate_is_garbage_both_ways(board: MakeBoard) -> None:

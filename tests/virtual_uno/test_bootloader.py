@@ -1,6 +1,6 @@
 """The upload through real bootloaders into the flash of the emulated board, and each way it can fail.
 
-Time is the emulated board's, so that nothing here depends on how fast the machine is; test_flash.py types the command.
+Time is the emulated board's, so that nothing here depends on how fast the machine is; test_upload.py types the command.
 """
 
 from __future__ import annotations

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from measuring import MICE
 from pty_server import PtyServer
 from rig_signals import RigFeed
 from wire_link import WireLink
 
+from linkpose.recording.columns import ACCEL, GYRO, MAG, mouse_columns
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun
@@ -102,3 +104,26 @@ def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, t
     assert [gap["cause"] for gap in table.closing["gaps"]] == ["reset"]
     assert np.count_nonzero(table.columns["flags"].astype(int) & GAP_BEFORE) == 1
     assert table.columns["time_s"][-1] == pytest.approx(3.99, abs=0.02)
+
+
+def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_path: Path) -> None:
+    """Two inertial sensors, a barometer, a magnetometer and three mice at 100 Hz: nothing lost, all columns."""
+    uno = board(imu2={}, magnetometer="qmc5883l", mice=MICE[:3]).uno
+    run = LinkRun(test=1, seed=0, duration_s=None, imu2=True, mag=True)
+    feed = RigFeed(uno, run)
+    path = tmp_path / "r.csv"
+    with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
+        done = linkpose("record", path, "--port", server.link, "--duration", 6, "--json")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
+    table = read_table(path, "recording")
+    wanted = [f"imu2_{name}" for name in ACCEL + GYRO] + ["imu2_temp_degC", *MAG, "mag_fresh"]
+    wanted += [name for port in (1, 2, 3) for name in mouse_columns(port)]
+    assert set(wanted) <= set(table.columns)
+    settled = slice(50, None)
+    for name in wanted[:-6]:
+        assert np.isfinite(table.columns[name][settled]).all(), name
+    field = np.linalg.norm([table.columns[name][settled] for name in MAG], axis=0)
+    assert np.median(field) == pytest.approx(np.hypot(30.0, 42.0), abs=2.0)
+    assert table.columns["mag_fresh"][settled].mean() > 0.95

@@ -29,8 +29,7 @@ from rig_signals import RigFeed
 from wire_link import WATCHED_BUS, WireLink, burst_starts
 
 from linkpose.filters.mice import MiceFilter
-from linkpose.sensors.conversion import Converter, Settings
-from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.conversion import BoardSettings, Converter, Placed
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.mice import MiceRun, ring
 from linkpose.wire.messages import GetInfo, Hello, ResetMice, SampleFlags
@@ -161,9 +160,10 @@ def test_above_133_hz_a_sample_says_whether_it_brings_movement(board: MakeBoard,
     assert np.abs(counts[~stale] - [expected, 0]).max() <= 1
     samples = link.samples
     link.send(GetInfo())
-    converter = Converter(Settings.of(link.expect(Hello, 50)))
-    rows = [converter.row(sample, sample.t_us * 1e-6, sample.seq, sample.flags) for sample in samples]
-    velocity = MiceFilter(Rig(mouse=ring(3))).process(Measurements.of(rows))[2 * ticks :, 0]
+    converter = Converter(BoardSettings.of(link.expect(Hello, 50)))
+    places = [Placed(sample.t_us * 1e-6, sample.seq, sample.flags) for sample in samples]
+    block = converter.convert_placed(samples, places).measurements
+    velocity = MiceFilter(Rig(mouse=ring(3))).process(block)[2 * ticks :, 0]
     assert np.abs(velocity - speed_m_s).max() <= 0.02
 
 

@@ -149,7 +149,21 @@ def test_timer_ticks_wake_the_core_without_drift(probed: Probed) -> None:
 
 def test_watchdog_resets_and_stays_on(probed: Probed) -> None:
     assert probed.values["first_reset_cause"] == [0x01]
+    assert probed.values["reset_cause_after_writing_ones"] == [0]
     assert probed.values["second_reset_cause"] == [0x08]
     assert probed.values["watchdog_still_on"] == [1]
     resets = probed.events[probed.events["kind"] == "reset"]
     assert list(resets["value"]) == [0x08]
+
+
+def test_watchdog_interrupts_before_it_resets_and_a_reset_keeps_the_registers(probed: Probed) -> None:
+    assert probed.values["watchdog_interrupts"] == [1]
+    assert probed.values["r2_after_reset"] == [0xA7]
+
+
+def test_adc_measures_the_band_gap(probed: Probed) -> None:
+    """Data sheet table 23-1: 25 clocks for the first conversion, then 13; a prescaler of 16."""
+    assert 25 * 16 <= probed.values["adc_first_cycles"][0] <= 25 * 16 + POLL
+    assert 13 * 16 <= probed.values["adc_second_cycles"][0] <= 13 * 16 + POLL
+    assert probed.values["adc_band_gap"] == [225]  # 1.1 V of 5.0 V
+    assert probed.values["adc_open_input"] == [0]

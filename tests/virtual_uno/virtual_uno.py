@@ -190,6 +190,7 @@ class VirtualUno:
         hex_path: Path | str,
         *,
         seed: int = 0,
+        adc: dict[str, Any] | None = None,
         mpu6050: dict[str, Any] | None = None,
         imu2: dict[str, Any] | None = None,
         bmp180: dict[str, Any] | None = None,
@@ -199,10 +200,10 @@ class VirtualUno:
         bootloader_s: float = 0.0,
         boot_address: int = 0,
     ) -> None:
-        """`mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's modules of
-        these names. `imu2`: options of a second inertial sensor at 0x69 (None: there is none); `bmp280`: options of a
-        BMP280 in place of the BMP180; `magnetometer`: "hmc5883l", "qmc5883l" or "qmc5883p". `bootloader_s`
-        is the time that a bootloader waits after a reset from outside (0: there is none);
+        """`adc`, `mpu6050`, `bmp180` and each of `mice` (from the first port on) are the options of the emulator's
+        modules of these names. `imu2`: options of a second inertial sensor at 0x69 (None: there is none); `bmp280`:
+        options of a BMP280 in place of the BMP180; `magnetometer`: "hmc5883l", "qmc5883l" or "qmc5883p".
+        `bootloader_s` is the time that a bootloader waits after a reset from outside (0: there is none);
         `boot_address` is where every reset begins when the .hex holds a bootloader.
         Raises VirtualUnoError when something is not installed."""
         self._emulator = _Emulator.take()
@@ -214,7 +215,7 @@ class VirtualUno:
         self.mag = Sensor(self, "magnetometer", 3)
         self.baro = Sensor(self, "bmp180", 2)
         self.mice = [Mouse(self, index) for index in range(len(mice))]
-        options = {"seed": seed, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
+        options = {"seed": seed, "adc": adc or {}, "mpu6050": mpu6050 or {}, "bmp180": bmp180 or {}, "mice": list(mice)}
         options |= {"imu2": imu2, "bmp280": bmp280, "magnetometer": magnetometer}
         options |= {"bootloaderS": bootloader_s, "bootAddress": boot_address}
         try:
@@ -267,9 +268,14 @@ class VirtualUno:
         """The reset line, as DTR pulls it when a host opens the port."""
         self.request("reset")
 
-    def hang(self) -> None:
-        """The program gets stuck, with interrupts off."""
-        self.request("hang")
+    def hang(self, *, interrupts: bool = False) -> int:
+        """Stops the program in an endless loop and returns the byte address of the loop."""
+        at: int = self.request("hang", interrupts=interrupts)["at"]
+        return at
+
+    def supply(self, volts: float) -> None:
+        """Sets the supply voltage of the ATmega328P."""
+        self.request("supply", volts=volts)
 
     # --- the serial line ---
 

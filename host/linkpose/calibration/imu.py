@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,11 @@ class ImuCalibration:
     accel_scale: Floats | None
     accel_residual_m_s2: float | None  # rms of ‖(s_A − o) / k‖ − g over the attitudes
     pressure_noise_Pa: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object that `calibrate imu --json` prints; None where the recordings do not show it."""
+        values = {name: getattr(self, name) for name in self.__slots__}
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
 def calibrate_imu(recordings: Sequence[Recording]) -> ImuCalibration:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -73,6 +73,9 @@ _FIRST_STD = 0.01
 _USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, worth so many members
 
 
+SENSOR_ERRORS = ("gyro_bias_rad_s", "accel_offset_m_s2", "accel_scale")  # of the rig's [imu], which the fit estimates
+
+
 @dataclass(frozen=True, slots=True)
 class JointCalibration:
     """What was found. The residual of a good joint is 0.03 m/s² or less.
@@ -85,6 +88,11 @@ class JointCalibration:
     residual_m_s2: float  # rms, by axis, of the smoothed specific force that is not explained
     samples: int  # in motion
     imu: Imu
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object that `calibrate joint --json` prints: J2S, and the sensor errors that the same fit estimated."""
+        fit = {"j2s_m": self.j2s_m.tolist(), "std_m": self.std_m.tolist(), "residual_m_s2": self.residual_m_s2}
+        return fit | {"samples": self.samples} | {name: getattr(self.imu, name) for name in SENSOR_ERRORS}
 
 
 class _Sums(NamedTuple):

@@ -31,6 +31,8 @@ from linkpose.wire.messages import SampleFlags
 REST_S = 0.5  # of standing still that must come before a drive, for the gyro's bias
 FULL_TURN = 2 * math.pi
 TURN_TOLERANCE_RAD = math.radians(20)  # from a straight line, or from full turns
+GYRO_SCALE = 0.04  # of an uncalibrated gyro: 3 % (data sheet), and 1 % of cross-axis sensitivity
+MOST_TURNS = 12  # beyond which such a gyro miscounts
 FEWEST_COUNTS = 1000  # of a mouse over a line: so that a count is a tenth of a percent
 PLACE_STD_M = 0.001  # to which a ruler tells where a mouse sits
 LINE_STD_M = 0.001  # to which a line is driven straight
@@ -48,6 +50,10 @@ class MouseCalibration:
     angle_deg: float
     angle_std_deg: float
     residual_mm: float  # rms over all drives
+
+    def as_dict(self) -> dict[str, int | float]:
+        """The object that `calibrate mice --json` prints."""
+        return {name: round(getattr(self, name), 5) for name in self.__slots__}
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +83,7 @@ def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | 
     places = np.array([complex(mouse.x_m, mouse.y_m) for mouse in rig.mouse])
     design, target = _equations(drives, places, length_m)
     if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
-        raise LinkposeError("these drives do not tell the scale; measure the line and give it with --length M")
+        raise LinkposeError("these drives do not determine the scale; measure the length of the line and give it")
     solution, covariance, residual = _least_squares(design, target)
     _check_fit(residual, len(rig.mouse))
     return [_described(i, solution, covariance, _own(residual, i, drives, len(places))) for i in range(len(places))]
@@ -109,7 +115,12 @@ def _sums(recording: Recording, mice: int) -> _DriveSums:
     _check_whole(name, m, counts, first, last)
     turn = _turned(name, m, first, last)
     turns = round(turn / FULL_TURN)
-    if abs(turn - turns * FULL_TURN) > TURN_TOLERANCE_RAD:
+    if abs(turns) > MOST_TURNS:
+        raise LinkposeError(
+            f"{name} has {abs(turns)} full turns; more than {MOST_TURNS} cannot be counted with a gyro that may be "
+            f"{100 * GYRO_SCALE:.0f} % off. Drive {MOST_TURNS} turns or fewer."
+        )
+    if abs(turn - turns * FULL_TURN) > TURN_TOLERANCE_RAD + GYRO_SCALE * abs(turn):
         raise LinkposeError(
             f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; drive it anew"
         )

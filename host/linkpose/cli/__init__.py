@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import sys
@@ -11,29 +12,31 @@ from typing import Any
 import click
 
 from linkpose import __version__
+from linkpose.cli.streams import safe_streams
 from linkpose.errors import LinkposeError, printable
 
 # Command -> what it does.
 COMMANDS = {
     "ports": "List the serial ports and say which is the board.",
-    "flash": "Build the firmware, upload it to the board, and prove it.",
-    "info": "Show the board's versions, sensors, settings and link health.",
+    "flash": "Upload the firmware to the board and verify that it answers.",
+    "info": "Show the board's versions, sensors, settings and data health.",
     "record": "Record the sensors into a CSV file.",
     "estimate": "Run the filters, live or over a recording.",
-    "calibrate": "Complete a rig file from recordings made for it.",
+    "calibrate": "Calibrate sensors, J2S and mice from recordings; writes rig.toml.",
+    "convert": "Convert estimates and recordings for other programs.",
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
-    "reproduce": "Measure the papers' tables and figures anew.",
+    "reproduce": "Recompute the tables and figures of the three papers.",
     "plot": "Draw recordings, estimates and references.",
-    "localize": "Find where a robot was, in a map or among beacons.",
+    "localize": "Estimate the path of a robot in a map or among beacons.",
 }
 
 
 class LazyGroup(click.Group):
-    """A group that knows its commands by name and imports a command only to run it or to show its help."""
+    """A group that lists its commands by name and imports a command only to run it or to show its help."""
 
     def __init__(self, *args: Any, table: Mapping[str, str], modules: str, **more: Any) -> None:
-        """`table` is command -> what it does; `modules` begins the name of the module that holds it, as `command`."""
+        """`table` maps each command to its one-line help; its module is `modules` + command."""
         super().__init__(*args, **more)
         self._table, self._modules = table, modules
 
@@ -43,9 +46,19 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in self._table:
             return None
-        command = importlib.import_module(self._modules + cmd_name).command
-        assert isinstance(command, click.Command)
+        command: click.Command = importlib.import_module(self._modules + cmd_name).command
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """As click does, with the nearest name for one that is not known."""
+        name = args[0] if args else ""
+        if name and name not in self._table and not name.startswith("-"):
+            near = difflib.get_close_matches(name, self._table, 1)
+            hint = f"Did you mean {near[0]}?" if near else f"The commands are {', '.join(self._table)}."
+            ctx.fail(f"There is no command {name!r}. {hint}")
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
@@ -65,16 +78,26 @@ def group() -> None:
 
 def main() -> None:
     """Entry point. Every failure a user can cause ends here as one sentence and a status."""
+    with safe_streams():
+        status = _run()
+    sys.exit(status)
+
+
+def _run() -> int:
+    """Run the command; its exit status."""
     try:
         status = group.main(prog_name="linkpose", standalone_mode=False)
+        sys.stdout.flush()
     except click.exceptions.Abort:
-        status = 130
+        return 130
     except click.ClickException as error:
         error.show()
-        status = error.exit_code
+        return error.exit_code
     except LinkposeError as error:
-        click.echo(f"linkpose: {printable(error)}", err=True)
-        status = 1
+        from linkpose.cli.cures import sentence
+
+        click.echo(f"linkpose: {printable(sentence(error))}", err=True)
+        return 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
@@ -82,5 +105,5 @@ def main() -> None:
         click.echo(
             f"linkpose: unexpected {printable(what)}; please report it with what LINKPOSE_DEBUG=1 shows", err=True
         )
-        status = 1
-    sys.exit(status if isinstance(status, int) else 0)
+        return 1
+    return status if isinstance(status, int) else 0

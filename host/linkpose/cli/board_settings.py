@@ -1,19 +1,32 @@
-"""Options that put other settings in force on the board, for as long as it is not reset."""
+"""Options that change the board's settings; linkpose restores them after a reset of the board."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-if TYPE_CHECKING:
-    from linkpose.device.session import Session
+LEGAL_RATES_HZ = tuple(rate for rate in range(50, 501) if 2_000_000 % rate == 0)  # a tick is a whole number of 0.5 µs
+
+
+class RateType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
+    """A sample rate that the board's timer can produce."""
+
+    name = "HZ"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        if str(value) not in map(str, LEGAL_RATES_HZ):
+            self.fail(
+                f"{value!r} is not a rate of the board; choose from {', '.join(map(str, LEGAL_RATES_HZ))}", param, ctx
+            )
+        return int(value)
+
 
 # Option -> what it sets in CONFIGURE, its values, and what it is.
 _OPTIONS = {
-    "--rate": ("sample_rate_hz", click.IntRange(50, 500), "Samples a second, a divisor of 2 MHz. Default: 100."),
+    "--rate": ("sample_rate_hz", RateType(), "Sample rate (Hz), a divisor of 2 MHz. Default: 100."),
     "--accel-range": ("accel_range_g", ("2", "4", "8", "16"), "Full scale of the accelerometer (g). Default: 8."),
     "--gyro-range": (
         "gyro_range_deg_s",
@@ -40,9 +53,3 @@ def board_settings(function: Callable[..., Any]) -> Callable[..., Any]:
         kind = click.Choice(values) if isinstance(values, tuple) else values
         decorated = click.option(option, field, type=kind, metavar="N", help=text)(decorated)
     return decorated
-
-
-def apply(board: dict[str, int], session: Session) -> None:
-    """Configures the board where anything was typed. Raises LinkposeError when it refuses."""
-    if board:
-        session.configure(session.settings._replace(**board))

@@ -1,4 +1,4 @@
-"""`linkpose calibrate`: completes a rig file from recordings made for it. Each part is a module `calibrate_<part>`."""
+"""`linkpose calibrate`: writes parts of a rig file from recordings made for it. Each is a module `calibrate_<part>`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import click
 
 from linkpose.cli import LazyGroup
 
-# Part of the rig file -> what is found.
+# Part of the rig file -> what is estimated.
 PARTS = {
     "imu": "Bias, offset, scale and noise of the inertial sensor, from rests in several attitudes.",
-    "joint": "J2S, the vector from the joint's centre to the sensor, from the link in motion.",
+    "joint": "J2S, the vector from the joint centre to the sensor, from the link in motion.",
     "mice": "Counts per metre and mounting angle of each mouse, from a straight line and a full turn.",
 }
 
 
 @click.group("calibrate", cls=LazyGroup, table=PARTS, modules="linkpose.cli.calibrate_")
 def command() -> None:
-    """Complete a rig file from recordings that were made for it."""
+    """Estimate calibration values from recordings made for it, and write them into a rig file."""

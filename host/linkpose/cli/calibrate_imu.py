@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -18,38 +18,36 @@ if TYPE_CHECKING:
 @click.argument("recordings", type=options.FILE, nargs=-1, required=True)
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write the calibration into.")
 @options.as_json
-def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool) -> None:
-    """Find the inertial sensor's errors and noise from rests, and write them into the rig file.
+@options.next_and_quiet
+def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quiet: bool) -> None:
+    """Estimate the inertial sensor's errors and noise from rests, and write them into the rig file.
 
-    Lay the sensor on each of its six sides in turn, some seconds each, in one recording or several. From fewer
-    attitudes the gyro's bias and the noises are found all the same.
+    Lay the sensor on each of its six sides in turn, for some seconds each, in one recording or several. Fewer attitudes
+    are enough for the gyro's bias and the noise. `linkpose simulate link --rests` simulates such a recording.
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_imu(loaded)
-    options.save_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     if json_lines:
-        click.echo(json.dumps(_object(found)))
+        click.echo(json.dumps(found.as_dict()))
     else:
         _show(found)
     if found.accel_scale is None:
         click.echo(
-            f"offset and scale of the accelerometer stay as they were: {_count(found.attitudes, 'attitude')}, "
-            f"{FEWEST_ATTITUDES} are needed",
+            f"Offset and scale of the accelerometer are unchanged: {_count(found.attitudes, 'attitude')} recorded, "
+            f"{FEWEST_ATTITUDES} needed.",
             err=True,
         )
-    click.echo(f"written to {rig_file}", err=True)
+    if not quiet:
+        click.echo(f"written to {rig_file}", err=True)
+    options.show_next(quiet, f"calibrate joint SWING.csv --rig {rig_file}")
 
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def _object(found: ImuCalibration) -> dict[str, Any]:
-    values = {name: getattr(found, name) for name in found.__slots__}
-    return {name: value.tolist() if hasattr(value, "tolist") else value for name, value in values.items()}
 
 
 def _show(found: ImuCalibration) -> None:
@@ -64,7 +62,7 @@ def _show(found: ImuCalibration) -> None:
         click.echo(f"accelerometer: offset {ox:.4f}, {oy:.4f}, {oz:.4f} m/s², scale {kx:.5f}, {ky:.5f}, {kz:.5f}")
         if found.attitudes > FEWEST_ATTITUDES:
             click.echo(f"accelerometer: residual {found.accel_residual_m_s2:.4f} m/s²")
-        else:  # as many equations as unknowns: what is left says nothing
-            click.echo(f"accelerometer: no residual from {FEWEST_ATTITUDES} attitudes, which always fit; more tell it")
+        else:  # as many equations as unknowns
+            click.echo(f"accelerometer: {FEWEST_ATTITUDES} attitudes always fit; record more to get a residual")
     if found.pressure_noise_Pa is not None:
         click.echo(f"barometer: noise {found.pressure_noise_Pa:.2f} Pa")

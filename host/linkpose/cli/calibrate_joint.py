@@ -9,42 +9,50 @@ import click
 
 from linkpose.cli import options
 
-_ERRORS = ("gyro_bias_rad_s", "accel_offset_m_s2", "accel_scale")
-
 
 @click.command("joint")
 @click.argument("recordings", type=options.FILE, nargs=-1, required=True)
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write J2S into.")
-@click.option("--imu", "with_imu", is_flag=True, help="Write the sensor's bias, offset and scale, too.")
+@click.option("--imu", "with_imu", is_flag=True, help="Write the sensor's bias, offset and scale as well.")
 @options.as_json
-def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_lines: bool) -> None:
-    """Find J2S, the vector from the joint's centre to the sensor in its axes, and write it into the rig file.
+@options.next_and_quiet
+def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_lines: bool, quiet: bool) -> None:
+    """Estimate J2S, the vector from the joint centre to the sensor in its axes, and write it into the rig file.
 
-    Record the link on its fixed joint, swung for half a minute or more in all directions. The rig file's calibration of
-    the inertial sensor is applied, and what is left of its errors is estimated with J2S; --imu keeps that as well.
+    Record the link on its fixed joint, swung for half a minute or more in all directions. The calibration of the
+    inertial sensor in the rig file is applied. Sensor errors that remain are estimated together with J2S; --imu writes
+    them, too.
     """
-    from linkpose.calibration.joint import LARGE_RESIDUAL_M_S2, calibrate_joint, is_calibrated, with_calibration
+    from linkpose.calibration.joint import (
+        LARGE_RESIDUAL_M_S2,
+        SENSOR_ERRORS,
+        calibrate_joint,
+        is_calibrated,
+        with_calibration,
+    )
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_joint(loaded, rig)
-    options.save_rig(rig_file, with_calibration(rig, found, with_imu))
-    (x, y, z), (sx, sy, sz) = found.j2s_m.tolist(), found.std_m.tolist()
+    with_calibration(rig, found, with_imu).save(rig_file)
     if json_lines:
-        values = {"j2s_m": [x, y, z], "std_m": [sx, sy, sz], "residual_m_s2": found.residual_m_s2}
-        errors = {name: getattr(found.imu, name) for name in _ERRORS}
-        click.echo(json.dumps({**values, "samples": found.samples, **errors}))
+        click.echo(json.dumps(found.as_dict()))
     else:
-        click.echo(f"J2S {x:.4f} ± {sx:.4f}, {y:.4f} ± {sy:.4f}, {z:.4f} ± {sz:.4f} m")
+        axes = zip(found.j2s_m.tolist(), found.std_m.tolist(), strict=True)
+        click.echo(f"J2S {', '.join(f'{value:.4f} ± {std:.4f}' for value, std in axes)} m")
         click.echo(f"residual {found.residual_m_s2:.3f} m/s² over {found.samples} samples in motion")
-        for name in _ERRORS:
+        for name in SENSOR_ERRORS:
             click.echo(f"{name} {', '.join(f'{value:.4f}' for value in getattr(found.imu, name))}")
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
-        click.echo("a large residual: see that the joint is fixed, and the sensor firmly on the link", err=True)
-    if not with_imu and not is_calibrated(rig.imu, found):
+        click.echo("The residual is large. Check that the joint is fixed and the sensor firm on the link.", err=True)
+    if not with_imu:
         click.echo(
-            "the sensor is not calibrated: add --imu to write what was found of its errors, or type "
-            "`linkpose calibrate imu`",
-            err=True,
+            f"The sensor errors found ({', '.join(SENSOR_ERRORS)}) are not saved. Add --imu to save them.", err=True
         )
-    click.echo(f"written to {rig_file}", err=True)
+        if not is_calibrated(rig.imu, found):
+            click.echo(
+                "The rig file does not calibrate the sensor: add --imu, or type `linkpose calibrate imu`.", err=True
+            )
+    if not quiet:
+        click.echo(f"written to {rig_file}", err=True)
+    options.show_next(quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")

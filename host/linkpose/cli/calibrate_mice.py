@@ -24,26 +24,25 @@ if TYPE_CHECKING:
     help="Length of the straight line (m). Without it the scale comes from the turn and from where the mice sit.",
 )
 @options.as_json
-def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, json_lines: bool) -> None:
-    """Find counts per metre and mounting angle of each mouse, and write them into the rig file.
+@options.next_and_quiet
+def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, json_lines: bool, quiet: bool) -> None:
+    """Estimate counts per metre and mounting angle of each mouse, and write them into the rig file.
 
     Measure where each mouse sits (x_m ahead, y_m to the left of the robot's centre) and write it into the rig file.
     Record a straight line of known length, driven ahead, and a full turn on the spot (several turns, or several
-    recordings, are better), each with a second of rest before it. The gyro tells which recording is which.
+    recordings, are better), each with a second of rest before it. The gyro shows which recording is which.
     """
     from linkpose.calibration.mice import calibrate_mice, with_calibration
 
     loaded = options.load_recordings(recordings)
     rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
     found = calibrate_mice(loaded, rig, length)
-    options.save_rig(rig_file, with_calibration(rig, found))
+    with_calibration(rig, found).save(rig_file)
     for mouse in found:
-        click.echo(json.dumps(_object(mouse)) if json_lines else _line(mouse))
-    click.echo(f"written to {rig_file}", err=True)
-
-
-def _object(mouse: MouseCalibration) -> dict[str, int | float]:
-    return {name: round(getattr(mouse, name), 5) for name in mouse.__slots__}
+        click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
+    if not quiet:
+        click.echo(f"written to {rig_file}", err=True)
+    options.show_next(quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
 
 
 def _line(mouse: MouseCalibration) -> str:

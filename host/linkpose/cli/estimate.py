@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +13,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from linkpose.cli import options
-from linkpose.cli.board_settings import apply, board_settings
+from linkpose.cli.board_settings import board_settings
+from linkpose.cli.cures import sentence
 from linkpose.cli.patience import while_compiling
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
+    from linkpose.board import Board
     from linkpose.cli.live import Console
-    from linkpose.device.session import Placement
     from linkpose.estimation import EstimateWriter, Estimator
 
 WORST_STD_M = 0.03  # of a J2S that the motion has told
@@ -47,7 +48,14 @@ class Request:
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimates here.")
 @click.option("--record", type=options.FILE, metavar="REC.csv", help="Keep the live measurements as a recording.")
 @click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
-@click.option("--filter", "filter_names", multiple=True, metavar="NAME", help="Run this filter; may be repeated.")
+@click.option(
+    "--filter",
+    "filter_names",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=options.complete_filter,
+    help="Run this filter; may be repeated. Default: all that the sensors and the rig support.",
+)
 @click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
 @board_settings
@@ -81,7 +89,8 @@ def command(
     from linkpose.cli.live import Console, refuse_same_file
 
     if is_live == (recording is not None):
-        raise click.UsageError("name a RECORDING, or add --live to estimate from the board")
+        both = f"--live estimates from the board: leave out {recording}, or leave out --live"
+        raise click.UsageError(both if is_live else "name a RECORDING, or add --live to estimate from the board")
     if recording is not None and (port or duration or record or raw or board):
         raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
     if smooth and is_live:
@@ -98,16 +107,18 @@ def command(
 
 def _replay(path: Path, request: Request, console: Console) -> None:
     """Estimates over a recording, as fast as it goes."""
-    from linkpose.estimation import Estimator, mice_of, sensors_of
+    from linkpose.estimation import Estimator
     from linkpose.recording.reader import load_recording
 
     recording = load_recording(path)
     for remark in recording.remarks:
         console.say(remark)
+    if recording.unusable and not request.filter_names:
+        raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     with while_compiling(console.say):
         measurements = recording.measurements
-        estimator = Estimator(request.filter_names, rig, sensors_of(measurements), mice_of(measurements))
+        estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
         _check(estimator, request, console)
         if request.smooth:
             _smooth(estimator)
@@ -118,7 +129,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     with _Sink(estimator, request, head) as sink:
         sink.write(estimates)
         sink.close({"rows": len(estimates), **_outcome(estimator)})
-    _tell_j2s(estimator, console)
+    _report_j2s(estimator, console)
+    _report_mice(estimator, console)
     if request.output:
         console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
 
@@ -140,59 +152,90 @@ def _live(
     console: Console,
 ) -> None:
     """Estimates as the board measures."""
+    from linkpose.board import Board
     from linkpose.cli import live
-    from linkpose.cli.view import View
-    from linkpose.device.ports import choose_port
-    from linkpose.device.session import Session
-    from linkpose.sensors.conversion import Settings
-    from linkpose.sensors.devices import found
-    from linkpose.sensors.measurements import Measurements
+    from linkpose.cli.view import Extremes, View, final_table
+    from linkpose.sensors.measurements import Floats, Measurements
 
     with contextlib.ExitStack() as stack:
-        capture = stack.enter_context(live.raw_capture(raw, request.force))
-        session = stack.enter_context(Session(port or choose_port(), console.say, capture))
-        apply(board, session)
-        rig = options.resolve_rig(request.rig_file, request.joint, session.rig)
-        session.wait_for_mice(len(rig.mouse))
-        with while_compiling(console.say):  # before the board is started: no sample waits for a compiler
-            from linkpose.estimation import Estimator
+        connected = stack.enter_context(
+            Board(
+                port, settings=board, rig=request.rig_file, joint=request.joint, raw=raw, force=request.force,
+                notify=console.say,
+            )
+        )  # fmt: skip
+        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.precompile import Precompilation
 
-            settings, sensors = Settings.of(session.hello), found(session.hello)
-            used = rig.with_delay_of(settings.dlpf)
-            estimator = Estimator(request.filter_names, used, sensors, settings.mouse_ports)
-            _check(estimator, request, console)
-            estimator.warm_up()
-        recorder = stack.enter_context(live.Recorder(session, record, rig, request.force))
-        head = {"device": session.port, "filters": [f.name for f in estimator.filters], "rig": used.as_dict()}
+        estimator = Estimator.for_board(request.filter_names, connected)
+        _check(estimator, request, console)
+        names = [f.name for f in estimator.filters]
+        compiling = stack.enter_context(Precompilation(names))
+        if record:
+            connected.record(record, force=request.force)
+        head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
-        view = stack.enter_context(View(estimator.columns, console.shows_progress))
+        view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
+        if view.is_shown:
+            stack.enter_context(console.through(view.say))
+        following = LiveEstimator(estimator, compiling.is_ready)
+        extremes = Extremes(estimator.columns)
 
-        def handle(placements: list[Placement]) -> None:
-            rows = recorder.take(placements)
-            if rows:
-                estimates = estimator.process(Measurements.of(rows))
-                sink.write(estimates)
-                view.show(estimates[-1], session.health)
+        def write(rows: Floats) -> None:
+            if len(rows):
+                sink.write(rows)
+                extremes.add(rows)
 
-        ended = live.run(session, duration, handle)
+        def handle(block: Measurements) -> None:
+            rows, newest = following.process(block)
+            write(rows)
+            if len(block):
+                view.show(newest, lambda: connected.health, compiling.progress)
+            else:
+                view.redraw(lambda: connected.health, compiling.progress)
+
+        ended = live.run_board(connected, duration, handle)
         view.close()
-        recorder.close(ended)
-        health = session.health()
+        if compiling.waiting:
+            console.say(f"{compiling.progress}; its estimates follow")
+            compiling.wait()
+        write(following.finish())
+        health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
-        _tell_j2s(estimator, console)
+        if console.shows_progress:
+            for line in final_table(extremes.summary()):
+                console.say(line)
+        _report_j2s(estimator, console)
+        _report_mice(estimator, console)
         live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        if request.output:
+            console.say(f"next: linkpose plot {request.output}")
+        connected.check_usable()
+
+
+def _title(board: Board) -> str:
+    """The port, and the length of J2S where it is known."""
+    j2s = board.rig.joint.known_j2s_m
+    return board.port + ("" if j2s is None else f"  J2S {math.hypot(*j2s):.3f} m")
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
     """Names the filters that cannot run. Raises LinkposeError when J2S is to be estimated and no filter does it."""
     from linkpose import filters
+    from linkpose.filters import REGISTRY
 
     if request.joint is not None and request.joint.known_j2s_m is None and estimator.found_j2s is None:
         name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
         raise LinkposeError(f"--j2s auto is estimated by {name}, which does not run; add --filter {name}")
-    for reason in dict.fromkeys(estimator.left_out.values()):
-        names = ", ".join(name for name, why in estimator.left_out.items() if why == reason)
-        console.say(f"without {names}: {reason}")
+    left_out = {name: sentence(reason) for name, reason in estimator.left_out.items()}
+    for reason in dict.fromkeys(left_out.values()):
+        names = ", ".join(name for name, why in left_out.items() if why == reason)
+        console.detail(f"not running: {names}: {reason}")
+    missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
+    if missing and any(REGISTRY[f.name].sensors for f in estimator.filters):
+        console.say(f"{missing[0]}: {left_out[missing[0]]}")
+    others = " (-v: why not others)" if left_out else ""
+    console.say(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
 
 
 def _outcome(estimator: Estimator) -> dict[str, Any]:
@@ -201,10 +244,23 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     found = estimator.found_j2s
     if found:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    if estimator.mice_scale:
+        outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     return outcome
 
 
-def _tell_j2s(estimator: Estimator, console: Console) -> None:
+def _report_mice(estimator: Estimator, console: Console) -> None:
+    """The common scale of the mice where it differs from the rig file."""
+    if estimator.mice_scale:
+        factor, std = estimator.mice_scale
+        change = "more" if factor > 1 else "fewer"
+        console.say(
+            f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
+            "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
+        )
+
+
+def _report_j2s(estimator: Estimator, console: Console) -> None:
     """J2S where it was to be found, and what the motion did not tell of it."""
     found = estimator.found_j2s
     if not found:
@@ -255,10 +311,6 @@ class _Sink:
 
 
 def _print(text: str) -> None:
-    """Puts results on stdout at once. Raises LinkposeError when their reader has gone, as in `linkpose ... | head`."""
-    try:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered has nowhere to go
-        raise LinkposeError("the reader of the estimates has gone; stopped") from None
+    """Put results on stdout at once."""
+    sys.stdout.write(text)
+    sys.stdout.flush()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.errors import printable
 
 if TYPE_CHECKING:
     from linkpose.evaluation.scores import Evaluation, Score
@@ -57,7 +58,7 @@ def command(
     found = evaluate(read_table(estimate), truth, from_s, to_s)
     if not quiet:
         for remark in (*truth.remarks, *found.remarks):
-            click.echo(remark, err=True)
+            click.echo(printable(remark), err=True)
     if json_lines:
         for score in found.scores:
             click.echo(json.dumps(score.as_dict()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,7 +11,8 @@ import click
 from linkpose.cli import options
 
 if TYPE_CHECKING:
-    from linkpose.device.session import Health, Session
+    from linkpose.cli.live import Console
+    from linkpose.device.session import Health, Placement, Session
     from linkpose.wire.messages import HelloDevice, Status
 
 OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of the drift
@@ -22,22 +24,37 @@ OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of th
 @options.as_json
 @options.verbosity
 def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, quiet: bool) -> None:
-    """Show the board's versions, sensors, settings and link health. Takes about three seconds."""
+    """Show the board's versions, sensors, settings and data health. Takes about three seconds."""
+    from linkpose.board import open_session
     from linkpose.cli import live
-    from linkpose.device.ports import choose_port
-    from linkpose.device.session import Session
 
     console = live.Console(quiet, verbose)
-    with Session(port or choose_port(), console.say) as session:
+    with open_session(port, console.say) as session:
         tested = _self_test(session) if self_test else {}
-        live.run(session, OBSERVED_S, lambda _: console.progress(lambda: "observing the link ..."))
-        report = _report(session, session.health()) | tested
+        sensors = _observe(session, console)
+        report = _report(session, session.health()) | {"health": sensors} | tested
     if json_lines:
         click.echo(json.dumps(report))
     else:
         console.clear()
-        for name, value in report.items():
-            click.echo(f"{name.replace('_', ' '):18} {_text(value)}")
+        for line in _lines(report):
+            click.echo(line)
+
+
+def _observe(session: Session, console: Console) -> dict[str, Any]:
+    """Stream for a short time; the state and counts of each sensor."""
+    from linkpose.cli import live
+    from linkpose.recorder import Recorder
+    from linkpose.sensors.rig import Rig
+
+    recorder = Recorder(session, None, Rig())
+
+    def handle(placements: list[Placement]) -> None:
+        recorder.convert(placements)
+        console.progress(lambda: "observing the sensors ...")
+
+    live.run(session.stream(OBSERVED_S), handle)
+    return recorder.monitor.as_dict()
 
 
 def _report(session: Session, health: Health) -> dict[str, Any]:
@@ -103,9 +120,61 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, 1)
 
 
+# Units at the end of a report's keys, as a person reads them.
+_UNITS = {"_hz": "Hz", "_g": "g", "_deg_s": "°/s", "_ppm": "ppm", "_percent": "%", "_us": "µs", "_mv": "mV"}
+
+
+def _lines(report: dict[str, Any]) -> Iterator[str]:
+    """The report for a person: one value a line with its unit, one device or mouse a line."""
+    for name, value in report.items():
+        label, unit = _label(name)
+        if name == "devices":
+            found = [device for device in value if device["state"] != "absent"]
+            yield from _block("devices", [_device_line(device) for device in found] or ["none"])
+        elif name == "health":
+            shown = {sensor: of for sensor, of in value.items() if of["state"] != "absent"}
+            yield from _block(
+                "data health", [_health_line(sensor, of) for sensor, of in shown.items()] or ["no sensor"]
+            )
+        elif isinstance(value, dict):
+            yield from _block(label, [" ".join(filter(None, (*_item(key, item),))) for key, item in value.items()])
+        elif isinstance(value, list):
+            yield from _block(label, [_text(item) for item in value] or ["none"])
+        else:
+            yield f"{label:20} {_text(value)}" + (f" {unit}" if unit and value is not None else "")
+
+
+def _block(label: str, lines: Sequence[str]) -> Iterator[str]:
+    for at, line in enumerate(lines):
+        yield f"{label if at == 0 else '':20} {line}"
+
+
+def _label(name: str) -> tuple[str, str]:
+    """A key without its unit, in words; the unit."""
+    for ending, unit in _UNITS.items():
+        if name.endswith(ending):
+            return name.removesuffix(ending).replace("_", " "), unit
+    return name.replace("_", " "), ""
+
+
+def _item(name: str, value: Any) -> tuple[str, str, str]:
+    label, unit = _label(name)
+    return label, _text(value), unit
+
+
+def _device_line(device: dict[str, Any]) -> str:
+    where = f"{device['chip']} at {device['address']} (id {device['id']}): {device['state']}"
+    return f"{where}. {device['remark']}" if device["remark"] else where
+
+
+def _health_line(sensor: str, of: dict[str, Any]) -> str:
+    counts = [f"{of['valid']} of {of['samples']} samples valid"] if "valid" in of else []
+    counts += [f"{count} {cause}" for cause, count in of.get("invalid", {}).items()]
+    counts += [f"{of['saturated']} saturated"] if of.get("saturated") else []
+    return f"{sensor} {of['state']}" + (f": {', '.join(counts)}" if counts else "")
+
+
 def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value) or "none"
     if isinstance(value, dict):
-        return ", ".join(f"{key.replace('_', ' ')} {item}" for key, item in value.items())
+        return ", ".join(f"{key.replace('_', ' ')} {_text(item)}" for key, item in value.items()) or "none"
     return "not known" if value is None else str(value)

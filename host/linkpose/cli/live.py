@@ -1,26 +1,28 @@
-"""What `record` and `estimate --live` have in common: progress, a recording, and an end that loses nothing."""
+"""What `record` and `estimate --live` have in common on the terminal: progress, messages, and the end of a run."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
-import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.device.session import Health, Placement, Session
 from linkpose.errors import LinkposeError, printable
-from linkpose.recording.csvfile import create
-from linkpose.recording.writer import RecordingWriter, closing, metadata
-from linkpose.sensors.conversion import Converter, Row, Settings
-from linkpose.sensors.rig import Rig
+
+if TYPE_CHECKING:
+    from linkpose.board import Board
+    from linkpose.device.session import Health
+    from linkpose.sensors.measurements import Measurements
+
+Block = TypeVar("Block")
 
 PROGRESS_INTERVAL_S = 0.2
 
@@ -33,11 +35,22 @@ class Console:
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
+        self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
 
     def say(self, text: str) -> None:
+        """Prints a line."""
         self.clear()
         if not self._quiet:
-            click.echo(printable(text), err=True)
+            self._print(printable(text))
+
+    @contextlib.contextmanager
+    def through(self, print_line: Callable[[str], None]) -> Iterator[None]:
+        """Within this context, lines are printed by a live view, which keeps them above itself."""
+        self._print, before = print_line, self._print
+        try:
+            yield
+        finally:
+            self._print = before
 
     def detail(self, text: str) -> None:
         if self._verbose:
@@ -60,96 +73,51 @@ class Console:
             self._width = 0
 
 
-class Recorder:
-    """Turns a session's samples into rows, and writes them where a recording is asked for."""
+def run(stream: Generator[Block, None, None], handle: Callable[[Block], object]) -> str:
+    """Passes the blocks of a stream to `handle` until the stream or the user ends it.
 
-    def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool) -> None:
-        self._session = session
-        settings = Settings.of(session.hello)
-        mouse_ports = max(settings.mouse_ports, len(rig.mouse))
-        self._converter = Converter(settings, mouse_ports)
-        self._writer: RecordingWriter | None = None
-        if path is not None:
-            clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
-            head = metadata(session.hello, settings, session.port, rig, clock)
-            self._writer = RecordingWriter(path, head, mouse_ports, force)
-
-    def take(self, placements: list[Placement]) -> list[Row]:
-        """The samples as rows, which are on their way to the disk."""
-        rows = [self._converter.row(sample, *place) for sample, place in placements]
-        if self._writer is not None and rows:
-            self._writer.write_rows(rows)
-        return rows
-
-    def close(self, ended: str) -> None:
-        """Writes the closing line: "duration", "interrupted" or "failure"."""
-        writer, self._writer = self._writer, None
-        if writer is not None:
-            health = self._session.health()
-            status = health.status
-            board = {"frames_dropped": status.frames_dropped, "ticks_missed": status.ticks_missed} if status else None
-            timeline = self._session.timeline
-            with writer:
-                writer.close(closing(timeline, health.corrupt, health.drift_ppm, board=board, ended=ended))
-
-    def __enter__(self) -> Recorder:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(LinkposeError):  # the failure that brought us here is on its way to the user
-            self.close("failure")
-
-
-def run(session: Session, duration_s: float | None, handle: Callable[[list[Placement]], None]) -> str:
-    """Hands the stream's samples to `handle` until the time is over or the user ends it; which of the two it was."""
-    with ending_well():
+    Returns which of the two it was: "duration" or "interrupted".
+    """
+    with ending_well(), contextlib.closing(stream):
         try:
-            for placements in session.stream(duration_s):
-                handle(placements)
+            for block in stream:
+                handle(block)
         except KeyboardInterrupt:
             return "interrupted"
     return "duration"
 
 
+def run_board(board: Board, duration_s: float | None, handle: Callable[[Measurements], object]) -> str:
+    """Passes the board's blocks to `handle`, empty ones too, and ends the recording as the user ended the run."""
+    ended = run(board.stream(duration_s, yield_idle=True), handle)
+    board.finish(ended)
+    return ended
+
+
 @contextlib.contextmanager
 def ending_well() -> Iterator[None]:
-    """SIGTERM ends a recording as well as Ctrl-C does."""
+    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does.
+
+    A signal that is ignored, as `nohup` ignores SIGHUP, stays so.
+    """
 
     def interrupt(*_: int | FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    names = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    before = {each: signal.signal(each, interrupt) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def raw_capture(path: Path | None, force: bool) -> Iterator[BinaryIO | None]:
-    """A file for every byte as it comes, unbuffered, or None where none is asked for."""
-    if path is None:
-        yield None
-        return
-    with os.fdopen(create(path, force), "wb", buffering=0) as file:
-        yield file
-
-
-def summary(health: Health) -> dict[str, Any]:
-    """The closing summary."""
-    return {
-        "event": "summary",
-        "samples": health.samples,
-        "lost": health.lost,
-        "corrupt": health.corrupt.total,
-        "gaps": len(health.gaps),
-        "duration_s": round(health.duration_s, 6),
-        "rate_hz": round(health.rate_hz, 3),
-    }
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def show_summary(console: Console, health: Health, json_lines: bool, where: str) -> None:
     """The summary on stderr, and as the last line of stdout with --json."""
+    from linkpose.device.session import summary
+
     console.say(f"{health_line(health)}{where}")
     if json_lines:
         click.echo(json.dumps(summary(health)))
@@ -161,6 +129,11 @@ def health_line(health: Health) -> str:
     text += f", {health.corrupt.total} corrupt"
     if health.gaps:
         text += f", {len(health.gaps)} gaps"
+    faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
+    invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
+    saturated = sum(of.get("saturated", 0) for of in health.sensors.values())
+    text += f", {invalid} invalid" * bool(invalid) + f", {saturated} saturated" * bool(saturated)
+    text += "".join(f", {fault}" for fault in faults)
     if health.status and health.status.frames_dropped:
         text += f", {health.status.frames_dropped} dropped by the board"
     return text

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.errors import LinkposeError
-from linkpose.sensors.rig import Joint, Rig
+from linkpose.errors import printable
+from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
     from linkpose.recording.reader import Recording
@@ -40,17 +40,13 @@ class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in 
         return x, y, z
 
 
-# A J2S of which nothing is known but that it is some metres long at the most.
-UNKNOWN_JOINT = Joint((0.0, 0.0, 0.0), 1.0)
-
-
 class JointType(VectorType):
     """A joint by its J2S: three numbers, or `auto` for one that is to be estimated."""
 
     name = "X,Y,Z|auto"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Joint:
-        return UNKNOWN_JOINT if value == "auto" else Joint(super().convert(value, param, ctx))
+        return UNKNOWN_JOINT if str(value).lower() == "auto" else Joint(super().convert(value, param, ctx))
 
 
 class SecondsType(click.ParamType):  # type: ignore[type-arg]
@@ -69,7 +65,11 @@ class SecondsType(click.ParamType):  # type: ignore[type-arg]
 
 
 class FiniteRange(click.FloatRange):
-    """A number within bounds. click's own range lets NaN and infinity pass."""
+    """A number within bounds. click's own range accepts NaN and infinity, and shows an open end as None."""
+
+    def _describe_range(self) -> str:
+        ends = (self.min, ">" if self.min_open else ">="), (self.max, "<" if self.max_open else "<=")
+        return ", ".join(f"{sign}{end:g}" for end, sign in ends if end is not None)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = float(super().convert(value, param, ctx))
@@ -85,8 +85,24 @@ def port(function: Function) -> Function:
     return click.option(
         "--port",
         metavar="PORT",
+        shell_complete=complete_port,
         help="Device, pyserial URL or sim://link. Default: $LINKPOSE_PORT, otherwise the only UNO connected.",
     )(function)
+
+
+def complete_filter(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of filters for the shell's completion."""
+    from linkpose.filters import NAMES
+
+    return [name for name in NAMES if name.startswith(incomplete)]
+
+
+def complete_port(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+    """Names of ports for the shell's completion."""
+    from linkpose.device.ports import find_ports
+
+    names = [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
+    return [name for name in names if name.startswith(incomplete)]
 
 
 def duration(function: Function) -> Function:
@@ -160,6 +176,11 @@ def simulated_outputs(what: str) -> Callable[[Function], Function]:
     return decorate
 
 
+def next_and_quiet(function: Function) -> Function:
+    """-q of a command that ends with what to type next."""
+    return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
+
+
 def show_next(quiet: bool, following: str) -> None:
     """What to type next, on stderr."""
     if not quiet:
@@ -180,13 +201,8 @@ def verbosity(function: Function) -> Function:
 
 
 def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:
-    """The rig file where one is named, or else the one that came along; `--j2s` goes before either's.
-
-    How late the readings are is theirs rather than the rig's: what came along tells it where the rig file does not.
-    """
-    rig = Rig.load(rig_file) if rig_file else brought or Rig()
-    if brought is not None and rig.imu.delay_s is None:
-        rig = replace(rig, imu=replace(rig.imu, delay_s=brought.imu.delay_s))
+    """The rig file if one is named, otherwise the rig of the recording or simulated board; --j2s replaces its J2S."""
+    rig = as_rig(rig_file, brought)
     return replace(rig, joint=joint) if joint else rig
 
 
@@ -196,15 +212,5 @@ def load_recordings(paths: Sequence[Path]) -> list[Recording]:
 
     loaded = [load_recording(path) for path in paths]
     for remark in (remark for recording in loaded for remark in recording.remarks):
-        click.echo(remark, err=True)
+        click.echo(printable(remark), err=True)
     return loaded
-
-
-def save_rig(path: Path, rig: Rig) -> None:
-    """Writes a rig file, whole or not at all. Raises LinkposeError where it cannot be written."""
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        partial.write_text(rig.to_toml(), encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        raise LinkposeError(f"cannot write the rig file {path}: {error.strerror}") from error

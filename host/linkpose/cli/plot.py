@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
+from linkpose.errors import printable
+
+if TYPE_CHECKING:
+    from linkpose.plotting import Scene
 
 
 @click.command("plot")
@@ -15,11 +20,20 @@ from linkpose.cli import options
     "-o", "--output", type=options.FILE, metavar="FILE.png", help="PNG, SVG or PDF; default: the first file's name."
 )
 @click.option("--filter", "wanted", multiple=True, metavar="NAME", help="Draw this filter only; may be repeated.")
+@click.option("--map", "map_file", type=options.FILE, metavar="MAP.yaml", help="Draw this map under a robot's path.")
+@click.option("--beacons", type=options.FILE, metavar="BEACONS.csv", help="Draw these beacons with a robot's path.")
 @options.up
 @options.force
 @click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
 def command(
-    files: tuple[Path, ...], output: Path | None, wanted: tuple[str, ...], up: str, force: bool, quiet: bool
+    files: tuple[Path, ...],
+    output: Path | None,
+    wanted: tuple[str, ...],
+    map_file: Path | None,
+    beacons: Path | None,
+    up: str,
+    force: bool,
+    quiet: bool,
 ) -> None:
     """Draw recordings, estimates and references.
 
@@ -32,9 +46,23 @@ def command(
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force)
     tables = [read_any(path, up) for path in files]
-    figure, remarks = plotting.plot_tables(tables, [name.replace("_", "-") for name in wanted])
+    scene = _scene(map_file, beacons)
+    figure, remarks = plotting.plot_tables(tables, [name.replace("_", "-") for name in wanted], scene)
     plotting.save(figure, output, force)
     for remark in [remark for table in tables for remark in table.remarks] + remarks:
         if not quiet:
-            click.echo(remark, err=True)
+            click.echo(printable(remark), err=True)
     click.echo(output)
+
+
+def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
+    """What --map and --beacons put under the path."""
+    if map_file is None and beacons is None:
+        return None
+    from linkpose.localization.maps import load_map
+    from linkpose.localization.tables import read_beacons
+    from linkpose.plotting import Scene
+
+    grid = load_map(map_file) if map_file else None
+    places = read_beacons(beacons) if beacons else {}
+    return Scene(grid, {str(name): place for name, place in places.items()})

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
-from linkpose.cli.board_settings import apply, board_settings
+from linkpose.cli.board_settings import board_settings
 
 
 @click.command(name="record")
@@ -34,24 +34,21 @@ def command(
     quiet: bool,
 ) -> None:
     """Record the sensors into OUT, a CSV file. Without OUT the file is named by date and time. Ctrl-C ends it well."""
+    from linkpose.board import Board
     from linkpose.cli import live
-    from linkpose.device.ports import choose_port
-    from linkpose.device.session import Placement, Session
+    from linkpose.sensors.measurements import Measurements
 
     path = out or Path(f"linkpose-{datetime.datetime.now():%Y%m%d-%H%M%S}.csv")
     live.refuse_same_file(path, raw)
     console = live.Console(quiet, verbose)
-    with live.raw_capture(raw, force) as capture, Session(port or choose_port(), console.say, capture) as session:
-        apply(board, session)
-        rig = options.resolve_rig(rig_file, None, session.rig)
-        session.wait_for_mice(len(rig.mouse))
-        console.detail(f"firmware {session.hello}")
-        with live.Recorder(session, path, rig, force) as recorder:
-            console.say(f"recording to {path}" + ("" if duration else ", Ctrl-C ends"))
+    with Board(port, settings=board, rig=rig_file, raw=raw, force=force, notify=console.say) as connected:
+        connected.record(path, force=force)
+        console.detail(f"firmware {connected.hello}")
+        console.say(f"recording to {path}" + ("" if duration else ", Ctrl-C ends"))
 
-            def handle(placements: list[Placement]) -> None:
-                recorder.take(placements)
-                console.progress(lambda: live.health_line(session.health()))
+        def handle(_: Measurements) -> None:
+            console.progress(lambda: live.health_line(connected.health))
 
-            recorder.close(live.run(session, duration, handle))
-        live.show_summary(console, session.health(), json_lines, f": {path}")
+        live.run_board(connected, duration, handle)
+        live.show_summary(console, connected.health, json_lines, f": {path}")
+        connected.check_usable()

@@ -30,7 +30,7 @@ from linkpose.cli import options
     help="Share of beams that end at an obstacle that the map lacks.",
 )
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Do not print what to type next.")
+@options.next_and_quiet
 def command(
     output: Path,
     truth: Path,

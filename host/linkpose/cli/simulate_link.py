@@ -25,8 +25,10 @@ from linkpose.sensors.rig import Vector
     help="J2S: vector from the joint centre to the sensor, in its axes (m).",
 )
 @click.option("--rests", is_flag=True, help="Lay the sensor on its six sides in turn, as `calibrate imu` needs it.")
+@click.option("--imu2", is_flag=True, help="Add a second inertial sensor, half-way between the joint and the first.")
+@click.option("--mag", is_flag=True, help="Add a magnetometer.")
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Do not print what to type next.")
+@options.next_and_quiet
 def command(
     output: Path,
     truth: Path,
@@ -37,6 +39,8 @@ def command(
     errors: str,
     j2s: Vector,
     rests: bool,
+    imu2: bool,
+    mag: bool,
     force: bool,
     quiet: bool,
 ) -> None:
@@ -46,6 +50,6 @@ def command(
 
     check_outputs((output, truth), force)
     check_length(duration, rate)
-    write_link(LinkRun(test, seed, duration, rate, errors, j2s, rests=rests), output, truth, force)
+    write_link(LinkRun(test, seed, duration, rate, errors, j2s, rests=rests, imu2=imu2, mag=mag), output, truth, force)
     following = f"calibrate imu {output} --rig rig.toml" if rests else f"estimate {output} -o estimate.csv"
     options.show_next(quiet, following)

@@ -42,7 +42,7 @@ from linkpose.cli import options
     help="Slip, lift or unplug a mouse for some seconds, for example lift:2:5-8; may be repeated.",
 )
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Do not print what to type next.")
+@options.next_and_quiet
 def command(
     output: Path,
     truth: Path,

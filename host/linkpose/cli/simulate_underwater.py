@@ -43,7 +43,7 @@ NON_NEGATIVE = options.FiniteRange(min=0)
 )
 @options.force
 @options.as_json
-@click.option("-q", "--quiet", is_flag=True, help="Do not print what to type next.")
+@options.next_and_quiet
 def command(
     output: Path,
     truth: Path,

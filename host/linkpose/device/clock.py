@@ -94,12 +94,13 @@ class DeviceClock:
         self._var = [offset * noise / total, cross * noise / total, rate - cross * cross / total]
 
     def host_time(self, t_us: int) -> float:
-        """The host's time (s, time.perf_counter) of an unwrapped board time, never before one given out earlier.
+        """The host's time (s, time.perf_counter) of an unwrapped board time, never before one returned earlier.
 
         Goes from the last time given out at the fitted rate, and slews towards the fit, so that the interval between
         two samples is never disturbed by more than a thousandth.
         """
-        assert self._fit_us is not None
+        if self._fit_us is None:
+            raise RuntimeError("the clock has no fit before the first PONG")
         elapsed = (t_us - self._epoch_us) * 1e-6
         target = t_us * 1e-6 + self._offset_s + self._rate * (t_us - self._fit_us) * 1e-6
         expected = self._host_s + elapsed * (1 + self._rate)

@@ -12,7 +12,15 @@ from typing import Any, NamedTuple
 import serial
 from serial.tools import list_ports
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import (
+    NoBoardFound,
+    NotASerialPort,
+    PermissionDenied,
+    PortBusy,
+    PortError,
+    PortNotFound,
+    SeveralBoardsFound,
+)
 from linkpose.wire.messages import BAUD
 
 
@@ -41,10 +49,6 @@ CHIPS = {
 
 READ_TIMEOUT_S = 0.05
 WRITE_TIMEOUT_S = 1.0
-
-
-class NoSuchPort(LinkposeError):
-    """The port does not exist, or not at this moment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,23 +98,28 @@ def find_ports() -> list[PortInfo]:
 def choose_port(simulated_will_do: bool = True) -> str:
     """The only UNO that is connected.
 
-    Arduino's own USB chips precede those of copies, and these precede general adapters. Raises LinkposeError with a
-    list of the ports when none or several qualify.
+    Arduino's own USB chips precede those of copies, and these precede general adapters. The environment variable
+    LINKPOSE_PORT names another port. Raises NoBoardFound or SeveralBoardsFound, which list the ports, or PortError for
+    a board whose USB device has no port.
     """
+    if named := os.environ.get("LINKPOSE_PORT"):
+        return named
     ports = find_ports()
     best = max((port.likelihood for port in ports), default=-1)
     unos = [port for port in ports if port.likelihood == best >= 0]
     if len(unos) == 1:
         return unos[0].port
-    listed = ", ".join(f"{p.port} ({p.description or 'no description'})" for p in (unos or ports))
     if unos:
-        raise LinkposeError(f"{len(unos)} boards are connected: {listed}. Choose one with --port")
+        raise SeveralBoardsFound(unos)
     for device in devices_without_port():
-        raise LinkposeError(device.cure)
-    if ports:
-        raise LinkposeError(f"no UNO is connected; the ports are: {listed}. Connect the board or pass --port")
-    hint = ", or try --port sim://link" if simulated_will_do else ""
-    raise LinkposeError(f"no serial port is connected; plug the board in{hint}")
+        raise PortError(device.location, device.cure)
+    raise NoBoardFound(ports, simulated_will_do)
+
+
+def register_scheme(package: str) -> None:
+    """Lets `open_port` open URLs of another scheme: `package` holds a module protocol_SCHEME, as pyserial asks."""
+    if package not in serial.protocol_handler_packages:
+        serial.protocol_handler_packages.append(package)
 
 
 class PortlessDevice(NamedTuple):
@@ -181,45 +190,39 @@ def find_again(name: str, identity: UsbIdentity | None) -> str | None:
 
 
 def open_port(name: str, baud: int = BAUD) -> serial.Serial:
-    """Open a device, a pyserial URL or a simulated board (`sim://...`) at a bit rate.
+    """Opens a device, a pyserial URL, or a URL of a registered scheme, at a bit rate.
 
-    Raises LinkposeError with a sentence of its own for a port that is absent, busy or forbidden, and for a file that is
-    not a port.
+    Raises PortNotFound, PortBusy, PermissionDenied, NotASerialPort or another PortError.
     """
-    if "linkpose.simulation" not in serial.protocol_handler_packages:
-        serial.protocol_handler_packages.append("linkpose.simulation")
     options: dict[str, Any] = {"baudrate": baud, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
         user = holder(name)
         if user:
-            raise LinkposeError(f"{name} is in use by {user}. Close it and try again")
+            raise PortBusy(name, user)
         if os.name == "posix":
             options["exclusive"] = True
     try:
         port = serial.serial_for_url(name, **options)
     except (serial.SerialException, OSError, ValueError) as error:
-        code, text = getattr(error, "errno", None), str(error).lower()
-        if code in (errno.ENOENT, errno.ENXIO) or "filenotfound" in text or "could not find" in text:
-            raise NoSuchPort(f"there is no port {name}. `linkpose ports` lists the ports") from error
-        raise LinkposeError(_why_not(name, error)) from error
+        raise _why_not(name, error) from error
     return port
 
 
-def _why_not(name: str, error: Exception) -> str:
+def _why_not(name: str, error: Exception) -> PortError:
+    """The error that says why a port cannot be opened, from what the system or pyserial raised."""
     code = getattr(error, "errno", None)
     text = str(error).lower()
+    if code in (errno.ENOENT, errno.ENXIO) or "filenotfound" in text or "could not find" in text:
+        return PortNotFound(name)
     if code in (errno.EACCES, errno.EPERM) or "permissionerror(13" in text or "access is denied" in text:
-        if os.name == "nt":
-            return f"{name} is in use by another program. Close it and try again"
-        join = f"sudo usermod -aG {_group(name)} $USER"
-        return f"no permission to open {name}. Join the group that owns it with `{join}` and log in again"
+        return PortBusy(name) if os.name == "nt" else PermissionDenied(name, _group(name))
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
-        return f"{name} is in use by another program. Close it and try again"
+        return PortBusy(name)
     if "no handler" in text or "invalid url" in text:
-        return f"{name} is not a port. Pass a device such as /dev/ttyACM0 or COM3, or sim://link"
+        return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
-        return f"{name} is not a serial port. `linkpose ports` lists the ports"
-    return f"cannot open {name}: {error}"
+        return NotASerialPort(name)
+    return PortError(name, f"cannot open {name}: {error}")
 
 
 def _group(name: str) -> str:

@@ -6,18 +6,18 @@ import contextlib
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple, TypeVar
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from linkpose.device.clock import DeviceClock
-from linkpose.device.link import Arrival, Disconnected, Link
-from linkpose.device.ports import NoSuchPort, find_again, usb_identity
-from linkpose.errors import LinkposeError
-from linkpose.sensors.conversion import Settings
-from linkpose.sensors.devices import Sensors, check_hello, found
+from linkpose.device.connection import Arrival, Connection, Disconnected
+from linkpose.device.ports import find_again, usb_identity
+from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
+from linkpose.sensors.conversion import BoardSettings, Placed
+from linkpose.sensors.devices import Sensors, check_hello, found, mouse_remarks
 from linkpose.sensors.rig import Rig
-from linkpose.sensors.timeline import Gap, Placed, Timeline
+from linkpose.sensors.timeline import Gap, Timeline
 from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
@@ -27,6 +27,7 @@ from linkpose.wire.messages import (
     Ack,
     Command,
     Configure,
+    DeviceState,
     GetInfo,
     Hello,
     Message,
@@ -47,24 +48,30 @@ ASK_INTERVAL_S = 0.4
 ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3  # at a command whose answer does not come
 SELF_TEST_TIMEOUT_S = 3.0
-MICE_TIMEOUT_S = 1.5
+MICE_TIMEOUT_S = 3.0  # self-test up to 1.5 s, set-up of a slow mouse 0.6 s
+LOW_SUPPLY_MV = 4500  # below it an ATmega328P at 16 MHz is out of its specification, and 5 V mice are too
+SENSORS_TIMEOUT_S = 1.0  # the slowest sensor is set up 0.3 s after the firmware starts
 SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
 LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
 RECEIVE_TIMEOUT_S = 0.1
+MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
+STILL_SAMPLES = 10  # with the same time stamp
+JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
-
-FLASH = "type `linkpose flash`"
-UPGRADE = "type `pip install --upgrade linkpose`"
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
-class WrongBoard(LinkposeError):
-    """A board that cannot be gone on with, however long it is waited for."""
+class NotResumed(Disconnected):
+    """A board that was reset and could not be started again at once."""
+
+
+class AnotherBoard(BoardError):
+    """Another board answers at the port than the one that the recording began with."""
 
 
 class Placement(NamedTuple):
@@ -86,7 +93,8 @@ class Health:
     rate_hz: float
     drift_ppm: float | None
     drift_std_ppm: float | None
-    status: Status | None  # the board's own counters, as it last told them
+    status: Status | None  # the board's own counters, as it last sent them
+    sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts, by sensor (sensors.health)
 
 
 class Session:
@@ -97,31 +105,38 @@ class Session:
 
     def __init__(self, port: str, notify: Notify, capture: BinaryIO | None = None) -> None:
         self.port = port
-        self._notify = notify
+        self.notify = notify
         self._capture = capture
-        self._link = Link(port, capture)
+        self._connection = Connection(port, capture)
         self._usb = usb_identity(port)
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
+        self._mouse_ports: int | None = None  # of the recording; None: not known yet
+        self._supply_reported = False
         self._started: Arrival | None = None  # what came together with the ACK of START
-        self._pinged_at = 0.0  # s, perf_counter
+        self._pinged_at = self._looked_s = 0.0  # s, perf_counter
+        self._unread_bytes = 0  # since the last sample, that belong to no message
+        self._last_stamp: tuple[int, int] | None = None  # seq and t_us of the last sample
+        self._still = 0  # samples in a row with the same t_us
+        self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
             0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
         )
         self._corrupt_before = Corrupt()
         try:
-            self.hello = self._handshake()
+            self.hello = self._first_hello = self._handshake()
+            self._wanted = _configured(self.hello)  # the settings that values are scaled by, after a reset too
         except BaseException:
-            self._link.close()
+            self._connection.close()
             raise
 
     @property
     def rig(self) -> Rig | None:
         """The rig that a simulated board brings along; None of a real one."""
-        return self._link.rig
+        return self._connection.rig
 
     @property
     def settings(self) -> Configure:
@@ -133,63 +148,96 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(Disconnected):
-            self._link.send(Stop())
-        self._link.close()
+            self._connection.send(Stop())
+        self._connection.close()
 
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
-        link = self._link
+        connection = self._connection
         heard = bytearray()
         deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
         while time.perf_counter() < deadline:
             if time.perf_counter() >= ask_at:
-                link.send(Stop())
-                link.send(GetInfo())
+                connection.send(Stop())
+                connection.send(GetInfo())
                 ask_at = time.perf_counter() + ASK_INTERVAL_S
-            arrival = link.receive(0.05)
+            arrival = connection.receive(0.05)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
-                    raise WrongBoard(_other_protocol(message))
+                    raise _other_protocol(message)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
-                    link.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    message = self._wait_for_sensors(message)
+                    connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
                     return message
-        raise LinkposeError(f"{self.port}: {_why_no_hello(bytes(heard), link.decoder.corrupt)}")
+        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+
+    def _wait_for_sensors(self, hello: Hello) -> Hello:
+        """Gives sensors that are being set up the time for it; the latest HELLO."""
+        deadline = time.perf_counter() + SENSORS_TIMEOUT_S
+        while any(device.state == DeviceState.STARTING for device in hello.devices):
+            if time.perf_counter() > deadline:
+                break
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            hello = self._await(Hello, "GET_INFO")
+        return hello
 
     def _check_versions(self, hello: Hello) -> None:
-        """Raises WrongBoard when the two sides do not understand each other, and tells of a harmless difference."""
+        """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise WrongBoard(_other_schema(hello))
+            raise _other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
-            older, cure = ("board", FLASH) if hello.protocol_minor < PROTOCOL_MINOR else ("linkpose", UPGRADE)
-            self._notify(
-                f"the board speaks protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
-                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they understand each other, but the {older} is older: {cure}"
+            older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
+            self.notify(
+                f"the board uses protocol {hello.protocol_major}.{hello.protocol_minor}, this linkpose "
+                f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}; they are compatible, but the {older} should be updated"
             )
         check_hello(hello)
 
     # ---- commands ----
 
     def configure(self, settings: Configure) -> Hello:
-        """Puts settings in force; the HELLO that shows them. Raises LinkposeError when the board refuses."""
-        self._command(settings, Command.CONFIGURE)
-        time.sleep(SETTLE_S)
-        self._link.send(GetInfo())
-        self.hello = self._await(Hello, "GET_INFO")
-        return self.hello
+        """Puts settings in force and returns the HELLO that shows them.
+
+        Raises LinkposeError if the board refuses them, or does not keep them because it is reset again and again.
+        """
+        for _ in range(ATTEMPTS):
+            self._command(settings, Command.CONFIGURE)
+            time.sleep(SETTLE_S)
+            self._connection.send(GetInfo())
+            self.hello = self._await(Hello, "GET_INFO")
+            if _configured(self.hello) == settings:
+                self._wanted = settings
+                return self.hello
+        raise LinkposeError("the board loses its settings: it is reset again and again; check its supply and its cable")
 
     def wait_for_mice(self, count: int) -> None:
-        """Gives so many mice the time to pass their self-test, for which they take up to a second after power-on."""
+        """Wait until no mouse is being set up and `count` ports have mice, for at most MICE_TIMEOUT_S.
+
+        The ports known afterwards are those of the recording; a mouse at another port is reported when it appears.
+        """
         deadline = time.perf_counter() + MICE_TIMEOUT_S
-        while Settings.of(self.hello).mouse_ports < count and time.perf_counter() < deadline:
+        told = False
+        while self._mice_missing(count) and time.perf_counter() < deadline:
+            if not told:
+                self.notify("Waiting for the mice, which are being set up or have not been found yet")
+                told = True
             time.sleep(ASK_INTERVAL_S)
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
+        self._mouse_ports = max(BoardSettings.of(self.hello).mouse_ports, count)
+        for remark in mouse_remarks(self.hello):
+            self.notify(remark)
+
+    def _mice_missing(self, count: int) -> bool:
+        starting = any(mouse.state == DeviceState.STARTING for mouse in self.hello.mice)
+        return starting or BoardSettings.of(self.hello).mouse_ports < count
 
     def self_test(self, device: int = 0) -> SelfTestResult:
         """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
@@ -202,7 +250,7 @@ class Session:
         A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
         """
         for _ in range(ATTEMPTS):
-            self._link.send(message)
+            self._connection.send(message)
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for at, answer in enumerate(arrival.messages):
                     if isinstance(answer, Nak) and answer.command == command:
@@ -232,7 +280,7 @@ class Session:
         """What arrives within a time."""
         deadline = time.perf_counter() + timeout_s
         while (left := deadline - time.perf_counter()) > 0:
-            arrival = self._link.receive(left)
+            arrival = self._connection.receive(left)
             if arrival is not None:
                 yield arrival
 
@@ -240,7 +288,7 @@ class Session:
 
     def _ping(self) -> None:
         self._token = (self._token + 1) % (1 << 32)
-        self._pings = {self._token: self._link.send(Ping(self._token))}
+        self._pings = {self._token: self._connection.send(Ping(self._token))}
 
     def _hear_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
@@ -262,7 +310,7 @@ class Session:
 
     # ---- streaming ----
 
-    def stream(self, duration_s: float | None = None) -> Iterator[list[Placement]]:
+    def stream(self, duration_s: float | None = None) -> Generator[list[Placement], None, None]:
         """Samples as they arrive, in lists of those that arrived together, for `duration_s` of the board's time.
 
         A list may be empty: the caller gets its turn several times a second even when nothing arrives. After a reset or
@@ -271,13 +319,15 @@ class Session:
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
-        self._began_s = self._link.now()
+        self._began_s = self._connection.now()
         while not timeline.is_over:
             try:
                 placements = self._next(timeline)
             except Disconnected as error:
-                self._notify(f"{self.port} disappeared ({error.reason}); waiting for the board, Ctrl-C ends")
-                timeline.interrupted("cable")
+                reset = isinstance(error, NotResumed)
+                event = f"{error.reason}" if reset else f"{self.port} disappeared ({error.reason})"
+                self.notify(f"{event}; waiting for the board, Ctrl-C ends")
+                timeline.interrupted("reset" if reset else "cable")
                 yield []
                 yield from self._reconnect(timeline)
                 continue
@@ -285,7 +335,7 @@ class Session:
             if self._silent_s > LATE_S:
                 self._end_when_due(timeline)
         if timeline.missing_at_end:
-            self._notify(
+            self.notify(
                 f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
                 "are counted as lost"
             )
@@ -293,30 +343,67 @@ class Session:
     def _end_when_due(self, timeline: Timeline) -> None:
         """End the timeline when the duration has passed without a sample that would have ended it."""
         first_s = timeline.start_s if timeline.samples else self._began_s
-        timeline.end_if_past(self._link.now() - first_s - LATE_S)
+        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
-        self._clock = DeviceClock()
-        self._tie_clocks()
-        self._started = self._command(Start(), Command.START)
-        self._pinged_at = time.perf_counter()
+        wanted = self._wanted
+        for _ in range(ATTEMPTS):
+            self._clock = DeviceClock()
+            self._tie_clocks()
+            self._started = self._start(wanted)
+            if self._started is not None:
+                break
+            self._connection.send(Stop())
+            self.configure(wanted)
+        else:
+            raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
+        self._pinged_at = self._looked_s = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
+        self._unread_bytes = self._still = 0
+        self._last_stamp = None
+
+    def _start(self, wanted: Configure) -> Arrival | None:
+        """Starts the stream and checks that the board streams with the settings that its values are scaled by.
+
+        Returns what arrived behind the ACK; None if the board was reset on the way and has lost its settings.
+        """
+        started = self._command(Start(), Command.START)
+        self._connection.send(GetInfo())
+        messages, arrived_s = list(started.messages), started.time_s
+        for arrival in itertools.chain([started], self._arrivals(ANSWER_TIMEOUT_S)):
+            if arrival is not started:
+                messages += arrival.messages
+                arrived_s = arrival.time_s
+            hellos = [message for message in arrival.messages if isinstance(message, Hello)]
+            if hellos:
+                sound = all(hello.streaming and _configured(hello) == wanted for hello in hellos)
+                rest: list[Message | OtherProtocol] = [
+                    message for message in messages if not isinstance(message, Hello)
+                ]
+                return Arrival(arrived_s, rest, b"") if sound else None
+        return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._link.receive(RECEIVE_TIMEOUT_S), None
+        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
         now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
-        if arrival is None:
-            self._silent_s += RECEIVE_TIMEOUT_S  # not by the clock: a suspended program has not waited
+        waited_s, self._looked_s = now - self._looked_s, now
+        if arrival is None or not arrival.messages:
+            self._unread_bytes += len(arrival.data) if arrival else 0
+            self._silent_s += min(waited_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
             self._ask_when_silent()
             return []
         placements = []
         for message in arrival.messages:
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
+                if self._mouse_ports is not None and len(message.mice) > 2 * self._mouse_ports:
+                    self._report_new_mouse(len(message.mice) // 2)
+                self._unread_bytes = 0
+                self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
@@ -324,43 +411,96 @@ class Session:
                 self._hear(message, arrival, timeline)
         return placements
 
+    def _report_new_mouse(self, port: int) -> None:
+        self._mouse_ports = port
+        self.notify(
+            f"A mouse appeared at port {port}, which had none at the start: its movement is not recorded. "
+            "Plug mice in before the start, or add a [[mouse]] for each to the rig"
+        )
+
+    def _check_supply(self, status: Status) -> None:
+        if not 0 < status.vcc_mv < LOW_SUPPLY_MV or self._supply_reported:
+            return
+        self._supply_reported = True
+        self.notify(
+            f"The supply of the board is {status.vcc_mv / 1000:.1f} V (±10 %), below 4.5 V: mice or sensors may fail. "
+            "Use a shorter USB cable or another port, or supply the mice separately"
+        )
+
+    def _check_clock(self, sample: Sample, timeline: Timeline) -> None:
+        """Report a board clock that stands still or jumps against its own count of ticks, once each."""
+        seq, t_us = self._last_stamp or (sample.seq, sample.t_us)
+        self._last_stamp = (sample.seq, sample.t_us)
+        ticks = (sample.seq - seq) % (1 << 16)
+        off_s = ((sample.t_us - t_us + (1 << 31)) % (1 << 32) - (1 << 31)) * 1e-6 - ticks / self.hello.sample_rate_hz
+        self._still = self._still + 1 if ticks and sample.t_us == t_us else 0
+        fault = ""
+        if self._still == STILL_SAMPLES:
+            fault = "stands still"
+        elif abs(off_s) > JUMP_S and ticks < JUMP_S * self.hello.sample_rate_hz:
+            fault = f"jumped by {off_s:.2f} s"
+        if fault and fault.split()[0] not in self._clock_faults:
+            self._clock_faults.add(fault.split()[0])
+            self.notify(
+                f"{timeline.duration_s:.2f} s: the board's clock {fault}; the times from here on are doubtful. Replace "
+                "the board if it happens again"
+            )
+
     def _ask_when_silent(self) -> None:
         """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
         if self._silent_s - self._asked_s > SILENCE_S:
             if self._asked_s == 0.0:
-                self._notify(f"no sample for {SILENCE_S:g} s; asking the board")
+                noise = f", only {self._unread_bytes} bytes of noise" if self._unread_bytes > MOST_UNREAD_BYTES else ""
+                self.notify(f"no sample for {SILENCE_S:g} s{noise}; asking the board")
             self._asked_s = self._silent_s
-            self._link.send(GetInfo())
+            self._connection.send(GetInfo())
 
     def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
         if isinstance(message, Pong):
             self._hear_pong(message, arrival.time_s)
         elif isinstance(message, Status):
             self._status = message
+            self._check_supply(message)
         elif isinstance(message, OtherProtocol):
-            raise WrongBoard(_other_protocol(message))
+            raise _other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
-            self._notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
+            self.notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
             timeline.interrupted("reset")
-            self._resume(message)
+            try:
+                self._resume(message)
+            except (WrongFirmware, AnotherBoard, Disconnected):
+                raise
+            except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
+                raise NotResumed(self.port, error) from error
 
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
-        before, self.hello = self.hello, hello
-        if Settings.of(before).bmp180 != Settings.of(hello).bmp180 and found(before) & found(hello) & Sensors.BMP180:
-            raise WrongBoard(f"another board answers at {self.port} now; record it into a file of its own")
-        if _configured(before) != _configured(hello):
-            self.configure(_configured(before))
+        self.hello, before = hello, self._first_hello
+        if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
+            raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
+        for old, new in zip(before.devices, hello.devices, strict=True):
+            if old.id and new.id and (old.address, old.id) != (new.address, new.id):
+                raise AnotherBoard(
+                    f"another board answers at {self.port} now (a sensor has the id {new.id:#04x} instead of "
+                    f"{old.id:#04x}); record it into a file of its own"
+                )
+        if before.source_revision != hello.source_revision:
+            self.notify(
+                f"the board's firmware is another one now: source revision {hello.source_revision:08x} instead of "
+                f"{before.source_revision:08x}"
+            )
+        if _configured(hello) != self._wanted:
+            self.configure(self._wanted)
         self._begin()
 
     def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:
         """Wait until the board can be opened again and streams, or the duration is over; yields while it waits.
 
-        Raises WrongBoard for a board with which the recording cannot continue.
+        Raises WrongFirmware or AnotherBoard for a board with which the recording cannot continue.
         """
-        self._link.close()
-        for part, count in self._link.decoder.corrupt.as_dict().items():
+        self._connection.close()
+        for part, count in self._connection.decoder.corrupt.as_dict().items():
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
         obstacles: set[str] = set()
         while not timeline.is_over:
@@ -372,7 +512,7 @@ class Session:
                 return
             if obstacle and obstacle not in obstacles:
                 obstacles.add(obstacle)
-                self._notify(f"{obstacle}; still waiting")
+                self.notify(f"{obstacle}; still waiting")
 
     def _open_again(self) -> str | None:
         """Continue with the board that has returned. None: done; otherwise the obstacle, "" while it is absent."""
@@ -380,24 +520,24 @@ class Session:
         if port is None:
             return ""
         try:
-            self._link = Link(port, self._capture)
-        except NoSuchPort:
+            self._connection = Connection(port, self._capture)
+        except PortNotFound:
             return ""
         except LinkposeError as error:
             return str(error)
         self.port = port
         try:
             self._resume(self._handshake())
-        except WrongBoard:
+        except (WrongFirmware, AnotherBoard):
             raise
         except Disconnected:
-            self._link.close()
+            self._connection.close()
             return ""
         except LinkposeError as error:
-            self._link.close()
+            self._connection.close()
             return str(error)
         self._usb = usb_identity(port)
-        self._notify(f"the board is back at {port}; continuing, the gap is marked")
+        self.notify(f"the board is back at {port}; continuing, the gap is marked")
         return None
 
     # ---- health ----
@@ -405,7 +545,7 @@ class Session:
     def health(self) -> Health:
         """Counts so far."""
         timeline = self.timeline
-        now, before = self._link.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
+        now, before = self._connection.decoder.corrupt.as_dict(), self._corrupt_before.as_dict()
         duration = timeline.duration_s
         return Health(
             samples=timeline.samples,
@@ -420,14 +560,30 @@ class Session:
         )
 
 
+def summary(health: Health) -> dict[str, Any]:
+    """The closing summary of a session, as `record --json` prints it."""
+    return {
+        "event": "summary",
+        "samples": health.samples,
+        "lost": health.lost,
+        "corrupt": health.corrupt.total,
+        "gaps": len(health.gaps),
+        "duration_s": round(health.duration_s, 6),
+        "rate_hz": round(health.rate_hz, 3),
+        "sensors": health.sensors,
+    }
+
+
 def firmware_version(hello: Hello) -> str:
     return f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}"
 
 
 def reset_causes(hello: Hello) -> str:
-    """Names of the reset flags that are set, such as "watchdog"."""
+    """Names of the reset flags that are set, such as "watchdog", or where the firmware hung."""
     from linkpose.wire.messages import ResetCause
 
+    if hello.reset_cause & ResetCause.HUNG:
+        return f"the firmware hung at program counter {hello.hung_at:#06x}"
     names = [cause.name.lower().replace("_", " ") for cause in ResetCause if hello.reset_cause & cause and cause.name]
     return ", ".join(names) or "cause unknown"
 
@@ -444,33 +600,35 @@ def _reason(code: int) -> str:
         return f"reason {code}"
 
 
-def _other_protocol(other: OtherProtocol) -> str:
+def _other_protocol(other: OtherProtocol) -> WrongFirmware:
     theirs = f"{other.protocol_major}.{other.protocol_minor}"
     ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
     if other.protocol_major < PROTOCOL_MAJOR:
-        return f"the board's firmware is old: it speaks protocol {theirs}, this linkpose {ours}; {FLASH}"
-    return f"this linkpose is old: it speaks protocol {ours}, the board's firmware {theirs}; {UPGRADE}"
+        return WrongFirmware(f"the board's firmware is old: it uses protocol {theirs}, this linkpose {ours}", True)
+    return WrongFirmware(f"this linkpose is old: it uses protocol {ours}, the board's firmware {theirs}", False)
 
 
-def _other_schema(hello: Hello) -> str:
+def _other_schema(hello: Hello) -> WrongFirmware:
     theirs = firmware_version(hello)
     release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
     if release > tuple(map(int, VERSION.split("."))):
-        return f"this linkpose {VERSION} is older than the board's firmware {theirs}, their schemas differ; {UPGRADE}"
-    return f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas; {FLASH}"
+        text = f"this linkpose {VERSION} is older than the board's firmware {theirs}, and their schemas differ"
+        return WrongFirmware(text, False)
+    text = f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas"
+    return WrongFirmware(text, True)
 
 
 def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
     """What came instead of a HELLO, and what to do about it."""
     if not heard:
-        return "the board is silent; type `linkpose flash` if it never had this firmware, or choose another --port"
+        return "the board is silent; it may never have had this firmware, or another port is the board's"
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
     if printable > 0.8 * len(heard):
         text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
-        return f"another firmware answers: {text!r}; type `linkpose flash` to put linkpose's on the board"
+        return f"another firmware answers: {text!r}"
     if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
         return "the board answers only in part; check the cable and try again"
     return (
-        "only noise came, and no frame; the device runs at another baud rate or is no linkpose board: check the port, "
-        "or type `linkpose flash`"
+        "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "
+        "the port"
     )

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, Errors, errors_of, scored, yaw_drift_deg_per_min
-from linkpose.evaluation.series import Series, find_offset, interval, is_sparser, paired
+from linkpose.evaluation.series import Series, find_offset, is_sparser, paired
 from linkpose.evaluation.statistics import Statistics
 from linkpose.quantities import (
     ANGLE,
@@ -195,10 +195,15 @@ def _continuous_sign(q: Floats) -> Floats:
 
 
 def _common_offset(compared: Iterable[Mapping[Quantity, Pair]]) -> tuple[float, float]:
-    """The offset (s) of the filter that fits best, and its residual. Yaw and rotations have no origin in common."""
-    usable = [[pair for q, pair in both.items() if q not in (YAW, *CHAIN_ROTATION)] for both in compared]
-    offsets = [find_offset(pairs) for pairs in usable if pairs]
+    """The offset (s) of the filter that fits best, and its residual."""
+    offsets = [find_offset(pairs) for both in compared if (pairs := _comparable(both))]
     return min(offsets, key=lambda found: found[1]) if offsets else (0.0, np.inf)
+
+
+def _comparable(both: Mapping[Quantity, Pair]) -> list[Pair]:
+    """The pairs that move alike. A link's x and y do not where the two count yaw from different directions."""
+    unaligned = (YAW, *CHAIN_ROTATION, *((X, Y) if YAW in both else ()))
+    return [pair for q, pair in both.items() if q not in unaligned]
 
 
 # ---- doubts ----
@@ -261,7 +266,8 @@ def _score(
     rows = int(np.logical_or.reduce([np.isfinite(error) for error in errors.values()]).sum())
     known, empty = _known_rows(both, window)
     if rows < _FEWEST * known:
-        raise LinkposeError(_too_few(estimate, reference, name, rows, known, time_s[_any_finite(errors)]))
+        common = time_s[_any_finite(errors)]
+        raise TooFewRows(name, (estimate.path, reference.path), (rows, known), (float(common[0]), float(common[-1])))
     is_planar = not any(q in _LINK for q in both)
     std = _std(estimate, name, both, offset_s)
     drift = yaw_drift_deg_per_min(time_s, errors[YAW]) if YAW in errors else None
@@ -296,13 +302,6 @@ def _known_rows(both: Mapping[Quantity, Pair], window: Window) -> tuple[int, int
     inside = (estimate.time_s >= window[0]) & (estimate.time_s <= window[1])
     if not is_sparser(reference, estimate):
         return int((known & inside).sum()), int((~known & inside).sum())
-    share = interval(estimate.time_s) / interval(reference.time_s)
+    share = estimate.interval_s / reference.interval_s
     stamps, empty = (len(np.unique(estimate.time_s[part & inside])) for part in (known, ~known))
     return round(share * stamps), round(share * empty)
-
-
-def _too_few(estimate: Table, reference: Table, name: str, rows: int, known: int, common: Floats) -> str:
-    return (
-        f"only {rows} of {known} estimates of {name} in {estimate.path} have a reference in {reference.path}, "
-        f"less than half; to score the common part alone, add --from {common[0]:.6g} --to {common[-1]:.6g}"
-    )

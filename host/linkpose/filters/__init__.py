@@ -10,7 +10,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotRun, MissingJ2S, SensorMissing, UncertainJ2S, UnknownFilter
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
@@ -83,6 +83,15 @@ class Filter(Protocol):
 
 
 @runtime_checkable
+class FindsMiceScale(Protocol):
+    """What a filter offers beyond that when it compares the mice with the gyro."""
+
+    @property
+    def scale_change(self) -> tuple[float, float]:
+        """Counts per metre, common to all mice, relative to the rig file, and the standard deviation of this factor."""
+
+
+@runtime_checkable
 class FindsJ2s(Protocol):
     """What a filter offers beyond that when it estimates J2S."""
 
@@ -91,20 +100,17 @@ class FindsJ2s(Protocol):
         """J2S so far, and its covariance: (3,) m, (3, 3) m²."""
 
 
-class CannotRun(LinkposeError):
-    """The rig or the sensors do not allow a filter; the text says why and what to type."""
-
-
 def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST_MICE) -> Filter:
     """A fresh filter for measurements of these sensors and of mice at ports 1 to `mice`.
 
-    Raises CannotRun where the rig or the sensors do not allow it, LinkposeError for no such name.
+    Raises CannotRun where the rig or the sensors do not allow it, UnknownFilter for no such name.
     """
+    name = name.replace("_", "-")
     if name not in REGISTRY:
-        raise LinkposeError(f"there is no filter {name!r}: take {', '.join(NAMES)}")
+        raise UnknownFilter(name, NAMES)
     needs = REGISTRY[name]
     for missing in needs.sensors & ~sensors:
-        raise CannotRun(f"{name} needs the {missing.name}, which does not answer: check its wiring")
+        raise SensorMissing(name, missing.name or str(missing))
     _check_j2s(name, needs, rig)
     if needs.needs_mice:
         _check_mice(rig, sensors, mice)
@@ -124,10 +130,9 @@ def create_smoother(name: str, rig: Rig) -> Filter:
 def _check_j2s(name: str, needs: Capabilities, rig: Rig) -> None:
     """Raises CannotRun where J2S is missing, or too uncertain for the filter."""
     if needs.j2s != "none" and rig.joint.j2s_m is None:
-        raise CannotRun(f"{name} needs J2S: type `linkpose calibrate joint`, or give it with --j2s X,Y,Z")
+        raise MissingJ2S(name)
     if needs.j2s == "known" and rig.joint.known_j2s_m is None:
-        estimators = ", ".join(other for other, able in REGISTRY.items() if able.j2s == "guess")
-        raise CannotRun(f"{name} needs a J2S that is known; {estimators} is the filter that estimates it")
+        raise UncertainJ2S(name, [other for other, able in REGISTRY.items() if able.j2s == "guess"])
 
 
 def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
@@ -157,5 +162,5 @@ def _two_samples_at_rest() -> Measurements:
         baro_temp_degC=np.full(2, 25.0),
         baro_fresh=np.ones(2, np.bool_),
         mice_counts=np.zeros((2, 2, 2)),
-        flags=np.zeros(2, np.uint16),
+        flags=np.zeros(2, np.uint32),
     )

@@ -180,7 +180,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
     imu: ImuCalibration,

@@ -159,7 +159,7 @@ def _process(
     time_s: Floats,
     accel: Floats,
     gyro: Floats,
-    flags: NDArray[np.uint16],
+    flags: NDArray[np.uint32],
     imu: ImuCalibration,
     parameters: TiltParameters,
     d: Vec,

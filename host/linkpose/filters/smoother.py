@@ -74,7 +74,7 @@ def _reversed(block: Measurements) -> Measurements:
     """The recording as it would have been, had time run backwards; only what the filter reads is turned."""
     at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
     accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
-    accel_bit, gyro_bit = np.uint16(SampleFlags.ACCEL_SATURATED), np.uint16(SampleFlags.GYRO_SATURATED)
+    accel_bit, gyro_bit = np.uint32(SampleFlags.ACCEL_SATURATED), np.uint32(SampleFlags.GYRO_SATURATED)
     flags = block.flags & ~(accel_bit | gyro_bit) | block.flags[at_accel] & accel_bit | block.flags[at_gyro] & gyro_bit
     return replace(
         block,

@@ -7,9 +7,11 @@ figure is made.
 from linkpose.plotting.canvas import check_output, new_figure, save
 from linkpose.plotting.evaluation import evaluation
 from linkpose.plotting.experiments import paper_figure_2, redundant_mice, variants
+from linkpose.plotting.robots import Scene
 from linkpose.plotting.tables import plot_tables
 
 __all__ = [
+    "Scene",
     "check_output",
     "evaluation",
     "new_figure",

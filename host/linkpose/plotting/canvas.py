@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import datetime
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotWrite, FileError, FileExists
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +26,7 @@ COLOURS = {
 AXES_COLOURS = {"x": _RED, "y": _GREEN, "z": _BLUE}
 OTHERS = (_SKY, _GREEN, _ORANGE, _RED)  # of series that are no filter: mice, beacons
 TRUTH: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.1, "zorder": 5}
+REFERENCES = ("truth", "reference")  # labels of what is drawn as TRUTH
 BAND_ALPHA = 0.18
 _BEST = ("joint-inertial", "planar-ekf", "chain")  # drawn thick
 _BESIDES = ("-", ":", "-.")  # the second and third file
@@ -56,10 +58,15 @@ def finish(axes: Axes, label: str) -> None:
     axes.margins(x=0.0)
 
 
-def legend_above(axes: Axes, columns: int = 5) -> None:
-    """A legend above the axes, where it hides nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    once = dict(zip(labels, handles, strict=True))
+def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -> None:
+    """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
+    rank = {label: i for i, label in enumerate(best_first)}
+
+    def place(item: tuple[object, str]) -> int:
+        return -1 if item[1] in REFERENCES and best_first else rank.get(item[1], len(rank))
+
+    order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
+    once = {label: handle for handle, label in order}
     if once:
         axes.legend(
             once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False,
@@ -68,19 +75,19 @@ def legend_above(axes: Axes, columns: int = 5) -> None:
 
 
 def check_output(path: Path | None, force: bool) -> None:
-    """Raises LinkposeError where a picture of this name cannot be written: better before the work than after it."""
+    """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
     if path is None:
         return
     if path.suffix.lower() not in FORMATS:
-        raise LinkposeError(f"{path} is no picture that linkpose writes; name a file that ends in {', '.join(FORMATS)}")
+        raise FileError(path, f"{path} is no picture that linkpose writes; its name must end in {', '.join(FORMATS)}")
     if path.exists() and not force:
-        raise LinkposeError(f"{path} exists already; name another file or add --force to replace it")
+        raise FileExists(path)
     if not path.absolute().parent.is_dir():
-        raise LinkposeError(f"cannot write {path}: there is no folder {path.absolute().parent}")
+        raise CannotWrite(path, f"there is no folder {path.absolute().parent}")
 
 
 def save(figure: Figure, path: Path, force: bool) -> None:
-    """Writes the picture in the format that the file's ending names. Raises LinkposeError as `check_output` does, and
+    """Writes the picture in the format that the file's ending names. Raises FileError as `check_output` does, and
     where the file cannot be written.
     """
     check_output(path, force)
@@ -89,4 +96,4 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     try:
         figure.savefig(path, dpi=130, metadata=metadata.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
-        raise LinkposeError(f"cannot write {path}: {error}; name a file in a folder you may write to") from error
+        raise CannotWrite(path, str(error)) from error

@@ -9,7 +9,6 @@ import numpy as np
 
 from linkpose.plotting.canvas import OTHERS, TRUTH, finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import draw
-from linkpose.plotting.panels import order_legend
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -37,7 +36,8 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
     for axes, run in zip(figure.subplots(len(runs), 1), runs, strict=True):
         best_first = ["joint-inertial", "joint", "tilt", "imu-baro", "baro"]
         for name in reversed(best_first):
-            draw(axes, run.time_s, 100 * run.height_m[name], label=title(name), **line_style(name))
+            style = line_style(name) | ({"alpha": 0.4, "linewidth": 0.7} if name == "baro" else {})
+            draw(axes, run.time_s, 100 * run.height_m[name], label=title(name), **style)
         draw(axes, run.time_s, 100 * run.truth_m, label="truth", **TRUTH)
         finish(axes, f"Test {run.test}: height (cm)")
         inside = np.full(len(run.time_s), True)
@@ -46,7 +46,7 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
             inside = (run.time_s >= _SHOWN_S[0]) & (run.time_s <= _SHOWN_S[1])
         _scale_to(axes, 100 * np.concatenate([run.truth_m[inside], run.height_m["tilt"][inside]]))
         if run is runs[0]:
-            order_legend(axes, [title(name) for name in best_first])
+            legend_above(axes, best_first=[title(name) for name in best_first])
     figure.axes[-1].set_xlabel("time (s)")
     return figure
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import TRUTH, finish, line_style
+from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.sources import Sources, Track, pairs
 from linkpose.quantities import YAW, Quantity, unit_text
@@ -45,11 +45,11 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
         if quantity is YAW and drawn:
             value = _from_start_of(drawn[0][0], track)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
-    _view_values(axes, [value for _, value in drawn])
+    view_values(axes, [value for _, value in drawn])
     shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
     finish(axes, quantity.axis_label)
     if legend:
-        order_legend(axes, [track.label for track, _ in drawn])
+        legend_above(axes, best_first=[track.label for track, _ in drawn])
 
 
 def _from_start_of(estimate: Track, reference: Track) -> Floats:
@@ -63,7 +63,7 @@ def _from_start_of(estimate: Track, reference: Track) -> Floats:
     return np.asarray((theirs - theirs[at] + ours[known[0]] + 180.0) % 360.0 - 180.0)
 
 
-def _view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
+def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
     """Limits the y axis to the values: ±2σ of a filter that has just started is wider than all motion."""
     known = [value[np.isfinite(value)] for value in values_drawn]
     together = np.concatenate([k for k in known if len(k)]) if any(len(k) for k in known) else np.zeros(0)
@@ -71,24 +71,6 @@ def _view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
         low, high = np.quantile(together, [0.0005, 0.9995])
         margin = 0.08 * (high - low)
         axes.set_ylim(low - margin, high + margin)
-
-
-def order_legend(axes: Axes, best_first: Sequence[str]) -> None:
-    """The legend above the axes: the reference, the filters from the best on, then bands and shades."""
-    handles, labels = axes.get_legend_handles_labels()
-    rank = {label: i for i, label in enumerate(best_first)}
-
-    def place(item: tuple[object, str]) -> int:
-        is_reference = item[1] in ("truth", "reference")
-        return -1 if is_reference else rank.get(item[1], len(rank))
-
-    order = sorted(zip(handles, labels, strict=True), key=place)
-    once = {label: handle for handle, label in order}
-    if once:
-        axes.legend(
-            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=6, frameon=False, fontsize=8,
-            borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
-        )  # fmt: skip
 
 
 def errors(axes: Axes, sources: Sources, name: str) -> None:
@@ -114,7 +96,7 @@ def errors(axes: Axes, sources: Sources, name: str) -> None:
     bound_view(axes, drawn, stds)
     shade_unknown(axes, sources.tracks)
     finish(axes, f"{name} error ({unit})")
-    order_legend(axes, order)
+    legend_above(axes, best_first=order)
 
 
 def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
@@ -138,7 +120,7 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
     bound_view(axes, differences, stds)
     shade_unknown(axes, sources.tracks)
     finish(axes, f"from best ({unit_text(quantity.error.unit)})")
-    order_legend(axes, order)
+    legend_above(axes, best_first=order)
 
 
 def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> None:

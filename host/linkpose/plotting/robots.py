@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import order_legend, shade_unknown
+from linkpose.plotting.panels import shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.sensors.measurements import Floats
@@ -19,8 +18,11 @@ from linkpose.sensors.measurements import Floats
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from linkpose.localization.grid import GridMap
+
 _MARKS = 12  # heading ticks and ellipses along a path
 _MOST_MICE = 4
+_MOST_CELLS = 3000  # of a map, along a side
 
 TimePanel = tuple[float, Callable[["Axes"], None]]
 
@@ -29,9 +31,8 @@ TimePanel = tuple[float, Callable[["Axes"], None]]
 class Scene:
     """What lies under a robot's path, in its map's frame."""
 
-    image: NDArray[np.float64] | None = None  # (rows, columns) of a grid map, row 0 lowest: 0 free, 1 occupied
-    extent_m: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 1.0)  # left, right, bottom, top of the image
-    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m), further axes ignored
+    grid: GridMap | None = None
+    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m); further axes are ignored
     rejected_xy_m: Floats | None = None  # (N, 2) where measurements were rejected
 
 
@@ -63,15 +64,16 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
         axes.plot(x[keep], y[keep], label=track.label, **style)
         _mark(axes, track, str(style["color"]))
     axes.set_aspect("equal", "datalim")
+    axes.set_box_aspect(1.0)
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
-    order_legend(axes, [track.label for track in tracks])
+    legend_above(axes, 3, [track.label for track in tracks])
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
-    if scene.image is not None:
-        axes.imshow(scene.image, cmap="Greys", vmin=0, vmax=1.6, extent=scene.extent_m, origin="lower", zorder=0)
+    if scene.grid is not None:
+        _draw_map(axes, scene.grid)
     if scene.beacons:
         places = np.array([list(place)[:2] for place in scene.beacons.values()])
         axes.plot(*places.T, "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
@@ -79,6 +81,28 @@ def _draw_scene(axes: Axes, scene: Scene) -> None:
             axes.annotate(name, place, xytext=(4, 4), textcoords="offset points", fontsize=7)
     if scene.rejected_xy_m is not None and len(scene.rejected_xy_m):
         axes.plot(*scene.rejected_xy_m.T, "x", color=OTHERS[3], markersize=4, label="measurement rejected", zorder=4)
+
+
+def _draw_map(axes: Axes, grid: GridMap) -> None:
+    """Cells that stop beams, in grey. The map's own axes may be turned against those of the path."""
+    from matplotlib.transforms import Affine2D
+
+    _, x, y, turn = grid.geometry.tolist()
+    width, height = grid.size_m
+    cells = grid.blocked[:: _stride(grid.blocked.shape[0]), :: _stride(grid.blocked.shape[1])]
+    image = axes.imshow(
+        cells, cmap="Greys", vmin=0, vmax=2, extent=(0, width, 0, height), origin="lower", interpolation="nearest"
+    )
+    image.set_zorder(0)
+    placed = Affine2D().rotate(turn).translate(x, y)
+    image.set_transform(placed + axes.transData)
+    corners = placed.transform(np.array([(0, 0), (width, 0), (width, height), (0, height)]))
+    axes.update_datalim(corners)
+
+
+def _stride(cells: int) -> int:
+    """Of a map that is larger than any picture, every n-th cell."""
+    return max(1, cells // _MOST_CELLS)
 
 
 def _mark(axes: Axes, track: Track, colour: str) -> None:
@@ -94,7 +118,7 @@ def _mark(axes: Axes, track: Track, colour: str) -> None:
     if HEADING in track.values:
         angle = np.radians(track.values[HEADING][at])
         axes.quiver(
-            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.004, scale=28, zorder=4
+            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.007, scale=20, zorder=4
         )
     if X in track.std and Y in track.std:
         for i in at:
@@ -137,6 +161,7 @@ def _over_time(
     reference = of(sources.reference) if sources.reference is not None else None
     if reference is not None and sources.reference is not None:
         draw(axes, sources.reference.time_s, reference[0], label=sources.reference.label, **TRUTH)
+    view_values(axes, [value for _, (value, _) in drawn])
     shade_unknown(axes, sources.tracks)
     finish(axes, label)
 

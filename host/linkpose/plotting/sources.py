@@ -11,12 +11,11 @@ from linkpose import filters
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import Score, evaluate
 from linkpose.evaluation.series import interval
+from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
 from linkpose.quantities import Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
-
-REFERENCE = "truth"
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +121,7 @@ def _reference(table: Table, offset_s: float) -> Track:
         part = split(column)
         if part is not None and not part.is_std and part.prefix in ("", "chain"):
             values[part.quantity] = _shown_value(table, column, part.quantity)
-    label = REFERENCE if table.kind == "truth" else "reference"
+    label = REFERENCES[0] if table.kind == "truth" else REFERENCES[1]
     return Track("", label, 0, table.columns["time_s"] - offset_s, values, {})
 
 

@@ -67,7 +67,7 @@ def plot_tables(
     for table in tables:
         table.require("time_s")
     sources = gather([table for table in tables if not is_recording(table)], wanted)
-    sections = [section for section in (_link(sources), _chain(sources), _robot(sources, scene)) if section]
+    sections = [section for section in (_robot(sources, scene), _link(sources), _chain(sources)) if section]
     sections += [section for table in tables if is_recording(table) and (section := _readings(table))]
     if not sections:
         raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
@@ -87,7 +87,9 @@ def _lay_out(part: SubFigure, section: Section) -> None:
     rows = len(section.panels)
     shares = [panel.share for panel in section.panels]
     if section.path is not None:
-        grid = part.add_gridspec(max(rows, 1), 2 if rows else 1, height_ratios=shares or [1.0])
+        grid = part.add_gridspec(
+            max(rows, 1), 2 if rows else 1, height_ratios=shares or [1.0], width_ratios=[1.35, 1.0][: 2 if rows else 1]
+        )
         section.path(part.add_subplot(grid[:, 0]))
     else:
         grid = part.add_gridspec(rows, 1, height_ratios=shares)

@@ -2,24 +2,51 @@
 
 from __future__ import annotations
 
-from linkpose.sensors import bmp180, mpu6050
-from linkpose.sensors.conversion import TIME_DECIMALS, Row
+from typing import NamedTuple
+
+import numpy as np
+
+from linkpose.sensors import bmp180, magnetometer, mpu6050
+from linkpose.sensors.conversion import TIME_DECIMALS
+from linkpose.sensors.measurements import Block
 
 ACCEL = ("accel_x_m_s2", "accel_y_m_s2", "accel_z_m_s2")
 GYRO = ("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
-MAX_MICE = 4
+ACCEL2 = tuple(f"imu2_{name}" for name in ACCEL)
+GYRO2 = tuple(f"imu2_{name}" for name in GYRO)
+MAG = ("mag_x_uT", "mag_y_uT", "mag_z_uT")
+
+
+class Layout(NamedTuple):
+    """Which columns a recording has besides those that every recording has."""
+
+    mouse_ports: int
+    imu2: bool = False
+    mag: bool = False
+
 
 _HEAD = (
-    ("time_s", f".{TIME_DECIMALS}f"),
-    ("seq", ".0f"),
-    *((name, f".{mpu6050.ACCEL_DECIMALS}f") for name in ACCEL),
-    *((name, f".{mpu6050.GYRO_DECIMALS}f") for name in GYRO),
-    ("imu_temp_degC", f".{mpu6050.TEMPERATURE_DECIMALS}f"),
-    ("pressure_Pa", f".{bmp180.PRESSURE_DECIMALS}f"),
-    ("baro_temp_degC", f".{bmp180.TEMPERATURE_DECIMALS}f"),
-    ("baro_fresh", ".0f"),
+    ("time_s", f"%.{TIME_DECIMALS}f"),
+    ("seq", "%.0f"),
+    *((name, f"%.{mpu6050.ACCEL_DECIMALS}f") for name in ACCEL),
+    *((name, f"%.{mpu6050.GYRO_DECIMALS}f") for name in GYRO),
+    ("imu_temp_degC", f"%.{mpu6050.TEMPERATURE_DECIMALS}f"),
+    ("pressure_Pa", f"%.{bmp180.PRESSURE_DECIMALS}f"),
+    ("baro_temp_degC", f"%.{bmp180.TEMPERATURE_DECIMALS}f"),
+    ("baro_fresh", "%.0f"),
 )
-_FORMATS = tuple(code for _, code in _HEAD)
+_IMU2 = (
+    *((name, f"%.{mpu6050.ACCEL_DECIMALS}f") for name in ACCEL2),
+    *((name, f"%.{mpu6050.GYRO_DECIMALS}f") for name in GYRO2),
+    ("imu2_temp_degC", f"%.{mpu6050.TEMPERATURE_DECIMALS}f"),
+)
+_MAG = (*((name, f"%.{magnetometer.MAG_DECIMALS}f") for name in MAG), ("mag_fresh", "%.0f"))
+
+
+def _columns(layout: Layout) -> list[tuple[str, str]]:
+    """Name and format of each column."""
+    mice = [(name, "%.0f") for port in range(1, layout.mouse_ports + 1) for name in mouse_columns(port)]
+    return [*_HEAD, *_IMU2 * layout.imu2, *_MAG * layout.mag, *mice, ("flags", "%.0f")]
 
 
 def mouse_columns(port: int) -> tuple[str, str]:
@@ -27,16 +54,20 @@ def mouse_columns(port: int) -> tuple[str, str]:
     return f"mouse{port}_dx_counts", f"mouse{port}_dy_counts"
 
 
-def names(mouse_ports: int) -> list[str]:
-    """The header of a recording with so many mouse ports."""
-    mice = [name for port in range(1, mouse_ports + 1) for name in mouse_columns(port)]
-    return [name for name, _ in _HEAD] + mice + ["flags"]
+def names(layout: Layout) -> list[str]:
+    """The header of a recording."""
+    return [name for name, _ in _columns(layout)]
 
 
-def text(row: Row) -> str:
-    """The row as a line of CSV. A missing value is an empty field."""
-    head = (row.time_s, row.seq, *row.imu, row.pressure_Pa, row.baro_temp_degC, row.baro_fresh)
-    fields = [format(value, code) if value == value else "" for code, value in zip(_FORMATS, head, strict=True)]
-    fields += [format(value, ".0f") if value == value else "" for value in row.mice]
-    fields.append(str(row.flags))
-    return ",".join(fields)
+def text(block: Block, layout: Layout) -> str:
+    """The block as lines of CSV. A missing value is an empty field."""
+    part = block.measurements
+    mice = part.mice_counts.reshape(len(part), -1)
+    head = [part.time_s, block.seq, part.accel_m_s2, part.gyro_rad_s, part.imu_temp_degC]
+    imu2 = [part.accel2_m_s2, part.gyro2_rad_s, part.imu2_temp_degC] * layout.imu2
+    mag = [part.mag_uT, part.mag_fresh] * layout.mag
+    table = np.column_stack(
+        [*head, part.pressure_Pa, part.baro_temp_degC, part.baro_fresh, *imu2, *mag, mice, part.flags],
+    )
+    line = ",".join(code for _, code in _columns(layout)) + "\n"
+    return ((line * len(table)) % tuple(table.ravel().tolist())).replace("nan", "")

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotWrite, FileError, FileExists
 
 
 def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
@@ -34,10 +34,16 @@ class CsvFile:
     def __init__(self, path: Path, kind: str, metadata: Mapping[str, Any], columns: Sequence[str], force: bool) -> None:
         self.path = path
         self._fd = create(path, force)
+        self._has_name = os.fstat(self._fd).st_nlink > 0  # what is behind /dev/stdout may have none
         self.write(head(kind, metadata, columns))
 
     def write(self, text: str) -> None:
-        """Adds whole lines. They are with the operating system at once: killing this process does not lose them."""
+        """Adds whole lines. They are with the operating system at once: killing this process does not lose them.
+
+        Raises CannotWrite when the file was removed or replaced: what is written then is lost with this process.
+        """
+        if self._has_name and os.fstat(self._fd).st_nlink == 0:
+            raise CannotWrite(self.path, "it was removed while it was being written")
         write_all(self._fd, self.path, text.encode())
 
     def close(self, closing: Mapping[str, Any]) -> None:
@@ -61,16 +67,18 @@ class CsvFile:
 
 def create(path: Path, force: bool) -> int:
     """Opens a new file for writing and gives its descriptor. An existing one is kept unless `force`."""
-    flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if force else os.O_EXCL)
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
         if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
             flags = os.O_WRONLY
+        elif force and path.is_file():
+            path = path.resolve()  # a link stays a link
+            path.unlink()  # a program that still writes the old file notices, and does not write into the new one
         return os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
     except FileExistsError:
-        raise LinkposeError(f"{path} exists already; name another file or add --force to replace it") from None
+        raise FileExists(path) from None
     except OSError as error:
-        reason = error.strerror
-        raise LinkposeError(f"cannot write {path}: {reason}; name a file in a folder you may write to") from error
+        raise CannotWrite(path, error.strerror) from error
 
 
 def write_all(fd: int, path: Path, data: bytes) -> None:
@@ -86,10 +94,11 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
         if written:
             _cut_back(fd, data[:written])
         if error.errno == errno.EPIPE:
-            raise LinkposeError(f"the reader of {path} has gone; nothing more can be written to it") from error
-        raise LinkposeError(
+            raise FileError(path, f"the reader of {path} has gone; nothing more can be written to it") from error
+        raise FileError(
+            path,
             f"cannot write to {path} any more: {error.strerror}; what was written so far is whole, "
-            "make room or name a file on another disk"
+            "make room or name a file on another disk",
         ) from error
 
 

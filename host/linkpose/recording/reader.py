@@ -4,24 +4,39 @@ from __future__ import annotations
 
 import difflib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import FileFormatError
 from linkpose.recording import columns
 from linkpose.recording.table import Table, read_bytes, read_table
 from linkpose.recording.units import suspicions
-from linkpose.sensors import bmp180, mpu6050
-from linkpose.sensors.conversion import GAP_BEFORE, MOUSE_VALID, TIME_DECIMALS, Settings
+from linkpose.sensors import mpu6050
+from linkpose.sensors.conversion import (
+    COUNT_FIELDS,
+    GAP_BEFORE,
+    MAX_MICE,
+    TIME_DECIMALS,
+    BoardSettings,
+    Converter,
+    RawSamples,
+)
+from linkpose.sensors.devices import impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
-from linkpose.wire.messages import Hello, SampleFlags
+from linkpose.wire.frames import OtherProtocol
+from linkpose.wire.messages import PROTOCOL_MAJOR, Hello, SampleFlags
 
+if TYPE_CHECKING:
+    from linkpose.wire.capture import Capture
+
+MOST_CHANGES = 10  # of sensors' states, in the remarks
 _T_WRAP = 1 << 32
 _SEQ_WRAP = 1 << 16
 
@@ -35,7 +50,9 @@ class Recording:
     rig: Rig | None  # the one in force while it was recorded; None of a raw capture
     sample_rate_hz: float
     metadata: dict[str, Any]
-    remarks: list[str]  # what the reader should know: a cut file, corrupt frames
+    remarks: list[str]  # what the reader should know: a cut file, corrupt frames, faulty sensors
+    health: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts by sensor (sensors.health)
+    unusable: str = ""  # why nothing can be estimated from it
 
     @property
     def dlpf(self) -> int | None:
@@ -45,11 +62,43 @@ class Recording:
         return value if isinstance(value, int) and 0 <= value < len(mpu6050.DLPF_DELAY_S) else None
 
 
-def load_recording(path: Path) -> Recording:
-    """Reads a recording. Raises LinkposeError naming the file, the line and the cure for anything that is none."""
-    if path.suffix == ".bin":
-        return _from_capture(path)
-    return _from_csv(path)
+def load_recording(path: str | PathLike[str]) -> Recording:
+    """Reads a recording: a CSV file, or a raw capture (`.bin`).
+
+    Raises FileError, which names the file, the line and the reason, for anything else.
+    """
+    path = Path(path)
+    return _checked(_from_capture(path) if path.suffix == ".bin" else _from_csv(path))
+
+
+def _checked(recording: Recording) -> Recording:
+    """The recording with NaN for readings that are worth nothing, and what is wrong with them."""
+    from linkpose.sensors.health import HealthMonitor
+
+    monitor = HealthMonitor(recording.sample_rate_hz, dict.fromkeys(_sensors_in(recording), "ok"))
+    measurements, changes = monitor.check(recording.measurements)
+    if any("pressure_Pa" in remark for remark in recording.remarks):  # another unit, not a faulty sensor
+        changes = [change for change in changes if change.sensor != "baro"]
+    remarks = [f"{recording.path}: {change}" for change in changes[:MOST_CHANGES]]
+    if len(changes) > MOST_CHANGES:
+        remarks.append(f"{recording.path}: {len(changes) - MOST_CHANGES} more such changes")
+    return replace(
+        recording,
+        measurements=measurements,
+        remarks=[*recording.remarks, *remarks],
+        health=monitor.as_dict(),
+        unusable="" if monitor.is_usable else monitor.why_unusable,
+    )
+
+
+def _sensors_in(recording: Recording) -> list[str]:
+    """Sensors that the metadata lists, and those that gave a value."""
+    listed, block = recording.metadata.get("sensors"), recording.measurements
+    names = listed if isinstance(listed, list) else []
+    sensors = ["imu"] if "mpu6050" in names or np.isfinite(block.accel_m_s2).any() else []
+    sensors += ["baro"] if "bmp180" in names or np.isfinite(block.pressure_Pa).any() else []
+    counted = np.isfinite(block.mice_counts).any(axis=(0, 2))
+    return sensors + [f"mouse{port + 1}" for port in np.flatnonzero(counted).tolist()]
 
 
 # ---- CSV ----
@@ -58,10 +107,11 @@ def load_recording(path: Path) -> Recording:
 def _from_csv(path: Path) -> Recording:
     table = read_table(path, "recording")
     mouse_ports = _check_columns(table)
+    _check_time(table)
     has_imu = all(name in table.columns for name in columns.ACCEL + columns.GYRO)
     if not (has_imu or mouse_ports):
         missing = [name for name in columns.ACCEL + columns.GYRO if name not in table.columns]
-        raise LinkposeError(f"{path} has no column {', '.join(missing)}, and no mice: nothing to estimate from")
+        raise FileFormatError(path, f"{path} has no column {', '.join(missing)}, and no mice: nothing to estimate from")
     measurements = Measurements(
         table.columns["time_s"],
         _vectors(table, columns.ACCEL),
@@ -72,26 +122,55 @@ def _from_csv(path: Path) -> Recording:
         _fresh(table),
         _mice(table, mouse_ports),
         _flags(table),
+        **_other_sensors(table),
     )
-    remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
-    remarks += suspicions(path, measurements)
+    remarks = [*table.remarks, *_origin(table)]
+    remarks += suspicions(path, measurements, _stated_rate(table))
     rig = Rig.from_dict(_metadata_object(table, "rig"), f"{path}, line 2") if "rig" in table.metadata else None
     return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
 
 
+def _origin(table: Table) -> list[str]:
+    """A remark on a recording without metadata or closing line."""
+    if not table.kind:
+        return [
+            f"{table.path} has no metadata: another program has written or saved it; "
+            "its rate is taken from time_s, and it contains no rig"
+        ]
+    if not table.closing:
+        return [f"{table.path} has no closing line: it was cut; its {len(table)} whole rows are used"]
+    return []
+
+
 def _check_columns(table: Table) -> int:
-    """Number of mouse ports; raises LinkposeError for a column that no recording has, or without time_s."""
+    """Number of mouse ports; raises FileFormatError for a column that no recording has, or without time_s."""
     table.require("time_s")
-    known = columns.names(columns.MAX_MICE)
+    known = columns.names(columns.Layout(MAX_MICE, imu2=True, mag=True))
     for name in table.columns:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)
             hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
-            raise LinkposeError(f"{table.path}: unknown column {name}; {hint}")
-    ports = [p for p in range(1, columns.MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
+            raise FileFormatError(table.path, f"{table.path}: unknown column {name}; {hint}")
+    ports = [p for p in range(1, MAX_MICE + 1) if columns.mouse_columns(p)[0] in table.columns]
     for port in ports:
         table.require(*columns.mouse_columns(port))
     return max(ports, default=0)
+
+
+def _other_sensors(table: Table) -> dict[str, Any]:
+    """The measurements of a second inertial sensor and a magnetometer, where the file has their columns."""
+    fields: dict[str, Any] = {}
+    if columns.GYRO2[0] in table.columns:
+        table.require(*columns.ACCEL2, *columns.GYRO2)
+        fields |= {"accel2_m_s2": _vectors(table, columns.ACCEL2), "gyro2_rad_s": _vectors(table, columns.GYRO2)}
+        fields["imu2_temp_degC"] = _column(table, "imu2_temp_degC")
+    if columns.MAG[0] in table.columns:
+        table.require(*columns.MAG)
+        field = fields["mag_uT"] = _vectors(table, columns.MAG)
+        changes = (np.diff(field, axis=0, prepend=np.full((1, 3), np.nan)) != 0).any(axis=1)
+        fresh = table.columns["mag_fresh"] == 1 if "mag_fresh" in table.columns else changes
+        fields["mag_fresh"] = np.asarray(fresh & np.isfinite(field).all(axis=1))
+    return fields
 
 
 def _column(table: Table, name: str) -> Floats:
@@ -105,7 +184,14 @@ def _vectors(table: Table, names: tuple[str, ...]) -> Floats:
 def _fresh(table: Table) -> NDArray[np.bool_]:
     """As the file says, or where the pressure changes in a file that does not say."""
     if "baro_fresh" in table.columns:
-        return np.asarray(table.columns["baro_fresh"] == 1)
+        fresh = table.columns["baro_fresh"]
+        wrong = np.flatnonzero(~np.isin(fresh, (0, 1)) & ~np.isnan(fresh))
+        if len(wrong):
+            line = table.first_line + int(wrong[0])
+            raise FileFormatError(
+                table.path, f"{table.path}, line {line}: baro_fresh is {fresh[wrong[0]]:g}; it must be 0 or 1", line
+            )
+        return np.asarray(fresh == 1)
     pressure = _column(table, "pressure_Pa")
     return np.asarray(np.isfinite(pressure) & (np.diff(pressure, prepend=np.nan) != 0))
 
@@ -115,38 +201,56 @@ def _mice(table: Table, ports: int) -> Floats:
     return np.stack(pairs, axis=1) if pairs else np.empty((len(table), 0, 2))
 
 
-def _flags(table: Table) -> NDArray[np.uint16]:
+def _flags(table: Table) -> NDArray[np.uint32]:
     """As the file says; where it does not, what is there is valid."""
     if "flags" not in table.columns:
         imu = np.isfinite(_vectors(table, columns.ACCEL + columns.GYRO)).all(axis=1)
-        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint16)
+        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint32)
     flags = table.columns["flags"]
-    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFF)))
+    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFFFFFF)))
     if len(wrong):
-        raise LinkposeError(
-            f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 65535"
+        raise FileFormatError(
+            table.path,
+            f"{table.path}, line {table.first_line + int(wrong[0])}: flags must be a number from 0 to 4294967295",
         )
-    return flags.astype(np.uint16)
+    return flags.astype(np.uint32)
 
 
 def _metadata_object(table: Table, name: str) -> dict[str, Any]:
-    """This part of the metadata, empty where there is none; raises LinkposeError where it is no object."""
+    """This part of the metadata, empty where there is none; raises FileFormatError where it is no object."""
     part = table.metadata.get(name, {})
     if not isinstance(part, dict):
-        raise LinkposeError(
-            f"{table.path}, line 2: {name} is {json.dumps(part)[:40]}; it must be a JSON object, or be left out"
+        raise FileFormatError(
+            table.path,
+            f"{table.path}, line 2: {name} is {json.dumps(part)[:40]}; it must be a JSON object, or be left out",
         )
     return part
 
 
-def _rate(table: Table) -> float:
-    """The sample rate that the metadata tells, or else the usual interval's."""
+def _stated_rate(table: Table) -> float | None:
+    """The sample rate in the metadata, Hz."""
     rate = _metadata_object(table, "settings").get("sample_rate_hz")
-    if isinstance(rate, int | float) and rate > 0:
-        return float(rate)
+    return float(rate) if isinstance(rate, int | float) and rate > 0 else None
+
+
+def _rate(table: Table) -> float:
+    """The sample rate in the metadata, or else of the usual interval."""
     intervals = np.diff(table.columns["time_s"])
     usual = float(np.median(intervals[intervals > 0])) if np.any(intervals > 0) else 0.01
-    return 1.0 / usual
+    return _stated_rate(table) or 1.0 / usual
+
+
+def _check_time(table: Table) -> None:
+    """Raises FileFormatError when a time is not finite, or all are the same."""
+    time_s = table.columns["time_s"]
+    wrong = np.flatnonzero(~np.isfinite(time_s))
+    if len(wrong):
+        line = table.first_line + int(wrong[0])
+        raise FileFormatError(
+            table.path, f"{table.path}, line {line}: time_s is {time_s[wrong[0]]}; it must be a number of seconds", line
+        )
+    if len(time_s) > 1 and np.all(time_s == time_s[0]):
+        raise FileFormatError(table.path, f"{table.path}: time_s is {time_s[0]:g} in all rows; it must increase")
 
 
 # ---- raw capture ----
@@ -157,17 +261,28 @@ def _from_capture(path: Path) -> Recording:
 
     capture = decode_capture(read_bytes(path))
     hellos = [(before, message) for before, message in capture.others if isinstance(message, Hello)]
+    other = next((message for _, message in capture.others if isinstance(message, OtherProtocol)), None)
+    if not hellos and other is not None:
+        raise FileFormatError(
+            path,
+            f"{path} was captured with protocol {other.protocol_major}.{other.protocol_minor}, and this linkpose reads "
+            f"protocol {PROTOCOL_MAJOR}: read it with the linkpose that captured it, or use the CSV recording",
+        )
     if not hellos:
-        raise LinkposeError(f"{path} holds no HELLO of a board; it is no raw capture of `linkpose record --raw`")
+        raise FileFormatError(path, f"{path} holds no HELLO of a board; it is not a raw capture")
     if not len(capture.samples):
-        raise LinkposeError(f"{path} holds no sample; the board was never started")
+        raise FileFormatError(path, f"{path} holds no sample; the board was never started")
+    for _, hello in hellos:
+        if wrong := impossible(hello):
+            raise FileFormatError(path, f"{path}: its HELLO says {wrong}, which is impossible; the capture is damaged")
     first = [hello for before, hello in hellos if before == 0]
-    settings = Settings.of(first[-1] if first else hellos[0][1])
+    settings = BoardSettings.of(first[-1] if first else hellos[0][1])
     raw = capture.samples
     restarts = sorted({before for before, hello in hellos if 0 < before < len(raw) and not hello.streaming})
     time_s, gap_before, gaps = _times(raw, restarts, settings.sample_rate_hz)
     flags = (raw["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
-    measurements = _measurements(raw, capture.mouse_count, time_s, flags, settings)
+    counts = _raw_samples(capture)
+    measurements = Converter(settings, counts.mice.shape[1]).convert(counts, time_s, flags)
     remarks = [f"{path}: times are the board's own, for a raw capture holds no other clock"]
     if capture.corrupt.total:
         remarks.append(f"{path}: {capture.corrupt.total} corrupt frames left out")
@@ -197,50 +312,13 @@ def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[
     return time_s, np.where(marked, GAP_BEFORE, 0), gaps
 
 
-def _measurements(
-    raw: NDArray[np.void], mouse_count: NDArray[np.uint8], time_s: Floats, flags: NDArray[np.int64], settings: Settings
-) -> Measurements:
-    """The same values, to the last bit, as `Converter` gives one by one."""
-    valid = (flags & int(SampleFlags.IMU_VALID) != 0)[:, None]
-    accel = np.column_stack([raw[name] for name in ("accel_x", "accel_y", "accel_z")]).astype(np.float64)
-    gyro = np.column_stack([raw[name] for name in ("gyro_x", "gyro_y", "gyro_z")]).astype(np.float64)
-    accel = np.round(accel * mpu6050.accel_scale(settings.accel_range_g), mpu6050.ACCEL_DECIMALS)
-    gyro = np.round(gyro * mpu6050.gyro_scale(settings.gyro_range_deg_s), mpu6050.GYRO_DECIMALS)
-    temp = np.round(mpu6050.temperature(raw["imu_temp"].astype(np.float64)), mpu6050.TEMPERATURE_DECIMALS)
-    pressure, baro_temp, fresh = _baro(raw, flags, settings)
-    ports = int(mouse_count.max(initial=0))
-    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports].astype(np.float64)
-    mouse_valid = (flags[:, None] & np.array(MOUSE_VALID)[:ports] != 0) & (np.arange(ports) < mouse_count[:, None])
-    return Measurements(
-        time_s,
-        np.where(valid, accel, np.nan),
-        np.where(valid, gyro, np.nan),
-        np.where(valid[:, 0], temp, np.nan),
-        pressure,
-        baro_temp,
-        fresh,
-        np.where(mouse_valid[:, :, None], mice, np.nan),
-        flags.astype(np.uint16),
-    )
-
-
-def _baro(
-    raw: NDArray[np.void], flags: NDArray[np.int64], settings: Settings
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Pressure and temperature, each reading repeated until the next; where a new one came."""
-    valid = flags & int(SampleFlags.BARO_VALID) != 0
-    if not bmp180.is_sound(settings.bmp180):
-        nothing = np.full(len(raw), np.nan)
-        return nothing, nothing, np.zeros(len(raw), np.bool_)
-    count = raw["baro_count"].astype(np.int64)
-    again = np.concatenate([[True], ~valid[:-1]])  # the first reading, or the first after the sensor was away
-    fresh = valid & (again | (np.diff(count, prepend=-1) != 0))
-    ut, up = raw["baro_ut"].astype(np.int64), raw["baro_up"].astype(np.int64)
-    with np.errstate(divide="ignore"):
-        temp, pressure = bmp180.compensate(ut, up, settings.bmp180, settings.baro_oversampling)
-    latest = np.maximum.accumulate(np.where(fresh, np.arange(len(raw)), 0))
-    return (
-        np.where(valid, pressure[latest].astype(np.float64), np.nan),
-        np.where(valid, temp[latest] / 10, np.nan),
-        fresh,
+def _raw_samples(capture: Capture) -> RawSamples:
+    """The capture's samples, with the mouse ports that any of them carries."""
+    raw = capture.samples
+    ports = int(capture.mouse_count.max(initial=0))
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports]
+    return RawSamples(
+        np.stack([raw[name].astype(np.int64) for name in COUNT_FIELDS], axis=1),
+        mice.astype(np.int64),
+        capture.mouse_count.astype(np.int64),
     )

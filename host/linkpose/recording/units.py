@@ -1,4 +1,4 @@
-"""Remarks on values that look like another unit than the column's name says."""
+"""Remarks on values that contradict the unit in their column's name, or each other."""
 
 from __future__ import annotations
 
@@ -11,22 +11,80 @@ from linkpose.sensors.measurements import Floats, Measurements
 
 _GRAVITY_M_S2 = 9.8
 _AIR_PA = 1e5
-_ACCEL_UNITS = (("g", "9.80665"), ("thousandths of g", "0.00980665"))
+_ACCEL_UNITS = (("g", "9.80665"), ("thousandths of g", "0.00980665"), ("mm/s²", "0.001"))
+_GRAVITY_TOLERANCE = 0.2  # the MPU-6050's offset and scale error at the worst: 0.08 g, 3 % (data sheet)
+_STILL_RAD_S = 0.3
+_FEWEST_STILL = 50  # samples
+_MMHG = (600.0, 800.0)  # at sea level; as hPa, an altitude of 2 to 4 km
+_BLOCK_S = 0.1  # averages out noise and vibration
+_FEWEST_BLOCKS = 20
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _LONGEST_STEP_S = 0.5
 
 
-def suspicions(path: Path, measurements: Measurements) -> list[str]:
-    """What the values of a recording look like, and the cure; nothing where they can be in SI units."""
+def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = None) -> list[str]:
+    """What the values of a recording look like, and the cure; nothing where they can be in SI units.
+
+    `rate_hz` is the sample rate in the file's metadata, if it has one.
+    """
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
+    unit = _of_usual_size("accel_*", _median(force_m_s2), _GRAVITY_M_S2, _ACCEL_UNITS)
     found = [
-        _of_usual_size("accel_*", _median(force_m_s2), _GRAVITY_M_S2, _ACCEL_UNITS),
-        _rate(measurements.gyro_rad_s),
-        _time(_median(np.diff(measurements.time_s))),
-        _of_usual_size("pressure_Pa", _median(measurements.pressure_Pa), _AIR_PA, _PRESSURE_UNITS),
+        unit or _gravity(force_m_s2, measurements.gyro_rad_s),
+        _rate(measurements.gyro_rad_s) or _turning(measurements),
+        _time(_median(np.diff(measurements.time_s)), rate_hz),
+        _pressure(_median(measurements.pressure_Pa)),
     ]
     return [f"{path}: {suspicion}" for suspicion in found if suspicion]
+
+
+def _gravity(force_m_s2: Floats, gyro_rad_s: Floats) -> str:
+    """The specific force at rest is gravity's. Twice or half of it: another range was in force than is assumed."""
+    still = (np.linalg.norm(gyro_rad_s, axis=1) < _STILL_RAD_S) & np.isfinite(force_m_s2)
+    if np.count_nonzero(still) < _FEWEST_STILL:
+        return ""
+    force = float(np.median(force_m_s2[still]))
+    if abs(force / _GRAVITY_M_S2 - 1) < _GRAVITY_TOLERANCE:
+        return ""
+    return (
+        f"accel_* is {force:.3g} m/s² while the sensor is still, and gravity is {_GRAVITY_M_S2:g}: check the range "
+        "(accel_range_g) and the unit, or the sensor is faulty"
+    )
+
+
+def _turning(measurements: Measurements) -> str:
+    """Gravity turns in the sensor's axes as the gyro measures, da/dt = −ω × a: the ratio is the gyro's unit."""
+    steps = np.diff(measurements.time_s)
+    step_s = _median(steps[steps > 0])
+    size = max(1, round(_BLOCK_S / step_s)) if np.isfinite(step_s) else 1
+    blocks = len(measurements) // size
+    if blocks < _FEWEST_BLOCKS or step_s * size > 2 * _BLOCK_S:
+        return ""
+    accel, gyro = (
+        values[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+        for values in (measurements.accel_m_s2, measurements.gyro_rad_s)
+    )
+    change = np.diff(accel, axis=0)
+    expected = -np.cross(gyro[1:] + gyro[:-1], accel[1:] + accel[:-1]) / 4 * size * step_s
+    known = np.isfinite(change).all(axis=1) & np.isfinite(expected).all(axis=1)
+    both = float(np.sum(change[known] * expected[known]))
+    size_change, size_expected = (float(np.sum(values[known] ** 2)) for values in (change, expected))
+    if size_expected == 0 or both < 0.5 * np.sqrt(size_change * size_expected):
+        return ""
+    ratio = both / size_expected / (np.pi / 180)
+    if not 2 / 3 < ratio < 1.5:
+        return ""
+    return f"gyro_* turns gravity {180 / np.pi:.0f} times too far: is it in °/s? multiply it by {np.pi / 180:.7f}"
+
+
+def _pressure(median_pa: float) -> str:
+    if _MMHG[0] < median_pa < _MMHG[1]:
+        return (
+            f"pressure_Pa is {median_pa:.4g} (median): is it in mmHg? multiply it by 133.322. If it is in hPa, at 2 to "
+            "4 km of altitude, multiply it by 100"
+        )
+    return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS)
 
 
 def _median(values: Floats) -> float:
@@ -44,11 +102,18 @@ def _rate(gyro_rad_s: Floats) -> str:
     )
 
 
-def _time(median_step_s: float) -> str:
-    if not median_step_s > _LONGEST_STEP_S:
-        return ""
-    unit, factor = ("milliseconds", 1000) if median_step_s < 1000 * _LONGEST_STEP_S else ("microseconds", 1_000_000)
-    return f"time_s goes in steps of {median_step_s:g} s (median): is it in {unit}? divide it by {factor}"
+def _time(median_step_s: float, rate_hz: float | None) -> str:
+    steps = f"time_s goes in steps of {median_step_s:g} s (median)"
+    if median_step_s > _LONGEST_STEP_S:
+        unit, factor = ("milliseconds", 1000) if median_step_s < 1000 * _LONGEST_STEP_S else ("microseconds", 1_000_000)
+        if rate_hz is None or 0.5 < median_step_s * rate_hz / factor < 2.0:
+            return f"{steps}: is it in {unit}? divide it by {factor}"
+    if rate_hz and median_step_s > 0 and not 0.5 < median_step_s * rate_hz < 2.0:
+        return (
+            f"{steps}, and the file's rate is {rate_hz:g} Hz: multiply time_s by {1 / (median_step_s * rate_hz):.3g}, "
+            "or correct sample_rate_hz in line 2"
+        )
+    return ""
 
 
 def _of_usual_size(name: str, median: float, usual: float, units: Sequence[tuple[str, str]]) -> str:

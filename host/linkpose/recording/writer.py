@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,15 @@ from linkpose import __version__
 from linkpose.recording import columns
 from linkpose.recording.csvfile import CsvFile
 from linkpose.sensors import devices
-from linkpose.sensors.conversion import Converter, Row, Settings
+from linkpose.sensors.conversion import BoardSettings, Converter
+from linkpose.sensors.measurements import Block
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.wire.frames import Corrupt
 from linkpose.wire.messages import Hello, Sample
 
 
-def metadata(hello: Hello, settings: Settings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
+def metadata(hello: Hello, settings: BoardSettings, device: str, rig: Rig, clock: dict[str, Any]) -> dict[str, Any]:
     """The second line of a recording, from which everything in it can be understood."""
     return {
         "software": f"linkpose {__version__}",
@@ -38,7 +40,7 @@ def metadata(hello: Hello, settings: Settings, device: str, rig: Rig, clock: dic
         },
         "sensors": devices.names(hello),
         "devices": [device._asdict() for device in hello.devices],
-        "bmp180": settings.bmp180._asdict(),
+        "barometer": settings.barometer._asdict(),
         "mice": [mouse._asdict() for mouse in hello.mice],
         "clock": clock,
         "rig": rig.as_dict(),
@@ -61,29 +63,40 @@ def closing(timeline: Timeline, corrupt: Corrupt, drift_ppm: float | None, **mor
     }
 
 
+def layout_of(settings: BoardSettings, mouse_ports: int = 0) -> columns.Layout:
+    """Columns of a recording of this board, with room for `mouse_ports` mice or for those found if they are more."""
+    return columns.Layout(max(settings.mouse_ports, mouse_ports), settings.has_imu2, settings.has_mag)
+
+
+_BATCH = 4096  # samples converted at once; bounds the memory
 MOST_GAPS = 1000  # listed in the closing line; the rows mark every one
 
 
 class RecordingWriter(CsvFile):
     """A recording under way. Raises LinkposeError as `CsvFile` does."""
 
-    def __init__(self, path: Path, head: dict[str, Any], mouse_ports: int, force: bool) -> None:
-        super().__init__(path, "recording", head, columns.names(mouse_ports), force)
+    def __init__(self, path: Path, head: dict[str, Any], layout: columns.Layout, force: bool) -> None:
+        super().__init__(path, "recording", head, columns.names(layout), force)
+        self._layout = layout
 
-    def write_rows(self, rows: Iterable[Row]) -> None:
+    def write_block(self, block: Block) -> None:
         """Adds samples."""
-        self.write("".join(columns.text(row) + "\n" for row in rows))
+        self.write(columns.text(block, self._layout))
 
 
 def write_recording(
     path: Path, hello: Hello, samples: Iterable[Sample], device: str, rig: Rig, force: bool
 ) -> Timeline:
     """Writes samples that are all there already, in the board's own time; their timeline."""
-    settings = Settings.of(hello)
+    settings = BoardSettings.of(hello)
     converter, timeline, clock = Converter(settings), Timeline(settings.sample_rate_hz), BoardClock()
     head = metadata(hello, settings, device, rig, {"source": "board", "drift_ppm": None})
-    with RecordingWriter(path, head, settings.mouse_ports, force) as writer:
-        places = ((sample, timeline.place(sample, clock, 0.0)) for sample in samples)
-        writer.write_rows(converter.row(sample, *place) for sample, place in places if place is not None)
+    remaining = iter(samples)
+    with RecordingWriter(path, head, layout_of(settings), force) as writer:
+        while batch := list(itertools.islice(remaining, _BATCH)):
+            places = ((sample, timeline.place(sample, clock, 0.0)) for sample in batch)
+            placed = [(sample, place) for sample, place in places if place is not None]
+            if placed:
+                writer.write_block(converter.convert_placed(*zip(*placed, strict=True)))
         writer.close(closing(timeline, Corrupt(), None))
     return timeline

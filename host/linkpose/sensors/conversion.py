@@ -1,128 +1,226 @@
-"""From a SAMPLE's raw counts to a row of a recording in SI units, one sample at a time.
+"""Raw counts of SAMPLE messages to SI units, in blocks of any length: the one conversion for live, CSV and raw replay.
 
-Every value is rounded to the decimals that a recording keeps. What the filters see live is therefore exactly what they
-see when the recording is replayed.
+Every value is rounded to the decimals that a recording stores. The filters therefore receive the same values live and
+in a replay of the recording, to the last bit.
 """
 
 from __future__ import annotations
 
-import math
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from linkpose.sensors import bmp180, mpu6050
-from linkpose.wire.messages import DeviceState, Hello, Sample, SampleFlags
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors import magnetometer, mpu6050
+from linkpose.sensors.barometer import Barometer
+from linkpose.sensors.bmp180 import PRESSURE_DECIMALS, TEMPERATURE_DECIMALS
+from linkpose.sensors.measurements import Block, Floats, Measurements
+from linkpose.wire.messages import DeviceFamily, DeviceState, Hello, Sample, SampleFlags
+
+Integers = NDArray[np.int64]
 
 TIME_DECIMALS = 6
 
 IMU_VALID = int(SampleFlags.IMU_VALID)
 BARO_VALID = int(SampleFlags.BARO_VALID)
-MOUSE_VALID = tuple(int(SampleFlags[f"MOUSE{port}_VALID"]) for port in (1, 2, 3, 4))
+IMU2_VALID = int(SampleFlags.IMU2_VALID)
+MAG_VALID = int(SampleFlags.MAG_VALID)
+MOUSE_VALID = tuple(int(flag) for flag in SampleFlags if re.fullmatch(r"MOUSE\d_VALID", flag.name or ""))
 GAP_BEFORE = int(SampleFlags.GAP_BEFORE)
+MAX_MICE = len(MOUSE_VALID)  # mouse ports of the protocol
 
-# Steps in one unit of what is kept. Rounded so, in floating point, a value is the same here and in NumPy: some lie
-# half-way between two decimals, and round(value, decimals) decides those by the exact value.
-_ACCEL_STEPS = 10.0**mpu6050.ACCEL_DECIMALS
-_GYRO_STEPS = 10.0**mpu6050.GYRO_DECIMALS
-_TEMPERATURE_STEPS = 10.0**mpu6050.TEMPERATURE_DECIMALS
+COUNT_FIELDS = tuple(name for name in Sample._fields if name != "mice")  # columns of RawSamples.counts
+_IMU = slice(
+    COUNT_FIELDS.index("accel_x"), COUNT_FIELDS.index("gyro_z") + 1
+)  # accel x, y, z, temperature, gyro x, y, z
+_IMU2 = slice(COUNT_FIELDS.index("accel2_x"), COUNT_FIELDS.index("gyro2_z") + 1)
+_MAG = slice(COUNT_FIELDS.index("mag_x"), COUNT_FIELDS.index("mag_z") + 1)
+_MAG_COUNT = COUNT_FIELDS.index("mag_count")
+_BARO = [COUNT_FIELDS.index(name) for name in ("baro_ut", "baro_up", "baro_count")]
 
-_NO_IMU = (math.nan,) * 7
-_NO_MOVEMENT = (math.nan,) * 2
+# Rounding steps in one unit of each IMU column. `rint(value * steps) / steps` gives the same bits for any block length.
+_IMU_STEPS = 10.0 ** np.array(
+    [mpu6050.ACCEL_DECIMALS] * 3 + [mpu6050.TEMPERATURE_DECIMALS] + [mpu6050.GYRO_DECIMALS] * 3, dtype=np.float64
+)
+_MAG_STEPS = 10.0**magnetometer.MAG_DECIMALS
+_MOUSE_BITS = np.array(MOUSE_VALID, dtype=np.int64)
+_PORTS = np.arange(MAX_MICE)
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """What is needed to read the raw counts: the settings in force and the barometer's words."""
+class BoardSettings:
+    """The settings in force on a board that raw counts depend on, and the calibration words of its barometer."""
 
     sample_rate_hz: int
     accel_range_g: int
     gyro_range_deg_s: int
     dlpf: int
     baro_oversampling: int
-    bmp180: bmp180.Calibration
+    barometer: Barometer
     mouse_ports: int  # up to the last at which a mouse was found
+    imu_families: tuple[int, int] = (DeviceFamily.MPU6050, DeviceFamily.NONE)  # of the sensors at 0x68 and 0x69
+    mag_family: int = DeviceFamily.NONE
+
+    @property
+    def has_imu2(self) -> bool:
+        """Whether the board has, or had, a second inertial sensor."""
+        return self.imu_families[1] != DeviceFamily.NONE
+
+    @property
+    def has_mag(self) -> bool:
+        """Whether the board has, or had, a magnetometer."""
+        return self.mag_family != DeviceFamily.NONE
 
     @staticmethod
-    def of(hello: Hello) -> Settings:
+    def of(hello: Hello) -> BoardSettings:
         """The settings that a HELLO announces."""
-        words = bmp180.Calibration.of(hello.baro_words)
+        imu, imu2, _, mag = hello.devices
         found = [port for port, mouse in enumerate(hello.mice, 1) if mouse.state != DeviceState.ABSENT]
-        return Settings(
+        return BoardSettings(
             hello.sample_rate_hz,
             hello.accel_range_g,
             hello.gyro_range_deg_s,
             hello.dlpf,
             hello.baro_oversampling,
-            words,
+            Barometer.of(hello),
             max(found, default=0),
+            (imu.family or DeviceFamily.MPU6050, imu2.family),
+            mag.family,
         )
 
 
-class Row(NamedTuple):
-    """One sample in SI units, in the sensors' own axes; NaN is a missing value."""
+class Placed(NamedTuple):
+    """A sample's place: seconds since the first, ticks since START, and its flags with `gap_before`."""
 
     time_s: float
     seq: int
-    imu: tuple[float, ...]  # accel x, y, z (m/s²), gyro x, y, z (rad/s), temperature (degC)
-    pressure_Pa: float
-    baro_temp_degC: float
-    baro_fresh: int
-    mice: tuple[float, ...]  # dx, dy (counts) of each port in turn
     flags: int
 
 
+class RawSamples(NamedTuple):
+    """N samples as raw counts."""
+
+    counts: Integers  # (N, len(COUNT_FIELDS)) the fields of SAMPLE in their order
+    mice: Integers  # (N, M, 2) dx, dy of the ports that a sample carries; 0 where it carries none
+    mouse_count: Integers  # (N,) ports that each sample carries
+
+    @staticmethod
+    def of(samples: Sequence[Sample], mouse_ports: int) -> RawSamples:
+        """The counts of decoded samples, with room for `mouse_ports` ports."""
+        room = 2 * mouse_ports
+        mice = [(*sample.mice[:room], *(0,) * (room - len(sample.mice))) for sample in samples]
+        return RawSamples(
+            np.array([sample[: len(COUNT_FIELDS)] for sample in samples], np.int64).reshape(-1, len(COUNT_FIELDS)),
+            np.array(mice, dtype=np.int64).reshape(len(samples), mouse_ports, 2),
+            np.array([len(sample.mice) // 2 for sample in samples], dtype=np.int64),
+        )
+
+
 class Converter:
-    """Reads samples of one board with one set of settings; remembers the last pressure."""
+    """Converts consecutive blocks of raw samples of one board; the last pressure carries over from block to block."""
 
-    def __init__(self, settings: Settings, mouse_ports: int | None = None) -> None:
-        """`mouse_ports` gives the rows more room than for the mice that were found."""
+    def __init__(self, settings: BoardSettings, mouse_ports: int | None = None) -> None:
+        """`mouse_ports`: ports in the result, if these are not those that the board found."""
         self.settings = settings
-        self._mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
-        self._accel = mpu6050.accel_scale(settings.accel_range_g)
-        self._gyro = mpu6050.gyro_scale(settings.gyro_range_deg_s)
-        self._has_baro = bmp180.is_sound(settings.bmp180)
-        self._baro_count: int | None = None
-        self._baro = (math.nan, math.nan)
+        self.mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
+        accel, gyro = mpu6050.accel_scale(settings.accel_range_g), mpu6050.gyro_scale(settings.gyro_range_deg_s)
+        self._imu_scales = []
+        for family in settings.imu_families:
+            temperature, at_zero = mpu6050.temperature_scale(family)
+            scale, offset = [accel] * 3 + [temperature] + [gyro] * 3, [0.0] * 3 + [at_zero] + [0.0] * 3
+            self._imu_scales.append((np.array(scale), np.array(offset)))
+        self._mag_scale = magnetometer.scale(settings.mag_family)
+        self._mag_count: int | None = None  # of the last sample; None where it had no valid reading
+        self._has_baro = settings.barometer.is_sound
+        self._baro_count: int | None = None  # of the last sample; None where that had no valid reading
+        self._baro = np.full((1, 2), np.nan)  # last pressure (Pa) and temperature (degC)
 
-    def row(self, sample: Sample, time_s: float, seq: int, flags: int) -> Row:
-        """The sample taken at `time_s` (s since the start); `seq` and `flags` as the recording shows them."""
-        imu = _NO_IMU
-        if flags & IMU_VALID:
-            accel, gyro = self._accel, self._gyro
-            imu = (
-                round(sample.accel_x * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
-                round(sample.accel_y * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
-                round(sample.accel_z * accel * _ACCEL_STEPS) / _ACCEL_STEPS,
-                round(sample.gyro_x * gyro * _GYRO_STEPS) / _GYRO_STEPS,
-                round(sample.gyro_y * gyro * _GYRO_STEPS) / _GYRO_STEPS,
-                round(sample.gyro_z * gyro * _GYRO_STEPS) / _GYRO_STEPS,
-                round(mpu6050.temperature(sample.imu_temp) * _TEMPERATURE_STEPS) / _TEMPERATURE_STEPS,
-            )
-        fresh = self._read_baro(sample, flags)
-        mice = self._mice(sample, flags) if self._mouse_ports else ()
-        return Row(round(time_s, TIME_DECIMALS), seq, imu, *self._baro, fresh, mice, flags)
+    def convert(self, raw: RawSamples, time_s: Floats, flags: Integers) -> Measurements:
+        """The samples at `time_s` (N,), s since the start, in SI units; `flags` (N,) as a recording stores them."""
+        imu = self._convert_imu(0, raw.counts[:, _IMU], flags & IMU_VALID == 0)
+        others: dict[str, Any] = {}
+        if self.settings.has_imu2:
+            imu2 = self._convert_imu(1, raw.counts[:, _IMU2], flags & IMU2_VALID == 0)
+            others |= {
+                "accel2_m_s2": np.ascontiguousarray(imu2[:, :3]),
+                "gyro2_rad_s": np.ascontiguousarray(imu2[:, 4:]),
+            }
+            others["imu2_temp_degC"] = np.ascontiguousarray(imu2[:, 3])
+        if self.settings.has_mag:
+            others |= self._convert_mag(raw.counts, flags)
+        baro, fresh = self._convert_baro(raw.counts[:, _BARO], flags)
+        return Measurements(
+            np.round(time_s, TIME_DECIMALS),
+            np.ascontiguousarray(imu[:, :3]),
+            np.ascontiguousarray(imu[:, 4:]),
+            np.ascontiguousarray(imu[:, 3]),
+            np.ascontiguousarray(baro[:, 0]),
+            np.ascontiguousarray(baro[:, 1]),
+            fresh,
+            self._convert_mice(raw, flags),
+            flags.astype(np.uint32),
+            **others,
+        )
 
-    def _read_baro(self, sample: Sample, flags: int) -> int:
-        """Takes over a new reading; 1 when there is one."""
-        if not (flags & BARO_VALID and self._has_baro):
-            self._baro, self._baro_count = (math.nan, math.nan), None
-            return 0
-        if sample.baro_count == self._baro_count:
-            return 0
-        self._baro_count = sample.baro_count
-        try:
-            temperature, pressure = bmp180.compensate(
-                sample.baro_ut, sample.baro_up, self.settings.bmp180, self.settings.baro_oversampling
-            )
-        except ZeroDivisionError:  # no BMP180 reads so: the sensor or its wiring is ill
-            self._baro = (math.nan, math.nan)
-            return 0
-        self._baro = (float(pressure), temperature / 10)
-        return 1
+    def convert_placed(self, samples: Sequence[Sample], places: Sequence[Placed]) -> Block:
+        """Decoded samples with the places that a timeline assigned to them, in SI units. There may be none."""
+        time_s, seq, flags = zip(*places, strict=True) if places else ((), (), ())
+        raw = RawSamples.of(samples, self.mouse_ports)
+        measurements = self.convert(raw, np.array(time_s, dtype=np.float64), np.array(flags, dtype=np.int64))
+        return Block(np.array(seq, dtype=np.int64), measurements)
 
-    def _mice(self, sample: Sample, flags: int) -> tuple[float, ...]:
-        values: list[float] = []
-        for port in range(self._mouse_ports):
-            moved = sample.mice[2 * port : 2 * port + 2]
-            values += moved if moved and flags & MOUSE_VALID[port] else _NO_MOVEMENT
-        return tuple(values)
+    def _convert_imu(self, number: int, counts: Integers, invalid: NDArray[np.bool_]) -> Floats:
+        """Accelerations, temperature and rates (N, 7) of inertial sensor 0 or 1."""
+        scale, offset = self._imu_scales[number]
+        imu = np.rint((counts * scale + offset) * _IMU_STEPS) / _IMU_STEPS
+        imu[invalid] = np.nan
+        return np.asarray(imu)
+
+    def _convert_mag(self, counts: Integers, flags: Integers) -> dict[str, Any]:
+        """Field (N, 3), µT, each reading repeated until the next, and where a new reading arrived (N,)."""
+        valid, count = flags & MAG_VALID != 0, counts[:, _MAG_COUNT]
+        fresh = valid.copy()
+        fresh[1:] &= ~valid[:-1] | (count[1:] != count[:-1])
+        if len(flags):
+            fresh[0] &= count[0] != self._mag_count
+            self._mag_count = int(count[-1]) if valid[-1] else None
+        field = np.rint(counts[:, _MAG] * self._mag_scale * _MAG_STEPS) / _MAG_STEPS
+        return {"mag_uT": np.where(valid[:, None], field, np.nan), "mag_fresh": fresh}
+
+    def _convert_baro(self, counts: Integers, flags: Integers) -> tuple[Floats, NDArray[np.bool_]]:
+        """Pressure and temperature (N, 2), each reading repeated until the next, and where a new reading arrived (N,).
+
+        An impossible reading is missing and not new: the sensor or its wiring is faulty.
+        """
+        size = len(flags)
+        if not size or not self._has_baro:
+            return np.full((size, 2), np.nan), np.zeros(size, np.bool_)
+        valid, count = flags & BARO_VALID != 0, counts[:, 2]
+        fresh = valid.copy()
+        fresh[1:] &= ~valid[:-1] | (count[1:] != count[:-1])
+        fresh[0] &= count[0] != self._baro_count
+        if fresh.any():
+            readings = np.concatenate([self._baro, self._compensate(counts[fresh])])
+            baro = readings[np.cumsum(fresh)]
+        else:
+            baro = np.repeat(self._baro, size, axis=0)
+        baro[~valid] = np.nan
+        self._baro, self._baro_count = baro[-1:].copy(), int(count[-1]) if valid[-1] else None
+        return baro, fresh & np.isfinite(baro[:, 0])
+
+    def _compensate(self, counts: Integers) -> Floats:
+        """Pressure (Pa) and temperature (degC) of readings (N, 2); NaN for an impossible one."""
+        temperature, pressure = self.settings.barometer.compensate(counts[:, 0], counts[:, 1])
+        decimals = 10.0**PRESSURE_DECIMALS
+        return np.column_stack([np.rint(pressure * decimals) / decimals, np.round(temperature, TEMPERATURE_DECIMALS)])
+
+    def _convert_mice(self, raw: RawSamples, flags: Integers) -> Floats:
+        """Counts (N, ports, 2); NaN where a port has no mouse or its reading is invalid."""
+        ports = self.mouse_ports
+        if not ports:
+            return np.empty((len(flags), 0, 2))
+        valid = (flags[:, None] & _MOUSE_BITS[:ports] != 0) & (_PORTS[:ports] < raw.mouse_count[:, None])
+        return np.where(valid[:, :, None], raw.mice[:, :ports], np.nan)

@@ -7,7 +7,7 @@ from enum import IntFlag
 from typing import NamedTuple
 
 from linkpose.errors import LinkposeError
-from linkpose.wire.messages import DeviceFamily, DeviceKind, DeviceState, Hello, HelloDevice
+from linkpose.wire.messages import DeviceFamily, DeviceKind, DeviceState, Hello, HelloDevice, MouseLacks
 
 
 class Sensors(IntFlag):
@@ -115,14 +115,35 @@ def _chip(device: HelloDevice) -> str:
     return next((name for family, name in _MAGNETOMETERS.items() if family == device.family), "unknown magnetometer")
 
 
+_LACKS = {
+    MouseLacks.REMOTE_MODE: "refuses remote mode: it is read in stream mode, and its movement is up to 5 ms late",
+    MouseLacks.ENABLE: "does not confirm ENABLE: its sensor may stay dark. Move it and check that it counts",
+    MouseLacks.SAMPLE_RATE: "does not take 200 reports/s: its counts may beat with the sample rate",
+    MouseLacks.RESOLUTION: "does not take the requested resolution: it runs at {counts_per_mm} counts/mm",
+    MouseLacks.STATUS: "does not report its settings: its resolution is assumed",
+}
+
+
+def mouse_remarks(hello: Hello) -> Iterator[str]:
+    """One sentence for each thing that a mouse refused during its set-up."""
+    for port, mouse in enumerate(hello.mice, 1):
+        for lack, text in _LACKS.items():
+            if mouse.lacks & lack:
+                yield f"The mouse at port {port} {text.format(counts_per_mm=mouse.counts_per_mm)}"
+
+
 def check_hello(hello: Hello) -> None:
     """Raises LinkposeError that names a value which no board has: nothing may be scaled by it."""
-    wrong = next(_impossible(hello), None)
-    if wrong:
+    if wrong := impossible(hello):
         raise LinkposeError(
             f"the board's HELLO says {wrong}, which is impossible; its firmware is damaged or not linkpose's: "
             "type `linkpose flash`"
         )
+
+
+def impossible(hello: Hello) -> str | None:
+    """The first value of a HELLO that no board has, such as "dlpf = 7"; None if all are possible."""
+    return next(_impossible(hello), None)
 
 
 def _impossible(hello: Hello) -> Iterator[str]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from linkpose.sensors.conversion import Row
+from linkpose.errors import InvalidValue
+from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +29,35 @@ class Measurements:
     baro_temp_degC: Floats  # (N,)
     baro_fresh: NDArray[np.bool_]  # (N,) True at the first sample that carries a new pressure
     mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where flags say MICE_STALE
-    flags: NDArray[np.uint16]  # (N,) wire.messages.SampleFlags
+    flags: NDArray[np.uint32]  # (N,) wire.messages.SampleFlags
+    # A second inertial sensor and a magnetometer; NaN (and False) in all rows if there is none.
+    accel2_m_s2: Floats = None  # type: ignore[assignment]  # (N, 3) as the first sensor's, in the second sensor's axes
+    gyro2_rad_s: Floats = None  # type: ignore[assignment]  # (N, 3)
+    imu2_temp_degC: Floats = None  # type: ignore[assignment]  # (N,)
+    mag_uT: Floats = None  # type: ignore[assignment]  # (N, 3) field in the magnetometer's axes, repeated until the next reading
+    mag_fresh: NDArray[np.bool_] = None  # type: ignore[assignment]  # (N,) True where a new field arrived
+
+    def __post_init__(self) -> None:
+        """Absent sensors become rows of NaN, without memory of their own."""
+        size = len(self.time_s)
+        absent = {"accel2_m_s2": (size, 3), "gyro2_rad_s": (size, 3), "imu2_temp_degC": (size,), "mag_uT": (size, 3)}
+        for name, shape in absent.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
+        if getattr(self, "mag_fresh") is None:  # noqa: B009
+            object.__setattr__(self, "mag_fresh", np.broadcast_to(np.False_, size))
+        if self.flags.dtype != np.uint32:  # one type: the filters are compiled for it
+            object.__setattr__(self, "flags", self.flags.astype(np.uint32))
+
+    @property
+    def has_imu2(self) -> bool:
+        """Whether any sample has a reading of a second inertial sensor."""
+        return bool(np.isfinite(self.gyro2_rad_s).any())
+
+    @property
+    def has_mag(self) -> bool:
+        """Whether any sample has a reading of a magnetometer."""
+        return bool(np.isfinite(self.mag_uT).any())
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -38,18 +67,87 @@ class Measurements:
         return Measurements(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     @staticmethod
-    def of(rows: Sequence[Row]) -> Measurements:
-        """The samples of some rows."""
-        imu = np.array([row.imu for row in rows]).reshape(-1, 7)
-        mice = np.array([row.mice for row in rows], dtype=np.float64)
+    def from_imu(
+        time_s: ArrayLike,
+        accel_m_s2: ArrayLike,
+        gyro_rad_s: ArrayLike,
+        *,
+        accel2_m_s2: ArrayLike | None = None,
+        gyro2_rad_s: ArrayLike | None = None,
+        mag_uT: ArrayLike | None = None,
+    ) -> Measurements:
+        """Measurements of one's own inertial sensor, or of two, with or without a magnetometer.
+
+        Args:
+            time_s: (N,) time of each sample (s), not decreasing.
+            accel_m_s2: (N, 3) specific force in the sensor's axes (m/s²): +9.81 along the upward axis at rest.
+            gyro_rad_s: (N, 3) angular rate in the same axes (rad/s). A sample with NaN counts as missing.
+            accel2_m_s2: (N, 3) specific force of a second sensor in its own axes (m/s²); requires gyro2_rad_s.
+            gyro2_rad_s: (N, 3) angular rate of the second sensor (rad/s); requires accel2_m_s2.
+            mag_uT: (N, 3) magnetic field in the first sensor's axes (µT). A row that differs from the one before it is
+                a new reading.
+
+        Raises:
+            InvalidValue: an array has another shape, only one of accel2_m_s2 and gyro2_rad_s is given, or a time is
+                missing, infinite or earlier than the one before it.
+        """
+        time = _checked_times(time_s)
+        accel = _checked_vectors("accel_m_s2", accel_m_s2, len(time))
+        gyro = _checked_vectors("gyro_rad_s", gyro_rad_s, len(time))
+        others = _others(len(time), accel2_m_s2, gyro2_rad_s, mag_uT)
+        missing = np.full(len(time), np.nan)
+        valid = np.isfinite(accel).all(axis=1) & np.isfinite(gyro).all(axis=1)
         return Measurements(
-            np.array([row.time_s for row in rows]),
-            np.ascontiguousarray(imu[:, :3]),
-            np.ascontiguousarray(imu[:, 3:6]),
-            np.ascontiguousarray(imu[:, 6]),
-            np.array([row.pressure_Pa for row in rows]),
-            np.array([row.baro_temp_degC for row in rows]),
-            np.array([row.baro_fresh for row in rows], dtype=np.bool_),
-            mice.reshape(len(rows), mice.size // (2 * len(rows)) if rows else 0, 2),
-            np.array([row.flags for row in rows], dtype=np.uint16),
+            time,
+            accel,
+            gyro,
+            missing,
+            missing,
+            missing,
+            np.zeros(len(time), np.bool_),
+            np.empty((len(time), 0, 2)),
+            np.where(valid, SampleFlags.IMU_VALID, 0).astype(np.uint32) | others.pop("flags"),
+            **others,
         )
+
+
+class Block(NamedTuple):
+    """Consecutive measurements together with their tick numbers."""
+
+    seq: NDArray[np.int64]  # (N,) ticks since START, without wraps; a lost sample leaves a gap
+    measurements: Measurements
+
+
+def _others(size: int, accel2: ArrayLike | None, gyro2: ArrayLike | None, mag: ArrayLike | None) -> dict[str, Any]:
+    """The fields of a second sensor and a magnetometer, those that are given, and their `flags` (N,)."""
+    if (accel2 is None) != (gyro2 is None):
+        raise InvalidValue("accel2_m_s2", "and gyro2_rad_s belong together: give both or neither")
+    fields: dict[str, Any] = {"flags": np.zeros(size, np.uint32)}
+    if accel2 is not None and gyro2 is not None:
+        fields["accel2_m_s2"] = _checked_vectors("accel2_m_s2", accel2, size)
+        fields["gyro2_rad_s"] = _checked_vectors("gyro2_rad_s", gyro2, size)
+        valid = np.isfinite(fields["accel2_m_s2"]).all(axis=1) & np.isfinite(fields["gyro2_rad_s"]).all(axis=1)
+        fields["flags"] |= np.where(valid, SampleFlags.IMU2_VALID, 0).astype(np.uint32)
+    if mag is not None:
+        field = fields["mag_uT"] = _checked_vectors("mag_uT", mag, size)
+        finite = np.isfinite(field).all(axis=1)
+        fields["mag_fresh"] = finite & (np.diff(field, axis=0, prepend=np.full((1, 3), np.nan)) != 0).any(axis=1)
+        fields["flags"] |= np.where(finite, SampleFlags.MAG_VALID, 0).astype(np.uint32)
+    return fields
+
+
+def _checked_times(time_s: ArrayLike) -> Floats:
+    time = np.ascontiguousarray(time_s, dtype=np.float64)
+    if time.ndim != 1:
+        raise InvalidValue("time_s", f"has the shape {time.shape}; it must be (N,)")
+    if not np.isfinite(time).all() or (np.diff(time) < 0).any():
+        at = int(np.flatnonzero(~np.isfinite(time) | (np.diff(time, prepend=-np.inf) < 0))[0])
+        raise InvalidValue("time_s", f"is {time[at]} at index {at}; times must be finite and must not decrease")
+    return time
+
+
+def _checked_vectors(name: str, values: ArrayLike, rows: int) -> Floats:
+    vectors = np.ascontiguousarray(values, dtype=np.float64)
+    if vectors.shape != (rows, 3):
+        raise InvalidValue(name, f"has the shape {vectors.shape}; it must be ({rows}, 3), one row per time")
+    return vectors

@@ -3,15 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
 
 from linkpose.wire.messages import SCALES, DeviceFamily, SelfTestResult
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Number = TypeVar("Number", float, NDArray[np.float64])
 
 STANDARD_GRAVITY = 9.80665  # m/s² per g, by definition
 
@@ -38,13 +31,11 @@ TEMPERATURE = {
     DeviceFamily.MPU6500: (1 / 333.87, 21.0),
     DeviceFamily.ICM20600: (1 / 326.8, 25.0),
 }
-_UNKNOWN_TEMPERATURE = (0.0, math.nan)
 
 
-def temperature(count: Number, family: int = DeviceFamily.MPU6050) -> Number:
-    """Die temperature in degC of a count, or of an array of them; NaN for a family whose formula is unknown."""
-    scale, offset = TEMPERATURE.get(DeviceFamily(family), _UNKNOWN_TEMPERATURE)
-    return count * scale + offset
+def temperature_scale(family: int) -> tuple[float, float]:
+    """Die temperature: degC per count and degC at 0 counts; NaN for a family whose formula is unknown."""
+    return TEMPERATURE.get(DeviceFamily(family), (0.0, math.nan))
 
 
 # Group delay through the low-pass filter at DLPF_CFG 0 to 6, the slower of the two sensors; the other is at most 1 ms

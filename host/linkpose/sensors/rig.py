@@ -1,40 +1,52 @@
-"""rig.toml: where the sensors sit and how they err. Calibration writes it; the filters read it."""
+"""rig.toml: sensor placement and calibration. Calibration writes it; the filters read it."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import math
+import os
+import stat
+import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotRead, CannotWrite, FileFormatError
 
 Vector = tuple[float, float, float]
 
-_GUESS_M = 0.1  # a J2S known no better is of no use but as a start
+_LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
+
+# A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
+_GUESS_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """The link's joint."""
+    """The joint of the link. J2S is the vector from the joint centre to the sensor."""
 
-    j2s_m: Vector | None = None  # from the joint centre to the sensor, in the sensor's frame (m)
-    j2s_std_m: float = 0.0001  # how well that is known, each axis (m)
+    j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None: not known
+    j2s_std_m: float = 0.0001  # its standard deviation, each axis (m)
 
     @property
     def known_j2s_m(self) -> Vector | None:
-        """J2S, None where it is a guess from which it is to be estimated."""
+        """J2S; None if it is not known, or only a first guess from which it is to be estimated."""
         return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
+
+
+# A J2S of which nothing is known but that it is at most some metres long: the filter that can estimates it.
+UNKNOWN_JOINT = Joint((0.0, 0.0, 0.0), 1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Imu:
     """Calibration of the MPU-6050: acceleration = (measured - offset) / scale, rate = measured - bias.
 
-    The noises are the standard deviations of one sample at rest. The defaults are the data sheet's typical figures.
+    The noises are the standard deviations of one sample at rest. The defaults are typical figures of [MPU-6050].
     """
 
     gyro_bias_rad_s: Vector = (0.0, 0.0, 0.0)
@@ -42,11 +54,11 @@ class Imu:
     accel_scale: Vector = (1.0, 1.0, 1.0)
     gyro_noise_rad_s: float = math.radians(0.05)
     accel_noise_m_s2: float = 0.04
-    delay_s: float | None = None  # of the low-pass filter that the readings went through; None: by the board's setting
+    delay_s: float | None = None  # delay of the readings by the low-pass filter; None: follows from the DLPF setting
 
     @property
     def known_delay_s(self) -> float:
-        """The delay, none where nothing is said of it."""
+        """The delay; 0 if it is not known."""
         return self.delay_s or 0.0
 
 
@@ -77,10 +89,11 @@ class Rig:
     mouse: tuple[Mouse, ...] = ()
 
     def with_j2s(self, j2s_m: Vector) -> Rig:
+        """The rig with another J2S, assumed accurate to 0.1 mm (1σ)."""
         return replace(self, joint=Joint(j2s_m))
 
     def with_delay_of(self, dlpf: int | None) -> Rig:
-        """The rig for readings through this low-pass setting (DLPF_CFG, 0 to 6); a delay that the rig names stays."""
+        """The rig for readings with this low-pass setting (DLPF_CFG, 0 to 6); a delay that the rig states is kept."""
         from linkpose.sensors.mpu6050 import DLPF_DELAY_S
 
         if dlpf is None or self.imu.delay_s is not None:
@@ -99,7 +112,7 @@ class Rig:
 
     @staticmethod
     def from_dict(tables: Mapping[str, Any], origin: str) -> Rig:
-        """The inverse of `as_dict`; `origin` names the file. Raises LinkposeError for what cannot be."""
+        """The inverse of `as_dict`; `origin` names the file. Raises FileFormatError for an invalid key or value."""
         _refuse_unknown(tables, [f.name for f in fields(Rig)], origin, "")
         parts: dict[str, Any] = {}
         for name, cls in (("joint", Joint), ("imu", Imu), ("baro", Baro)):
@@ -107,20 +120,30 @@ class Rig:
                 parts[name] = _read_table(cls, tables[name], origin, name)
         mice = tables.get("mouse", [])
         if not isinstance(mice, list):
-            raise LinkposeError(f"{origin}: mouse is one table; write [[mouse]], once for each mouse")
+            raise FileFormatError(origin, f"{origin}: mouse is one table; write [[mouse]], once for each mouse")
         parts["mouse"] = tuple(_read_table(Mouse, table, origin, "mouse") for table in mice)
         return Rig(**parts)
 
     @staticmethod
-    def load(path: Path) -> Rig:
-        """Reads a rig file. Raises LinkposeError naming the file, the key and the cure."""
+    def load(path: str | PathLike[str]) -> Rig:
+        """Reads a rig file. Raises CannotRead, or FileFormatError naming the file, the key and the cure."""
         try:
-            tables = tomllib.loads(path.read_text(encoding="utf-8"))
+            tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except OSError as error:
-            raise LinkposeError(f"cannot read the rig file {path}: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise LinkposeError(f"{path} is not a rig file: {error}") from error
+            raise CannotRead(path, error.strerror, "the rig file") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
+            raise FileFormatError(path, f"{path} is not a rig file: {str(error)[:200]}") from error
         return Rig.from_dict(tables, str(path))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Writes a rig file, completely or not at all. An existing file keeps its mode, a symbolic link its target.
+
+        Raises CannotWrite, also for a path that is a device or a folder.
+        """
+        try:
+            _replace_file(Path(path), self.to_toml())
+        except OSError as error:
+            raise CannotWrite(path, error.strerror, "the rig file") from error
 
     def to_toml(self) -> str:
         """The rig as the text of a rig.toml that `load` reads back to an equal rig."""
@@ -144,12 +167,12 @@ def _refuse_unknown(table: Mapping[str, Any], known: list[str], origin: str, whe
         if key not in known:
             near = difflib.get_close_matches(key, known, 1, 0.4)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-            raise LinkposeError(f"{origin}: unknown key {where}{key}; {hint}")
+            raise FileFormatError(origin, f"{origin}: unknown key {where}{key}; {hint}")
 
 
 def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     if not isinstance(table, Mapping):
-        raise LinkposeError(f"{origin}: {name} must be a table: write [{name}]")
+        raise FileFormatError(origin, f"{origin}: {name} must be a table: write [{name}]")
     known = {f.name: f for f in fields(cls)}
     _refuse_unknown(table, list(known), origin, f"{name}.")
     values: dict[str, Any] = {}
@@ -159,28 +182,82 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
             _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
         )
         if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "_std_m", "counts_per_m")) and values[key] <= 0:
-            raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be above 0")
+            raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be above 0")
         if key == "delay_s" and not 0.0 <= values[key] <= 0.1:
-            raise LinkposeError(f"{origin}: {name}.{key} is {value}; it must be between 0 and 0.1 s")
+            raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be between 0 and 0.1 s")
         if key == "accel_scale" and min(values[key]) <= 0:
-            raise LinkposeError(f"{origin}: {name}.{key} is {value}; each axis must be above 0")
+            raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; each axis must be above 0")
     try:
         return cls(**values)
     except TypeError:
         missing = [k for k in ("x_m", "y_m") if k in known and k not in values]
-        raise LinkposeError(
-            f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
+        raise FileFormatError(
+            origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
 
 
 def _read_number(value: Any, origin: str, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise LinkposeError(f"{origin}: {where} is {value!r}; it must be a number")
-    return float(value)
+    if not isinstance(value, bool) and isinstance(value, int | float):
+        with contextlib.suppress(OverflowError):  # an integer of hundreds of digits
+            if math.isfinite(value) and abs(value) <= _LARGEST:
+                return float(value)
+    raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; it must be a number")
+
+
+def quoted(value: Any, most: int = 60) -> str:
+    """A value from a file as a message shows it: bounded in length, without control characters."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a nesting without end
+        return f"a {type(value).__name__} that is too large"
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _read_vector(value: Any, origin: str, where: str) -> Vector:
     if not isinstance(value, list | tuple) or len(value) != 3:
-        raise LinkposeError(f"{origin}: {where} is {value!r}; it must be three numbers: [x, y, z]")
+        raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; it must be three numbers: [x, y, z]")
     x, y, z = (_read_number(v, origin, where) for v in value)
     return x, y, z
+
+
+def _replace_file(path: Path, text: str) -> None:
+    """Writes `text` to `path` through a temporary file with an unpredictable name in the same folder."""
+    path = path.resolve()  # a symbolic link stays, and its target is replaced
+    mode = None
+    if path.exists():
+        mode = stat.S_IMODE(path.stat().st_mode)
+        if not path.is_file():
+            raise OSError(0, "it is not a file")
+    descriptor, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        Path(partial).chmod(mode if mode is not None else 0o666 & ~_umask())
+        Path(partial).replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            Path(partial).unlink()
+        raise
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def as_rig(rig: Rig | str | PathLike[str] | None, own: Rig | None = None) -> Rig:
+    """A rig given as such or as the path of a rig.toml; otherwise `own`, or defaults.
+
+    `own` is the rig of a recording or of a simulated board.
+
+    The delay of the readings belongs to the measurements: it comes from `own` where the rig does not state it.
+    """
+    if rig is None:
+        return own or Rig()
+    loaded = rig if isinstance(rig, Rig) else Rig.load(rig)
+    if own is not None and loaded.imu.delay_s is None:
+        loaded = replace(loaded, imu=replace(loaded.imu, delay_s=own.imu.delay_s))
+    return loaded

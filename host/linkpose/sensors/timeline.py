@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
-from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.sensors.conversion import GAP_BEFORE, Placed
 from linkpose.wire.messages import Sample
 
 _SEQ_WRAP = 1 << 16
@@ -51,14 +51,6 @@ class Gap:
             "lost": self.lost,
             "cause": self.cause,
         }
-
-
-class Placed(NamedTuple):
-    """A sample's place: seconds since the first, ticks since START, and its flags with `gap_before`."""
-
-    time_s: float
-    seq: int
-    flags: int
 
 
 class Timeline:

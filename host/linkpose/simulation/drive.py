@@ -75,8 +75,9 @@ class Move:
 class Manoeuvres:
     """Straight on, loops, turns on the spot, sideways, rests: one each SLOT_S, drawn by the seed, up to 1 m/s."""
 
-    def __init__(self, seed: tuple[int, ...]) -> None:
-        self._seed = seed
+    def __init__(self, seed: tuple[int, ...], rests: float = 0.05) -> None:
+        """`rests` is the share of manoeuvres that are rests."""
+        self._seed, self._rests = seed, rests
         self._twists = [np.zeros(3)]  # of each manoeuvre: the first is rest
         self._ways = [np.zeros(3), np.zeros(3)]  # Q at the start of each and at the end of the last
 
@@ -90,6 +91,10 @@ class Manoeuvres:
         twists = np.array(self._twists)
         return number, time_s - number * SLOT_S, twists[np.maximum(number - 1, 0)], twists[number]
 
+    def _shares(self) -> Floats:
+        moves = np.array([0.35, 0.15, 0.15, 0.15, 0.15]) / 0.95
+        return np.append((1.0 - self._rests) * moves, self._rests)
+
     def _draw(self, number: int) -> Floats:
         rng = np.random.default_rng([*self._seed, number])
         side, speed = rng.choice([-1.0, 1.0]), rng.uniform(0.3, 0.95)
@@ -101,7 +106,7 @@ class Manoeuvres:
             (0.5 * speed, side * 0.5 * speed, 0.0),  # sideways
             (0.0, 0.0, 0.0),
         )
-        return np.array(manoeuvres[int(rng.choice(len(manoeuvres), p=(0.35, 0.15, 0.15, 0.15, 0.15, 0.05)))])
+        return np.array(manoeuvres[int(rng.choice(len(manoeuvres), p=self._shares()))])
 
     def twist(self, time_s: Floats) -> Floats:
         _, within, before, after = self._tables(time_s)
@@ -117,6 +122,26 @@ class Manoeuvres:
         u = np.minimum(within / PASSAGE_S, 1.0)
         passed = PASSAGE_S * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(within - PASSAGE_S, 0.0)  # ∫ of the passage
         return np.asarray(np.array(self._ways)[number] + before * within[:, None] + (after - before) * passed[:, None])
+
+
+class Hastened:
+    """Another drive, `factor` times as fast, from its instant `start_s` on: a robot that is already moving."""
+
+    def __init__(self, drive: Drive, factor: float, start_s: float = 0.0) -> None:
+        self._drive, self._factor, self._start_s = drive, factor, start_s
+
+    def _instants(self, time_s: Floats) -> Floats:
+        return np.asarray(self._start_s + self._factor * np.asarray(time_s))
+
+    def twist(self, time_s: Floats) -> Floats:
+        return np.asarray(self._factor * self._drive.twist(self._instants(time_s)))
+
+    def acceleration(self, time_s: Floats) -> Floats:
+        return np.asarray(self._factor**2 * self._drive.acceleration(self._instants(time_s)))
+
+    def way(self, time_s: Floats) -> Floats:
+        before = self._drive.way(np.array([self._start_s]))
+        return np.asarray(self._drive.way(self._instants(time_s)) - before)
 
 
 class Track:

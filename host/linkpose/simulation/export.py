@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import CannotWrite, FileError, FileExists, LinkposeError
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
-from linkpose.localization.grid import save_map
+from linkpose.localization.maps import save_map
 from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats
@@ -30,17 +30,17 @@ _BLOCK = 50_000  # samples of the truth in memory at once
 
 
 def check_outputs(paths: Iterable[Path], force: bool) -> None:
-    """Raises LinkposeError where two of the files are one, one exists and `force` is not set, or has no folder."""
+    """Raises FileError where two of the files are one, one exists and `force` is not set, or has no folder."""
     named = [path.absolute() for path in paths]
     for path in named:
         if named.count(path) > 1:
-            raise LinkposeError(f"{path} is named for two outputs; name two files")
+            raise FileError(path, f"{path} is named for two outputs; name two files")
         if path.is_dir():
-            raise LinkposeError(f"{path} is a folder; name a file")
+            raise CannotWrite(path, "it is a folder")
         if path.is_file() and not force:
-            raise LinkposeError(f"{path} exists already; name another file or add --force to replace it")
+            raise FileExists(path)
         if not path.parent.is_dir():
-            raise LinkposeError(f"cannot write {path}: there is no folder {path.parent}")
+            raise CannotWrite(path, f"there is no folder {path.parent}")
 
 
 def check_length(duration_s: float, rate_hz: float) -> None:
@@ -58,7 +58,9 @@ def write_link(run: LinkRun, recording: Path, truth: Path, force: bool) -> None:
     check_outputs((recording, truth), force)
     write_truth_blocks(truth, _link_truth(run), {"device": run.description, "j2s_m": run.j2s_m}, force)
     settings: Configure = board.DEFAULTS._replace(sample_rate_hz=round(run.rate_hz))
-    write_recording(recording, board.hello(settings), run.samples(), run.description, run.rig, force)
+    write_recording(
+        recording, board.hello(settings, sensors=run.hello_sensors), run.samples(), run.description, run.rig, force
+    )
 
 
 def _link_truth(run: LinkRun) -> Iterator[Mapping[str, Floats]]:

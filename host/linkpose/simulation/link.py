@@ -15,15 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.barometer import Barometer
+from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig, Vector
 from linkpose.simulation import baro, imu
+from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
 from linkpose.wire.frames import sample
-from linkpose.wire.messages import HelloMouse, Sample, SampleFlags
+from linkpose.wire.messages import IMU2_OFFSET_US_400_KHZ, IMU_OFFSET_US, DeviceFamily, HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -43,7 +45,7 @@ class PaperTest(NamedTuple):
 TESTS = {1: PaperTest(6.8, 1.0), 2: PaperTest(10.7, 1.12), 3: PaperTest(12.5, 1.2)}
 
 # Streams of random numbers, apart from each other so that a setting changes only what it is about.
-_MOTION, _ERRORS, _WEATHER, _IMU_NOISE, _BARO_NOISE = range(5)
+_MOTION, _ERRORS, _WEATHER, _IMU_NOISE, _BARO_NOISE, _IMU2_NOISE, _IMU2_ERRORS, _MAG_NOISE, _MAG_ERRORS = range(9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ class RawBlock(NamedTuple):
     baro_up: Integers
     baro_count: Integers  # of all pressures read so far, not wrapped
     flags: Integers
+    imu2: NDArray[np.int16]  # (N, 7) accel, temperature, gyro; (N, 0): there is no second sensor
+    mag: NDArray[np.int16]  # (N, 3), or (N, 0)
 
     def samples(self) -> Iterator[Sample]:
         """As messages, with the counters wrapped as the board wraps them."""
@@ -91,16 +95,25 @@ class RawBlock(NamedTuple):
             self.baro_up.tolist(),
             (self.baro_count & 0xFF).tolist(),
             self.flags.tolist(),
+            self.imu2.tolist(),
+            self.mag.tolist(),
             strict=True,
         )
-        for seq, t_us, (ax, ay, az), temp, (gx, gy, gz), ut, up, count, flags in rows:
-            yield sample(seq, t_us, flags, (ax, ay, az, temp, gx, gy, gz), baro=(ut, up, count))
+        for seq, t_us, (ax, ay, az), temp, (gx, gy, gz), ut, up, count, flags, imu2, mag in rows:
+            yield sample(
+                seq,
+                t_us,
+                flags,
+                (ax, ay, az, temp, gx, gy, gz),
+                tuple(imu2),
+                (ut, up, count),
+                (*mag, seq & 0xFF) if mag else (),
+            )
 
 
 class LinkRun:
     """A run of the simulated link. Pure: every method gives the same for the same arguments, in any order."""
 
-    hello_sensors = Sensors.MPU6050 | Sensors.BMP180
     hello_mice: tuple[HelloMouse, ...] = ()
 
     def __init__(
@@ -116,8 +129,12 @@ class LinkRun:
         gyro_range_deg_s: int = 1000,
         oversampling: int = 1,
         rests: bool = False,
+        imu2: bool = False,
+        mag: bool = False,
     ) -> None:
-        """`duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
+        """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer.
+
+        `duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
         swinging the link, as `calibrate imu` asks for. Raises LinkposeError for a value that cannot be.
         """
         _check(test, seed, duration_s, rate_hz, errors, j2s_m)
@@ -125,6 +142,8 @@ class LinkRun:
         self.rate_hz, self.errors, self.j2s_m = rate_hz, errors, j2s_m
         self.accel_range_g, self.gyro_range_deg_s, self.oversampling = accel_range_g, gyro_range_deg_s, oversampling
         self._d = np.array(j2s_m, dtype=np.float64)
+        self.hello_sensors = Sensors.MPU6050 | Sensors.BMP180
+        self.hello_sensors |= Sensors.IMU2 * imu2 | Sensors.MAG * mag
         paper = TESTS[test]
         self.rests = rests
         self._motion: HandMotion | SixSides
@@ -134,6 +153,8 @@ class LinkRun:
             self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
             self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
         self.imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS, test]))
+        self.imu2_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _IMU2_ERRORS, test]))
+        self._hard_iron_uT = mag_model.hard_iron(errors, np.random.default_rng([seed, _MAG_ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
 
@@ -147,7 +168,10 @@ class LinkRun:
         """What a file of this run names as its device."""
         if self.rests:
             return f"simulated link, laid on six sides, seed {self.seed}, errors {self.errors}"
-        return f"sim://link?test={self.test}&seed={self.seed}&errors={self.errors}"
+        others = "".join(
+            f"&{s.name.lower()}=1" for s in (Sensors.IMU2, Sensors.MAG) if s.name and s & self.hello_sensors
+        )
+        return f"sim://link?test={self.test}&seed={self.seed}&errors={self.errors}{others}"
 
     @property
     def rig(self) -> Rig:
@@ -189,10 +213,25 @@ class LinkRun:
 
         `first` is the number of the first of these readings since the start: it names their noise.
         """
+        return self._imu_counts(time_s, first, self._d, self.imu_errors, _IMU_NOISE)
+
+    def imu2_counts(self, time_s: Floats, first: int) -> NDArray[np.int16]:
+        """As `imu_counts`, of the second sensor."""
+        return self._imu_counts(time_s, first, self._d / 2, self.imu2_errors, _IMU2_NOISE)
+
+    def mag_field(self, time_s: Floats, first: int) -> Floats:
+        """Field that the magnetometer measures (N, 3), µT, in the link's axes; `first` as for `imu_counts`."""
+        noise = imu.white((self.seed, _MAG_NOISE, self.test), first, len(time_s), 3)
+        noise = mag_model.NOISE_UT * (self.errors != "none") * noise
+        return mag_model.field(self._motion.at(time_s)) + self._hard_iron_uT + noise
+
+    def _imu_counts(
+        self, time_s: Floats, first: int, at_m: Floats, errors: imu.ImuErrors, stream: int
+    ) -> NDArray[np.int16]:
+        """Counts of a sensor at `at_m` (3,) from the joint; `stream` names its noise."""
         moving = self._motion.at(time_s)
-        force = STANDARD_GRAVITY * moving.tilt + moving.acceleration(self._d)
-        noise = imu.white((self.seed, _IMU_NOISE, self.test), first, len(time_s), 7)
-        errors = self.imu_errors
+        force = STANDARD_GRAVITY * moving.tilt + moving.acceleration(at_m)
+        noise = imu.white((self.seed, stream, self.test), first, len(time_s), 7)
         accel = force @ errors.accel_matrix.T + errors.accel_bias_m_s2 + errors.accel_noise_m_s2 * noise[:, :3]
         rate = moving.rate_rad_s @ errors.gyro_matrix.T + errors.gyro_bias_rad_s
         rate = rate + errors.gyro_noise_rad_s * noise[:, 4:]
@@ -235,7 +274,26 @@ class LinkRun:
         flags |= np.where(full[:, :3].any(axis=1), int(SampleFlags.ACCEL_SATURATED), 0)
         flags |= np.where(full[:, 4:].any(axis=1), int(SampleFlags.GYRO_SATURATED), 0)
         t_us = np.rint(time_s * 1e6).astype(np.int64)
-        return RawBlock(tick, t_us, counts[:, :3], counts[:, 3], counts[:, 4:], ut, up, pressures, flags)
+        imu2, mag, more = self._others(time_s, first)
+        return RawBlock(
+            tick, t_us, counts[:, :3], counts[:, 3], counts[:, 4:], ut, up, pressures, flags | more, imu2, mag
+        )
+
+    def _others(self, time_s: Floats, first: int) -> tuple[NDArray[np.int16], NDArray[np.int16], Integers]:
+        """Counts of the second inertial sensor (N, 7 or 0) and the magnetometer (N, 3 or 0), and their flags (N,)."""
+        size = len(time_s)
+        imu2 = mag = np.empty((size, 0), np.int16)
+        flags = np.zeros(size, np.int64)
+        if self.hello_sensors & Sensors.IMU2:
+            imu2 = self.imu2_counts(time_s + 1e-6 * (IMU2_OFFSET_US_400_KHZ - IMU_OFFSET_US), first)
+            full = (imu2 == -32768) | (imu2 == 32767)
+            flags |= int(SampleFlags.IMU2_VALID)
+            flags |= np.where(full[:, :3].any(axis=1), int(SampleFlags.ACCEL2_SATURATED), 0)
+            flags |= np.where(full[:, 4:].any(axis=1), int(SampleFlags.GYRO2_SATURATED), 0)
+        if self.hello_sensors & Sensors.MAG:
+            mag = mag_model.counts(self.mag_field(time_s, first))
+            flags |= int(SampleFlags.MAG_VALID)
+        return imu2, mag, flags
 
     def blocks(self) -> Iterator[RawBlock]:
         """All SAMPLEs, block by block; without end when the run has none."""
@@ -252,21 +310,24 @@ class LinkRun:
 
     def measurements(self) -> Measurements:
         """The whole run as a recording of it would be read. Only of a run that ends."""
-        settings = Settings(
+        settings = BoardSettings(
             round(self.rate_hz),
             self.accel_range_g,
             self.gyro_range_deg_s,
             dlpf=0,
             baro_oversampling=self.oversampling,
-            bmp180=baro.DATASHEET_WORDS,
+            barometer=Barometer(DeviceFamily.BMP180, baro.DATASHEET_WORDS.words(), self.oversampling),
             mouse_ports=0,
+            imu_families=(DeviceFamily.MPU6050, DeviceFamily.MPU6050 * bool(self.hello_sensors & Sensors.IMU2)),
+            mag_family=DeviceFamily.QMC5883L * bool(self.hello_sensors & Sensors.MAG),
         )
         if self.count is None:
             raise LinkposeError("a run without an end has no whole recording: give it a duration")
         converter = Converter(settings)
-        return Measurements.of(
-            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
-        )
+        samples = list(self.samples())
+        raw = RawSamples.of(samples, converter.mouse_ports)
+        flags = np.array([sample.flags for sample in samples], dtype=np.int64)
+        return converter.convert(raw, np.arange(len(samples)) / self.rate_hz, flags)
 
     def _baro_of(self, tick: Integers, pressures: Integers) -> tuple[Integers, Integers]:
         """UT and UP that the SAMPLEs of these ticks carry: the last ones read."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.sensors import bmp180
-from linkpose.sensors.conversion import Converter, Settings
+from linkpose.sensors.barometer import Barometer
+from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
@@ -24,7 +24,7 @@ from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation import imu
 from linkpose.simulation.drive import STILL_S, Drive, Manoeuvres, Move, Steady, Track
 from linkpose.wire.frames import sample
-from linkpose.wire.messages import DeviceState, HelloMouse, Sample, SampleFlags
+from linkpose.wire.messages import DeviceFamily, DeviceState, HelloMouse, Sample, SampleFlags
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -129,14 +129,15 @@ class MiceRun:
         *,
         mouse_errors: MouseErrors | None = None,
         faults: tuple[Fault, ...] = (),
+        drive: Drive | None = None,
         length_m: float = 2.0,
         accel_range_g: int = 8,
         gyro_range_deg_s: int = 1000,
     ) -> None:
         """`mice` are what a user would write into a rig file, three on the paper's triangle unless given; what they are
         differs by `errors` ("calibrated", "datasheet", "none") or `mouse_errors`. `path` is "drive", "paper" (its
-        steady (1, 1) cm/s), "line" (of `length_m`) or "turn" (a full one on the spot). `duration_s` None never ends (a
-        live board). Raises LinkposeError for a value that cannot be.
+        steady (1, 1) cm/s), "line" (of `length_m`) or "turn" (a full one on the spot); `drive` takes its place.
+        `duration_s` None never ends (a live board). Raises LinkposeError for a value that cannot be.
         """
         mice = ring(3) if mice is None else mice
         _check(seed, duration_s, rate_hz, len(mice), path, errors, faults, length_m)
@@ -145,7 +146,7 @@ class MiceRun:
         self.accel_range_g, self.gyro_range_deg_s, self.faults = accel_range_g, gyro_range_deg_s, faults
         self._mouse_errors = mouse_errors or LEVELS[errors]
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
-        self._drive = _drive(path, seed, duration_s, length_m)
+        self._drive = drive or _drive(path, seed, duration_s, length_m)
         self._track = Track(self._drive)
         self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
         self._place = np.array([(mouse.x_m, mouse.y_m) for mouse in mice])
@@ -308,12 +309,13 @@ class MiceRun:
         """The whole run as a recording of it would be read. Only of a run that ends."""
         if self.count is None:
             raise LinkposeError("a run without an end has no whole recording: give it a duration")
-        no_baro = bmp180.Calibration(*[0] * len(bmp180.Calibration._fields))
+        no_baro = Barometer(DeviceFamily.NONE, (0,) * 12, 0)
         ranges = (self.accel_range_g, self.gyro_range_deg_s)
-        converter = Converter(Settings(round(self.rate_hz), *ranges, 0, 0, no_baro, len(self.mice)))
-        return Measurements.of(
-            [converter.row(sample, i / self.rate_hz, i, sample.flags) for i, sample in enumerate(self.samples())]
-        )
+        converter = Converter(BoardSettings(round(self.rate_hz), *ranges, 0, 0, no_baro, len(self.mice)))
+        samples = list(self.samples())
+        raw = RawSamples.of(samples, converter.mouse_ports)
+        flags = np.array([sample.flags for sample in samples], dtype=np.int64)
+        return converter.convert(raw, np.arange(len(samples)) / self.rate_hz, flags)
 
 
 def _drive(path: str, seed: int, duration_s: float | None, length_m: float) -> Drive:

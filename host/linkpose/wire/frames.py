@@ -151,9 +151,9 @@ def _sample_unpacker(shape: SampleShape) -> tuple[int, Unpack]:
     end = at
     (cut1, cut2), (fill1, fill2) = [*cuts, end, end][:2], [*fills, (), ()][:2]
 
-    def whole(payload: bytes) -> Message:
+    def usual(payload: bytes) -> Message:  # without the last sections
         values = unpack_from(payload, 1)
-        message: Message = _new(Sample, (*values[:end], values[end:]))
+        message: Message = _new(Sample, (*values[:end], *fill1, values[end:]))
         return message
 
     def sparse(payload: bytes) -> Message:
@@ -162,13 +162,15 @@ def _sample_unpacker(shape: SampleShape) -> tuple[int, Unpack]:
         message: Message = _new(Sample, parts)
         return message
 
-    return _OVERHEAD + Struct("<" + shape.code).size, sparse if fills else whole
+    return _OVERHEAD + Struct("<" + shape.code).size, usual if cut1 == end else sparse
 
 
 _UNPACK = {from_board: _unpackers(from_board) for from_board in (True, False)}
-_UNPACK_SAMPLE = {shape.sections: _sample_unpacker(shape) for shape in sample_shapes()}
+_UNPACK_SAMPLE: dict[int, Unpack] = {}  # by frame length and sections: length * 256 + sections
+for _shape in sample_shapes():
+    _length, _unpack = _sample_unpacker(_shape)
+    _UNPACK_SAMPLE[_length << 8 | _shape.sections] = _unpack
 _PACK = {layout.cls: layout for layout in LAYOUTS}
-_NO_SAMPLE = (0, None)
 
 
 def encode(message: Message) -> bytes:
@@ -228,7 +230,7 @@ def sample(
     """
     values: list[Any] = [seq, t_us, flags, 0]
     sections = 0
-    for group, given in zip(_SAMPLE.groups, (imu, imu2, baro, mag), strict=False):
+    for group, given in zip(_SAMPLE.groups, (imu, baro, imu2, mag), strict=False):
         values += given or (0,) * len(group.code)
         sections |= group.mask * bool(given)
     counted = _SAMPLE.groups[-1]
@@ -250,7 +252,7 @@ class StreamDecoder:
     def __init__(self, from_board: bool = True) -> None:
         self.corrupt = Corrupt()
         self._unpack = _UNPACK[from_board]
-        self._unpack_sample = _UNPACK_SAMPLE if from_board else {}
+        self._unpack_sample: dict[int, Unpack] = _UNPACK_SAMPLE if from_board else {}
         self._types = {layout.type_id for layout in LAYOUTS if (layout.type_id < 0x80) == from_board}
         self._rest = b""
         self._overlong = False  # the present frame is too long: skip to its end
@@ -263,7 +265,7 @@ class StreamDecoder:
         if self._overlong and pieces:  # its end has arrived
             self._overlong = False
             pieces[0] = b""
-        sample_of = self._unpack_sample.get
+        sample_of, append, sections_at = self._unpack_sample.get, messages.append, _SECTIONS_AT
         for piece in pieces:
             if not piece:  # nothing between two 0x00 is an idle line, not a frame
                 continue
@@ -274,16 +276,12 @@ class StreamDecoder:
                 continue
             # Nearly all frames are SAMPLEs, so they are tried first.
             if len(piece) >= _SHORTEST_SAMPLE and payload[0] == _SAMPLE_TYPE:
-                length, unpack = sample_of(payload[_SECTIONS_AT], _NO_SAMPLE)
-                if (
-                    unpack is not None
-                    and length == len(piece)
-                    and crc_hqx(payload[:-2], _CRC_START) == payload[-2] | payload[-1] << 8
-                ):
-                    messages.append(unpack(payload))  # type: ignore[arg-type]
+                unpack = sample_of(len(piece) << 8 | payload[sections_at])
+                if unpack and crc_hqx(payload[:-2], 0xFFFF) == payload[-2] | payload[-1] << 8:
+                    append(unpack(payload))  # type: ignore[arg-type]  # never None: the length is in the key
                     continue
             if (message := self._decode(payload)) is not None:
-                messages.append(message)
+                append(message)
         if len(rest) > MAX_FRAME:
             if not self._overlong:
                 self._overlong = True

@@ -8,14 +8,14 @@ from typing import NamedTuple
 VERSION = "0.1.0"
 PROTOCOL_MAJOR = 2
 PROTOCOL_MINOR = 0
-SCHEMA_CRC = 0x5904cf63
+SCHEMA_CRC = 0x51379541
 BAUD = 250000
 MAX_FRAME = 132
 
 # Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-IMU_OFFSET_US = 13
-IMU2_OFFSET_US_400_KHZ = 540
-IMU2_OFFSET_US_100_KHZ = 1680
+IMU_OFFSET_US = 9
+IMU2_OFFSET_US_400_KHZ = 536
+IMU2_OFFSET_US_100_KHZ = 1676
 
 
 class ResetCause(IntFlag):
@@ -32,8 +32,8 @@ class Sections(IntFlag):
     """Which sections a SAMPLE carries, in the order of these bits; bits 4 to 6 hold the number of mice."""
 
     IMU = 0x1
-    IMU2 = 0x2
-    BARO = 0x4
+    BARO = 0x2
+    IMU2 = 0x4
     MAG = 0x8
 
 
@@ -211,6 +211,9 @@ class Sample(NamedTuple):
     gyro_x: int = 0
     gyro_y: int = 0
     gyro_z: int = 0
+    baro_ut: int = 0  # uncompensated temperature, 16 bits: UT of a BMP180, adc_T / 16 of a BMP280
+    baro_up: int = 0  # uncompensated pressure: 16 + oversampling bits of a BMP180, 20 bits of a BMP280
+    baro_count: int = 0  # increases by one with each new baro_up; wraps
     accel2_x: int = 0
     accel2_y: int = 0
     accel2_z: int = 0
@@ -218,9 +221,6 @@ class Sample(NamedTuple):
     gyro2_x: int = 0
     gyro2_y: int = 0
     gyro2_z: int = 0
-    baro_ut: int = 0  # uncompensated temperature, 16 bits: UT of a BMP180, adc_T / 16 of a BMP280
-    baro_up: int = 0  # uncompensated pressure: 16 + oversampling bits of a BMP180, 20 bits of a BMP280
-    baro_count: int = 0  # increases by one with each new baro_up; wraps
     mag_x: int = 0  # the scale depends on the family
     mag_y: int = 0
     mag_z: int = 0
@@ -384,8 +384,8 @@ LAYOUTS: tuple[Layout, ...] = (
     )),
     Layout(0x02, Sample, "HIIB", (
         Group("imu", "hhhhhhh", None, 0, 1, 0x1),
-        Group("imu2", "hhhhhhh", None, 0, 1, 0x2),
-        Group("baro", "HIB", None, 0, 1, 0x4),
+        Group("baro", "HIB", None, 0, 1, 0x2),
+        Group("imu2", "hhhhhhh", None, 0, 1, 0x4),
         Group("mag", "hhhB", None, 0, 1, 0x8),
         Group("mice", "hh", None, 0, 4, 0x70),
     )),

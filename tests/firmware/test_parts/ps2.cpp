@@ -2,6 +2,7 @@
 #include <Ps2Mouse.h>
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <deque>
 
 #include "support.h"
@@ -52,7 +53,10 @@ class FakeMouse {
  public:
   bool present = true;
   bool repeats_whole = true;
-  bool double_scaling = false;
+  Bytes refuses;       // commands answered with RESEND each time
+  Bytes refuses_once;  // the next time
+  bool remote_works = true;
+  bool remote = false, enabled = false;
   uint8_t resolution = 2, rate = 60, id = 0x00;
   int x = 0, y = 0;  // moved, not yet told
   int resets = 0;
@@ -73,11 +77,16 @@ class FakeMouse {
       sent_++;
       if (bad) return answer(Ending::kBadParity, received);
       received.push_back(byte);
+      if (request.acknowledged && received.size() == 1 && byte != 0xFA) return answer(Ending::kRefused, received);
     }
     return answer(received.size() == request.answers ? Ending::kDone : Ending::kTimeout, received);
   }
 
   void power_on() { output_ = {0xAA, 0x00}; }
+  void report_by_itself() {
+    report();
+    output_.pop_front();  // without ACK
+  }
 
  private:
   static Ps2Mouse::Answer answer(Ending ending, const Bytes& received) {
@@ -88,6 +97,8 @@ class FakeMouse {
     log.push_back(byte);
     if (byte == 0xFE) return repeat();
     output_.clear();
+    if (refuses_now(byte)) return say({0xFE});
+    if (byte >= 0xE6) argument_of_ = 0;  // a command takes the place of a missing argument
     if (argument_of_ != 0) {
       (argument_of_ == 0xE8 ? resolution : rate) = byte;
       argument_of_ = 0;
@@ -96,6 +107,7 @@ class FakeMouse {
     switch (byte) {
       case 0xFF:
         resets++;
+        remote = enabled = false;
         resolution = 2;
         say({0xFA});
         output_.push_back(0xAA);
@@ -107,10 +119,33 @@ class FakeMouse {
         say({0xFA});
         break;
       case 0xF2: say({0xFA, id}); break;
-      case 0xE9: say({0xFA, static_cast<uint8_t>(double_scaling ? 0x50 : 0x40), resolution, rate}); break;
+      case 0xE9: say({0xFA, static_cast<uint8_t>(remote << 6 | enabled << 5), resolution, rate}); break;
       case 0xEB: report(); break;
+      case 0xF0:
+        remote = remote_works;
+        say({0xFA});
+        break;
+      case 0xF4:
+        enabled = true;
+        say({0xFA});
+        break;
+      case 0xF6:
+        remote = enabled = false;
+        resolution = 2;
+        rate = 100;
+        say({0xFA});
+        break;
       default: say({0xFA}); break;
     }
+  }
+
+  bool refuses_now(uint8_t byte) {
+    const auto once = std::find(refuses_once.begin(), refuses_once.end(), byte);
+    if (once != refuses_once.end()) {
+      refuses_once.erase(once);
+      return true;
+    }
+    return std::find(refuses.begin(), refuses.end(), byte) != refuses.end();
   }
 
   void report() {
@@ -144,8 +179,11 @@ class Rig {
   Bytes received;
 
   void step() {
+    if (driver.polls()) driver.begin_round();
     const Ps2Mouse::Request request = driver.next();
+    if (!request.sends && driver.running() && mouse.enabled && (mouse.x != 0 || mouse.y != 0)) mouse.report_by_itself();
     driver.finish(mouse.play(request, received));
+    if (driver.polls() && driver.answered()) driver.complete_round();
   }
   bool start(int limit = 20) {
     for (int i = 0; i < limit && !driver.valid(); i++) step();
@@ -159,7 +197,7 @@ TEST_CASE("PS/2: every byte goes out with its parity and stop bit, and is acknow
   for (int value = 0; value < 256; value++) {
     const uint8_t byte = static_cast<uint8_t>(value);
     Line line;
-    line.bits.begin_sending(byte, 1);
+    line.bits.begin_sending(byte, 1, true);
     CHECK(line.take() == (value | odd_parity(byte) << 8 | 1 << 9));
     line.byte(0xFA);
     CHECK(line.bits.outcome() == Outcome::kDone);
@@ -167,18 +205,34 @@ TEST_CASE("PS/2: every byte goes out with its parity and stop bit, and is acknow
   }
 }
 
-TEST_CASE("PS/2: a byte without the mouse's acknowledge bit is refused") {
+TEST_CASE("PS/2: a byte without the mouse's acknowledge bit was not taken") {
   Line line;
-  line.bits.begin_sending(0xEB, 4);
+  line.bits.begin_sending(0xEB, 4, true);
   line.take(false);
-  CHECK(line.bits.outcome() == Outcome::kRefused);
+  CHECK(line.bits.outcome() == Outcome::kNotTaken);
   CHECK(line.last == Act::kHoldClock);
+}
+
+TEST_CASE("PS/2: an answer other than ACK ends a command at once, but not a repetition") {
+  for (uint8_t answer : {uint8_t{0xFE}, uint8_t{0xFC}, uint8_t{0xAA}}) {
+    Line line;
+    line.bits.begin_sending(0xEB, 4, true);
+    line.take();
+    line.byte(answer);
+    CHECK(line.bits.outcome() == Outcome::kRefused);
+    CHECK(line.last == Act::kHoldClock);
+    CHECK(line.bits.bytes()[0] == answer);
+    line.bits.begin_sending(0xFE, 3, false);
+    line.take();
+    line.byte(answer);
+    CHECK(line.bits.outcome() == Outcome::kRunning);
+  }
 }
 
 TEST_CASE("PS/2: every byte is received, and the clock is held after the last") {
   for (int value = 0; value < 256; value++) {
     Line line;
-    line.bits.begin_listening(2);
+    line.bits.begin_receiving(2);
     line.byte(static_cast<uint8_t>(value));
     CHECK(line.bits.outcome() == Outcome::kRunning);
     CHECK(line.last == Act::kNone);
@@ -191,7 +245,7 @@ TEST_CASE("PS/2: every byte is received, and the clock is held after the last") 
 
 TEST_CASE("PS/2: a byte of bad parity is not used, and the clock is held at its stop bit") {
   Line line;
-  line.bits.begin_listening(4);
+  line.bits.begin_receiving(4);
   line.byte(0xFA);
   line.byte(0x08, true);
   CHECK(line.bits.outcome() == Outcome::kBadParity);
@@ -201,7 +255,7 @@ TEST_CASE("PS/2: a byte of bad parity is not used, and the clock is held at its 
 
 TEST_CASE("PS/2: a missing clock is found at the next byte's start bit") {
   Line line;
-  line.bits.begin_listening(4);
+  line.bits.begin_receiving(4);
   line.byte(0x08, false, 9);
   line.edge(true);  // its stop bit at the place of the parity
   line.edge(false);
@@ -211,7 +265,7 @@ TEST_CASE("PS/2: a missing clock is found at the next byte's start bit") {
 
 TEST_CASE("PS/2: a byte whose clock stops for 2 ms is given up") {
   Line line;
-  line.bits.begin_listening(1);
+  line.bits.begin_receiving(1);
   line.byte(0x33, false, 5);
   line.edge(false, 2000 / Ps2Bits::kStepUs + 1);
   for (int i = 1; i < 11; i++) line.edge((0x47 << 1 | odd_parity(0x47) << 9 | 1 << 10) >> i & 1);
@@ -222,7 +276,7 @@ TEST_CASE("PS/2: a byte whose clock stops for 2 ms is given up") {
 
 TEST_CASE("PS/2: a slow mouse, 10 kHz, is not taken for one that stopped") {
   Line line;
-  line.bits.begin_listening(1);
+  line.bits.begin_receiving(1);
   for (int i = 0; i < 11; i++) line.edge((0x47 << 1 | odd_parity(0x47) << 9 | 1 << 10) >> i & 1, 2);
   CHECK(line.bits.outcome() == Outcome::kDone);
   CHECK(line.bits.resyncs() == 0);
@@ -234,13 +288,13 @@ TEST_CASE("PS/2 fuzz: a million edges at random do no harm, and a sound transact
   int working = 0;
   for (int round = 0; round < 20000; round++) {
     if (random.below(2)) {
-      line.bits.begin_sending(static_cast<uint8_t>(random.next()), static_cast<uint8_t>(1 + random.below(4)));
+      line.bits.begin_sending(static_cast<uint8_t>(random.next()), static_cast<uint8_t>(1 + random.below(4)), random.below(2));
     } else {
-      line.bits.begin_listening(static_cast<uint8_t>(1 + random.below(4)));
+      line.bits.begin_receiving(static_cast<uint8_t>(1 + random.below(4)));
     }
     for (int i = 0; i < 50; i++) line.edge(random.below(2), static_cast<uint8_t>(random.below(64) ? 1 : random.next()));
     if (line.bits.received() > Ps2Bits::kMaxAnswers) FAIL("too many");
-    line.bits.begin_sending(0xF2, 2);
+    line.bits.begin_sending(0xF2, 2, true);
     const bool sent = line.take() == (0xF2 | odd_parity(0xF2) << 8 | 1 << 9);
     line.byte(0xFA);
     line.byte(0x03);
@@ -255,21 +309,24 @@ TEST_CASE("PS/2 mouse: set up as wanted, and its settings read back") {
   REQUIRE(rig.start());
   CHECK(rig.driver.id() == 0x03);
   CHECK(rig.driver.counts_per_mm() == 8);
-  CHECK(rig.driver.report_rate_hz() == 100);
-  CHECK(rig.mouse.log == Bytes{0xF6, 0xF6, 0xF2, 0xE6, 0xE8, 3, 0xF3, 100, 0xF0, 0xE9});
+  CHECK(rig.driver.report_rate_hz() == 200);
+  CHECK(rig.driver.status() == 0x60);
+  CHECK(rig.driver.lacks() == 0);
+  CHECK(rig.mouse.log == Bytes{0xF6, 0xF6, 0xF2, 0xE6, 0xE8, 3, 0xF3, 200, 0xF0, 0xF4, 0xE9, 0xEB, 0xEB});
 }
 
 TEST_CASE("PS/2 mouse: a new resolution waits for the poll that runs, and every step of the set-up is taken") {
   Rig rig;
   rig.start();
   rig.mouse.x = 7;
+  rig.driver.begin_round();
   const Ps2Mouse::Request poll = rig.driver.next();
   rig.driver.configure(2);
   rig.driver.finish(rig.mouse.play(poll, rig.received));
   CHECK(rig.driver.dx() == 7);
   rig.mouse.log.clear();
-  for (int i = 0; i < 9; i++) rig.step();
-  CHECK(rig.mouse.log == Bytes{0xF6, 0xF2, 0xE6, 0xE8, 1, 0xF3, 100, 0xF0, 0xE9});
+  for (int i = 0; i < 12; i++) rig.step();
+  CHECK(rig.mouse.log == Bytes{0xF6, 0xF2, 0xE6, 0xE8, 1, 0xF3, 200, 0xF0, 0xF4, 0xE9, 0xEB, 0xEB});
   CHECK(rig.driver.valid());
   CHECK(rig.driver.counts_per_mm() == 2);
 }
@@ -371,7 +428,7 @@ TEST_CASE("PS/2 mouse: one that was there before the board is found by the probe
   Rig rig;
   rig.mouse.present = false;
   for (int i = 0; i < 5; i++) rig.step();
-  CHECK(rig.driver.settled());
+  CHECK(rig.driver.probed());
   CHECK_FALSE(rig.driver.ever_found());
   rig.mouse.present = true;
   CHECK(rig.start());
@@ -388,12 +445,90 @@ TEST_CASE("PS/2 mouse: RESET_MICE resets and sets up again") {
   CHECK(rig.driver.resets() == 1);
 }
 
-TEST_CASE("PS/2 mouse: scaling that stays at 2:1 leads to a reset") {
+TEST_CASE("PS/2 mouse: every command may be refused once, arguments too") {
+  for (uint8_t byte : {0xF6, 0xF2, 0xE6, 0xE8, 3, 0xF3, 200, 0xF0, 0xF4, 0xE9}) {
+    CAPTURE(byte);
+    Rig rig;
+    rig.mouse.refuses_once = {byte};
+    REQUIRE(rig.start());
+    CHECK(rig.driver.lacks() == 0);
+    CHECK(rig.driver.status() == 0x60);
+  }
+}
+
+TEST_CASE("PS/2 mouse: an answer with bad parity in the set-up is requested again") {
+  for (size_t bad = 0; bad < 12; bad++) {
+    CAPTURE(bad);
+    Rig rig;
+    rig.mouse.bad_parity.assign(bad + 1, false);
+    rig.mouse.bad_parity[bad] = true;
+    REQUIRE(rig.start(25));
+    CHECK(rig.driver.lacks() == 0);
+    CHECK(rig.driver.counts_per_mm() == 8);
+  }
+}
+
+TEST_CASE("PS/2 mouse: commands that are refused each time are reported, and the mouse works without them") {
+  const struct {
+    Bytes refuses;
+    uint8_t lacks;
+  } cases[] = {{{0xE6, 0xF2}, 0},
+               {{0xE8}, Ps2Mouse::kLacksResolution},
+               {{200}, Ps2Mouse::kLacksSampleRate},
+               {{0xF4}, Ps2Mouse::kLacksEnable},
+               {{0xE9}, Ps2Mouse::kLacksStatus},
+               {{0xF0}, Ps2Mouse::kLacksRemoteMode},
+               {{0xEB}, Ps2Mouse::kLacksRemoteMode}};
+  for (const auto& each : cases) {
+    Rig rig;
+    rig.mouse.refuses = each.refuses;
+    REQUIRE(rig.start(60));
+    for (int i = 0; i < 40; i++) rig.step();
+    CHECK(rig.driver.lacks() == each.lacks);
+    rig.driver.forget_movement();
+    rig.mouse.x = 12;
+    rig.step();
+    CHECK(rig.driver.dx() == 12);
+  }
+}
+
+TEST_CASE("PS/2 mouse: remote mode that STATUS does not confirm is not used") {
   Rig rig;
-  rig.mouse.double_scaling = true;
-  for (int i = 0; i < 12; i++) rig.step();
-  CHECK(rig.mouse.resets == 1);
+  rig.mouse.remote_works = false;
+  REQUIRE(rig.start());
+  CHECK(rig.driver.lacks() == uint8_t{Ps2Mouse::kLacksRemoteMode});
+  CHECK(rig.driver.status() == 0x20);
+  for (int i = 0; i < 200; i++) rig.step();
+  CHECK(rig.driver.valid());
+  rig.mouse.present = false;
+  for (int i = 0; i < 60; i++) rig.step();
+  CHECK_FALSE(rig.driver.running());
+}
+
+TEST_CASE("PS/2 mouse: a refused poll leaves the counts in the mouse and its driver unanswered") {
+  Rig rig;
+  rig.start();
+  rig.mouse.x = 21;
+  rig.mouse.refuses_once = {0xEB};
+  rig.step();
+  CHECK_FALSE(rig.driver.answered());
+  CHECK(rig.driver.valid());
+  rig.step();
+  CHECK(rig.driver.answered());
+  CHECK(rig.driver.dx() == 21);
+}
+
+TEST_CASE("PS/2 mouse: what it counted before the first complete round is not measured") {
+  Rig rig;
+  while (!rig.driver.running()) rig.step();
+  rig.mouse.x = 50;
+  rig.step();
   CHECK_FALSE(rig.driver.valid());
+  CHECK(rig.driver.dx() == 0);
+  rig.mouse.x = 3;
+  rig.step();
+  CHECK(rig.driver.valid());
+  CHECK(rig.driver.dx() == 3);
 }
 
 TEST_CASE("PS/2 mouse fuzz: a mouse that answers at random is survived, and set up when it comes to its senses") {

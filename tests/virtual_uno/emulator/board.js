@@ -1,6 +1,7 @@
 "use strict";
 // An Arduino UNO with a GY-87 on A4/A5 and PS/2 mice on port D: the parts and the wires between them.
 
+const { Adc } = require("./adc");
 const { Bmp180 } = require("./bmp180");
 const { Bmp280 } = require("./bmp280");
 const { CLOCK_HZ, Cpu, RESET_CAUSE } = require("./cpu");
@@ -22,6 +23,8 @@ const { Watchdog } = require("./watchdog");
 
 const OPCODE_CLI = 0x94f8;
 const OPCODE_JUMP_TO_ITSELF = 0xcfff;
+const SREG = 0x5f;
+const GLOBAL_INTERRUPT_ENABLE = 0x80;
 // Clock and data of each mouse port: Arduino pins D2/D3, D4/D5, D6/D7, D8/D9.
 const MOUSE_PORTS = [
   ["D", 0x04, 0x08],
@@ -34,7 +37,8 @@ const START_UP_S = 0.065; // the UNO's fuses: 16K clocks and 65 ms after every r
 class Board {
   /** @param {string} hex the program, Intel HEX
    *  @param {object} options
-   *  @param {number} options.seed of everything random: SRAM at power-on, faults
+   *  @param {number} options.seed of everything random: registers and SRAM at power-on, faults
+   *  @param {object} [options.adc] see Adc
    *  @param {object} [options.mpu6050] see Mpu6050
    *  @param {object} [options.imu2] a second inertial sensor, at 0x69: see Mpu6050
    *  @param {object} [options.bmp180] see Bmp180
@@ -46,7 +50,7 @@ class Board {
    *  @param {number} [options.bootAddress] where every reset begins: that of a bootloader which is part of the program */
   constructor(hex, options) {
     const { seed, mpu6050 = {}, imu2 = null, bmp180 = {}, bmp280 = null, magnetometer = null } = options;
-    const { mice = [], bootloaderS = 0, bootAddress = 0 } = options;
+    const { adc = {}, mice = [], bootloaderS = 0, bootAddress = 0 } = options;
     const random = seededRandom(seed);
     this.bootloaderCycles = bootloaderS * CLOCK_HZ;
     this.log = new Log();
@@ -55,6 +59,8 @@ class Board {
     cpu.resetVector = bootAddress >> 1;
     this.selfProgramming = new SelfProgramming(cpu);
     for (let address = 0x100; address < cpu.data.length; address += 1) cpu.data[address] = random() * 256;
+    for (let register = 0; register < 32; register += 1) cpu.data[register] = random() * 256;
+    this.adc = new Adc(cpu, adc);
     this.ports = makePorts(cpu);
     this.timers = [0, 1, 2].map((number) => new Timer(cpu, number));
     this.watchdog = new Watchdog(cpu, (cause) => this.reset(cause));
@@ -92,13 +98,18 @@ class Board {
     return this.hosts[mouse];
   }
 
-  /** The program stops for ever: in the loop with interrupts off that the C library puts behind main(). */
-  hang() {
+  /** The program stops for ever, in the loop that the C library puts behind main().
+   *  @param {boolean} interrupts whether they stay enabled
+   *  @returns {number} the byte address of the loop */
+  hang(interrupts) {
     const { progMem } = this.cpu;
     const loop = progMem.findIndex((word, at) => word === OPCODE_CLI && progMem[at + 1] === OPCODE_JUMP_TO_ITSELF);
     if (loop < 0) throw new Error("the program has no loop behind main()");
-    this.cpu.pc = loop;
+    this.cpu.pc = loop + 1;
     this.cpu.asleep = false;
+    if (interrupts) this.cpu.data[SREG] |= GLOBAL_INTERRUPT_ENABLE;
+    else this.cpu.data[SREG] &= ~GLOBAL_INTERRUPT_ENABLE;
+    return 2 * (loop + 1);
   }
 
   run(cycles) {

@@ -5,6 +5,7 @@ const { CPU, avrInstruction } = require("avr8js");
 
 const CLOCK_HZ = 16_000_000;
 const SRAM_BYTES = 2048;
+const FIRST_IO = 0x20;
 const FIRST_SRAM = 0x100;
 const SREG = 0x5f;
 const SMCR = 0x53;
@@ -27,6 +28,10 @@ class Cpu extends CPU {
     this.readHooks = new Array(this.data.length).fill(undefined); // dense: data accesses look here first
     this.writeHooks = new Array(this.data.length).fill(undefined);
     this.peripherals = [];
+    this.writeHooks[MCUSR] = (value) => { // its flags can only be cleared
+      this.data[MCUSR] &= value;
+      return true;
+    };
     this.nextEvent = null;
     this.nextEventCycle = Infinity;
     this.eventCycle = -1; // cycle of the event that is running, -1 outside of events
@@ -85,11 +90,11 @@ class Cpu extends CPU {
     peripheral.reset();
   }
 
-  /** A reset: registers to their initial values, SRAM kept, the core still for the start-up time.
+  /** A reset: I/O registers take their initial values, r0 to r31 and SRAM keep theirs, the core waits the start-up time.
    *  @param {boolean} causeKept whether MCUSR still tells when the program starts */
   restart(cause, startUpCycles, causeKept) {
     const flags = this.data[MCUSR];
-    this.data.fill(0, 0, FIRST_SRAM);
+    this.data.fill(0, FIRST_IO, FIRST_SRAM);
     if (causeKept) this.data[MCUSR] = cause === RESET_CAUSE.powerOn ? cause : flags | cause;
     this.pendingInterrupts.fill(null);
     this.nextInterrupt = -1;

@@ -1,6 +1,7 @@
 "use strict";
-// A PS/2 mouse down to its bits, in both directions: "The PS/2 Mouse Interface" and "The PS/2 Mouse/Keyboard Protocol"
-// (A. Chapweske), after IBM's PS/2 technical reference. What it does is a generator, `#life`, that yields waits.
+// A PS/2 mouse at bit level, in both directions, after A. Chapweske, "The PS/2 Mouse Interface" and "The PS/2
+// Mouse/Keyboard Protocol". The generator `#life` holds its behaviour and yields the waits. The default options describe
+// a mouse that follows the documents; the others describe deviations of real mice.
 
 const { CLOCK_HZ } = require("./cpu");
 const { Table } = require("./table");
@@ -25,14 +26,21 @@ const COMMAND = {
 
 const OPTIONS = {
   clockHz: 12_500, // 10 to 16.7 kHz
-  selfTestMs: 400, // from power or RESET to 0xAA: 300 to 500 ms as a rule
-  responseUs: 400, // from a command's last bit to the answer's first
-  requestUs: 150, // from the host's request to send to the first clock
+  selfTestMs: 400, // from power-on or RESET to 0xAA: usually 300 to 500 ms
+  responseUs: 400, // from the last bit of a command to the first bit of the answer: at most 20 ms
+  requestUs: 150, // from the host's request to send to the first clock: at most 15 ms
   betweenBytesUs: 120,
-  repeatsWholePacket: true, // after an inhibit or RESEND; otherwise only the byte concerned
+  repeatsWholePacket: true, // after an inhibit or RESEND; otherwise it repeats only the interrupted byte
   plugged: true,
-  ignores: [], // commands that get no answer at all
-  refuses: [], // commands that get 0xFE
+  pullUps: true, // resistors to 5 V on both lines; without them only the host's pull-ups raise the lines
+  ignores: [], // commands without any answer
+  refuses: [], // commands that get RESEND (0xFE) each time
+  refusesOnce: [], // commands that get RESEND the next time; one entry each
+  errors: [], // commands that get ERROR (0xFC) each time
+  darkUntilEnable: false, // the sensor does not run before ENABLE (0xF4), also in remote mode
+  noRemoteMode: false, // acknowledges 0xF0 and stays in stream mode; STATUS reports it
+  sensorAtReportRate: false, // the sensor is read at the report rate, by the mouse's own clock
+  reportRateError: 0, // relative error of that clock
 };
 
 class Ps2Mouse {
@@ -75,7 +83,7 @@ class Ps2Mouse {
     this.event = null;
     this.waiting = false;
     this.port.hold(this.clock | this.data, false);
-    this.port.pullUp(this.clock | this.data, false);
+    if (this.pullUps) this.port.pullUp(this.clock | this.data, false);
   }
 
   /** A new path, from where it is now; what is less than a count of the old one stays. */
@@ -93,7 +101,7 @@ class Ps2Mouse {
   }
 
   #powerOn() {
-    this.port.pullUp(this.clock | this.data);
+    if (this.pullUps) this.port.pullUp(this.clock | this.data);
     this.at = [...this.path.at(this.cpu.now / CLOCK_HZ)];
     this.counters = [0, 0];
     this.#setDefaults();
@@ -153,6 +161,10 @@ class Ps2Mouse {
     return (this.port.level & this.data) !== 0;
   }
 
+  get #reportCycles() {
+    return CLOCK_HZ / (this.reportRateHz * (1 + this.reportRateError));
+  }
+
   get #halfBitUs() {
     return 5e5 / this.clockHz;
   }
@@ -175,7 +187,7 @@ class Ps2Mouse {
 
   #reportDue() {
     if (!this.#streams || this.cpu.now < this.nextReport) return false;
-    this.nextReport += CLOCK_HZ / this.reportRateHz;
+    while (this.nextReport <= this.cpu.now) this.nextReport += this.#reportCycles;
     this.#count();
     return this.counters[0] !== 0 || this.counters[1] !== 0;
   }
@@ -277,8 +289,10 @@ class Ps2Mouse {
     }
     this.output = [];
     if (sound && this.ignores.includes(byte)) return;
-    if (!sound || this.refuses.includes(byte)) {
+    if (!sound || this.#refusesNow(byte)) {
       this.#queue([RESEND]);
+    } else if (this.errors.includes(byte)) {
+      this.#queue([ERROR]);
     } else if (this.mode === "wrap" && byte !== COMMAND.reset && byte !== COMMAND.endWrap) {
       this.#queue([byte]);
     } else if (this.argumentOf !== null) {
@@ -288,6 +302,13 @@ class Ps2Mouse {
     } else {
       this.#carryOut(byte);
     }
+  }
+
+  #refusesNow(byte) {
+    if (this.refuses.includes(byte)) return true;
+    const once = this.refusesOnce.indexOf(byte);
+    if (once >= 0) this.refusesOnce.splice(once, 1);
+    return once >= 0;
   }
 
   *#resetByCommand() {
@@ -335,11 +356,11 @@ class Ps2Mouse {
     const actions = {
       [COMMAND.defaults]: () => this.#setDefaults(),
       [COMMAND.disable]: () => { this.reporting = false; },
-      [COMMAND.enable]: () => { this.reporting = true; },
+      [COMMAND.enable]: () => { this.#count(); this.reporting = true; },
       [COMMAND.sampleRate]: () => { this.argumentOf = command; },
       [COMMAND.resolution]: () => { this.argumentOf = command; },
       [COMMAND.readId]: () => [STANDARD_ID],
-      [COMMAND.remote]: () => { this.mode = "remote"; },
+      [COMMAND.remote]: () => { if (!this.noRemoteMode) this.mode = "remote"; },
       [COMMAND.stream]: () => { this.mode = "stream"; },
       [COMMAND.wrap]: () => { this.modeBeforeWrap = this.mode; this.mode = "wrap"; },
       [COMMAND.endWrap]: () => { if (this.mode === "wrap") this.mode = this.modeBeforeWrap; },
@@ -359,7 +380,7 @@ class Ps2Mouse {
 
   #acknowledge(answer) {
     this.#clearCounters();
-    this.nextReport = this.cpu.now + CLOCK_HZ / this.reportRateHz;
+    this.nextReport = this.cpu.now + this.#reportCycles;
     this.#queue([ACKNOWLEDGE]);
     if (answer.length > 0) this.#queue(answer);
   }
@@ -371,10 +392,20 @@ class Ps2Mouse {
 
   // --- movement ---
 
-  /** Lets the counters follow the path up to now; a counter that is full stays so. */
+  /** The time at which the sensor was last read. */
+  get #sensedAt() {
+    if (!this.sensorAtReportRate) return this.cpu.now;
+    return Math.floor(this.cpu.now / this.#reportCycles) * this.#reportCycles;
+  }
+
+  /** Lets the counters follow the path up to the present. A dark sensor follows without counting. */
   #count() {
     const perMm = COUNTS_PER_MM[this.resolution];
-    const now = this.path.at(this.cpu.now / CLOCK_HZ);
+    const now = this.path.at(this.#sensedAt / CLOCK_HZ);
+    if (this.darkUntilEnable && !this.reporting) {
+      this.at = [...now];
+      return;
+    }
     for (let axis = 0; axis < 2; axis += 1) {
       const counts = Math.trunc((now[axis] - this.at[axis]) * perMm * (1 + ROUNDING));
       this.at[axis] += counts / perMm;

@@ -24,8 +24,11 @@ const OPERATIONS = {
     board.reset(RESET_CAUSE.external);
     return {};
   },
-  hang() {
-    board.hang();
+  hang({ interrupts }) {
+    return { at: board.hang(interrupts) };
+  },
+  supply({ volts }) {
+    board.adc.supplyV = volts;
     return {};
   },
   feed({ sensor, times, values, interpolated }) {

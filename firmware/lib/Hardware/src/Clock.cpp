@@ -1,5 +1,6 @@
 #include "Clock.h"
 
+#include <Messages.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <util/atomic.h>
@@ -13,14 +14,17 @@ namespace {
 
 constexpr uint32_t kStepsPerSecond = F_CPU / 8;
 
-// The burst begins this many steps after the tick: more than the longest time for which another interrupt or a locked
-// section can hold the tick's interrupt up, so that all bursts begin at the same distance.
-constexpr uint8_t kBurstDelaySteps = 24;
+// The burst begins this many 0.5 us steps after the tick: close to the longest delay by one mouse's pin change
+// (10 us; three at once take 24 us). It must not be longer: interrupts are off until the burst has
+// begun and the time is latched, and a mouse that sends meanwhile holds its clock low for only 30 us. With 24 steps edges
+// of a mouse at 16.6 kHz were missed at 250 Hz and its packets had to be repeated. wire::kImuOffsetUs follows it.
+constexpr uint8_t kBurstDelaySteps = 16;
+static_assert(kBurstDelaySteps / 2 + 1 == wire::kImuOffsetUs, "the schema states the distance");
 
 volatile uint32_t tick_number;
 volatile uint32_t tick_us;
 volatile uint8_t tick_half_us;  // 0 or 1 step on top of tick_us
-volatile bool tick_serves_mice;
+volatile bool tick_has_mice;
 volatile uint16_t period_steps;
 volatile uint16_t next_period_steps;
 
@@ -49,7 +53,7 @@ Tick tick() {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     latest.number = tick_number;
     latest.t_us = tick_us;
-    latest.serves_mice = tick_serves_mice;
+    latest.has_mice = tick_has_mice;
   }
   return latest;
 }
@@ -72,14 +76,6 @@ uint16_t steps_left() {
   return left;
 }
 
-void arm_deadline_locked(uint16_t steps) {
-  OCR1B = TCNT1 + steps;
-  TIFR1 = _BV(OCF1B);
-  TIMSK1 |= _BV(OCIE1B);
-}
-
-void disarm_deadline() { TIMSK1 &= static_cast<uint8_t>(~_BV(OCIE1B)); }
-
 }  // namespace clock
 
 ISR(TIMER1_COMPA_vect) {
@@ -87,7 +83,7 @@ ISR(TIMER1_COMPA_vect) {
   while (TCNT1L < clock::kBurstDelaySteps) {
   }
   twi::start_bursts();
-  clock::tick_serves_mice = ps2::start_prepared();
+  clock::tick_has_mice = ps2::start_armed();
   // A tick ends the period that was in force until now.
   const uint8_t halves = (clock::period_steps & 1) + clock::tick_half_us;
   clock::tick_us += (clock::period_steps >> 1) + (halves >> 1);
@@ -97,7 +93,7 @@ ISR(TIMER1_COMPA_vect) {
     clock::period_steps = clock::next_period_steps;
     OCR1A = clock::period_steps - 1;  // well before TCNT1 gets there
   }
-  idle::signal_work();
+  idle::signal_mice_work();
 }
 
 ISR(TIMER1_COMPB_vect) {

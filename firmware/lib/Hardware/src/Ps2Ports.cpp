@@ -21,14 +21,17 @@ Ps2Bits lines[kPorts];
 volatile uint8_t levels_before_d;
 volatile uint8_t levels_before_b;
 
-// Prepared transactions: their lines are moved by the next tick that serves the mice.
-volatile uint8_t prepared_d, prepared_b;  // clocks to let go
+// Armed transactions: the next tick moves their lines.
+volatile uint8_t armed_d, armed_b;            // clocks to release
 volatile uint8_t start_bits_d, start_bits_b;  // data to pull low before that
-volatile uint8_t divider = 1;
-volatile uint8_t ticks_left = 1;
+volatile bool round_armed;
+volatile bool round_is_complete;  // the round before the armed one
+volatile bool round_published;
+volatile uint8_t round_ticks;  // since the start of the last round
+volatile uint8_t round_period = 1;
 
-// Open drain: low is driven, high is left to the pull-up. The pull-up is off before the line is driven, and on after it
-// is let go, so that no line is ever driven high against a mouse.
+// Open drain: a low level is driven, a high level comes from the pull-ups. The inner pull-up is switched off before the
+// line is driven and on after it is released, so that no line is ever driven high against a mouse.
 inline __attribute__((always_inline)) void pull(uint8_t port, uint8_t line) {
   if (port < 3) {
     PORTD &= static_cast<uint8_t>(~line);
@@ -58,16 +61,16 @@ inline __attribute__((always_inline)) void edge(uint8_t pins, uint8_t now) {
     case Ps2Bits::Act::kHoldClock:
       pull(port, clock_of(port));
       release(port, data_of(port));
-      idle::signal_work();
+      idle::signal_mice_work();
       break;
   }
 }
 
-volatile uint8_t& prepared(uint8_t port) { return port < 3 ? prepared_d : prepared_b; }
+volatile uint8_t& armed(uint8_t port) { return port < 3 ? armed_d : armed_b; }
 volatile uint8_t& start_bits(uint8_t port) { return port < 3 ? start_bits_d : start_bits_b; }
 
 void hold_locked(uint8_t port) {
-  prepared(port) &= static_cast<uint8_t>(~clock_of(port));
+  armed(port) &= static_cast<uint8_t>(~clock_of(port));
   start_bits(port) &= static_cast<uint8_t>(~data_of(port));
   pull(port, clock_of(port));
   release(port, data_of(port));
@@ -88,27 +91,17 @@ void begin() {
   }
 }
 
-void set_divider(uint8_t ticks) {
+void send(uint8_t port, uint8_t byte, uint8_t answers, bool acknowledged) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-    divider = ticks;
-    ticks_left = ticks;
+    hold_locked(port);
+    lines[port].begin_sending(byte, answers, acknowledged);
   }
 }
 
-void send(uint8_t port, uint8_t byte, uint8_t answers) {
+void receive(uint8_t port, uint8_t answers) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
     hold_locked(port);
-    lines[port].begin_sending(byte, answers);
-    prepared(port) |= clock_of(port);
-    start_bits(port) |= data_of(port);
-  }
-}
-
-void listen(uint8_t port, uint8_t answers) {
-  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
-    hold_locked(port);
-    lines[port].begin_listening(answers);
-    prepared(port) |= clock_of(port);
+    lines[port].begin_receiving(answers);
   }
 }
 
@@ -116,34 +109,68 @@ void hold(uint8_t port) {
   ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { hold_locked(port); }
 }
 
-bool waiting(uint8_t port) { return prepared(port) & clock_of(port); }
+namespace {
+
+void arm_locked(uint8_t port) {
+  armed(port) |= clock_of(port);
+  if (lines[port].sending()) start_bits(port) |= data_of(port);
+}
+
+}  // namespace
+
+void arm(uint8_t port) {
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { arm_locked(port); }
+}
+
+void arm_round(uint8_t ports, bool complete, uint8_t period) {
+  ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
+    for (uint8_t port = 0; port < kPorts; port++, ports >>= 1) {
+      if (ports & 1) arm_locked(port);
+    }
+    round_is_complete = complete;
+    round_period = period;
+    round_armed = true;
+  }
+}
+
+bool waiting(uint8_t port) { return armed(port) & clock_of(port); }
+bool round_waiting() { return round_armed; }
+bool published() { return round_published; }
+uint8_t ticks_in_round() { return round_ticks; }
 const Ps2Bits& bits(uint8_t port) { return lines[port]; }
 
-// Data goes low first, which is the start bit, then the clocks go free: the mice begin to clock their byte in.
-bool start_prepared() {
-  if (--ticks_left != 0) return false;
-  ticks_left = divider;
+// Data goes low first, which is the start bit; then the clocks are released, and the mice clock their byte in.
+bool start_armed() {
+  const uint8_t ticks = round_ticks + 1;
+  bool publishes = false;
+  round_ticks = ticks;
+  if (round_armed) {
+    publishes = round_is_complete && ticks == round_period;
+    round_published = publishes;
+    round_armed = false;
+    round_ticks = 0;
+  }
   PORTD &= static_cast<uint8_t>(~start_bits_d);
   DDRD |= start_bits_d;
-  DDRD &= static_cast<uint8_t>(~prepared_d);
-  PORTD |= prepared_d;
-  prepared_d = start_bits_d = 0;
-  if (!prepared_b) return true;
+  DDRD &= static_cast<uint8_t>(~armed_d);
+  PORTD |= armed_d;
+  armed_d = start_bits_d = 0;
+  if (!armed_b) return publishes;
   PORTB &= static_cast<uint8_t>(~start_bits_b);
   DDRB |= start_bits_b;
-  DDRB &= static_cast<uint8_t>(~prepared_b);
-  PORTB |= prepared_b;
-  prepared_b = start_bits_b = 0;
-  return true;
+  DDRB &= static_cast<uint8_t>(~armed_b);
+  PORTB |= armed_b;
+  armed_b = start_bits_b = 0;
+  return publishes;
 }
 
 }  // namespace ps2
 
-// Each edge of each clock brings an interrupt, thousands a second. Half of them are rising edges, of which nothing is to
-// be done: so the interrupt itself only looks which clocks fell, in registers the compiler would not get along with, and
-// jumps to the compiled handler when there are any. An edge of a clock that is held low is our own.
+// Each edge of each clock causes an interrupt, tens of thousands a second. Half of them are rising edges, which need no
+// action: the interrupt itself only determines which clocks fell, with fewer registers than the compiler would use, and
+// jumps to the compiled handler if there are any. The handler ignores edges of a clock that the host holds low.
 //
-// What it hands on: the pins in GPIOR1, the clocks that fell in GPIOR2. The beginning is idle::note_wake().
+// It passes the pins in GPIOR1 and the clocks that fell in GPIOR2. Its beginning is idle::note_wake().
 #define PIN_CHANGE_INTERRUPT(vector, pin_register, direction_register, clocks, before, handler)       \
   extern "C" void handler() __attribute__((signal, used));                                          \
   ISR(vector, ISR_NAKED) {                                                                          \

@@ -121,6 +121,7 @@ void Magnetometer::search_next(uint32_t now_us) {
     return;
   }
   chip_ = chip_ + 1 < kChipCount ? chip_ + 1 : 0;
+  searched_ = searched_ || chip_ == 0;
   due_us_ = now_us + (chip_ == 0 ? kSearchUs : 0);
 }
 

@@ -27,6 +27,8 @@ class Magnetometer {
 
   bool present() const { return present_; }
   bool ever_found() const { return ever_found_; }
+  // Found, or all three chips were searched for.
+  bool settled() const { return ever_found_ || searched_; }
   Family family() const { return family_; }
   uint8_t address() const;
   uint8_t id() const { return id_; }  // as read, 0: never found
@@ -51,6 +53,7 @@ class Magnetometer {
   Family family_ = kNone;
   bool present_ = false;
   bool ever_found_ = false;
+  bool searched_ = false;
   bool measured_ = false;
   bool saturated_ = false;
   uint16_t restarts_ = 0;

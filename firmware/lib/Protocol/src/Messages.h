@@ -9,7 +9,7 @@ namespace wire {
 
 constexpr uint8_t kProtocolMajor = 2;
 constexpr uint8_t kProtocolMinor = 0;
-constexpr uint32_t kSchemaCrc = 0x5904cf63;
+constexpr uint32_t kSchemaCrc = 0x51379541;
 constexpr uint32_t kBaud = 250000;
 constexpr uint8_t kVersionMajor = 0;
 constexpr uint8_t kVersionMinor = 1;
@@ -21,9 +21,9 @@ constexpr uint8_t kMaxPayloadToHost = 109;
 constexpr uint8_t kMaxPayloadToBoard = 13;
 
 // Time from t_us of a SAMPLE to the START condition of each read, microseconds, by the I2C clock in force.
-constexpr uint16_t kImuOffsetUs = 13;
-constexpr uint16_t kImu2OffsetUs400Khz = 540;
-constexpr uint16_t kImu2OffsetUs100Khz = 1680;
+constexpr uint16_t kImuOffsetUs = 9;
+constexpr uint16_t kImu2OffsetUs400Khz = 536;
+constexpr uint16_t kImu2OffsetUs100Khz = 1676;
 
 // Why the board started: the ATmega328P's MCUSR, and `hung` if the watchdog interrupt stored the program counter.
 namespace reset_cause {
@@ -37,8 +37,8 @@ constexpr uint8_t kHung = 0x10;
 // Which sections a SAMPLE carries, in the order of these bits; bits 4 to 6 hold the number of mice.
 namespace sections {
 constexpr uint8_t kImu = 0x01;
-constexpr uint8_t kImu2 = 0x02;
-constexpr uint8_t kBaro = 0x04;
+constexpr uint8_t kBaro = 0x02;
+constexpr uint8_t kImu2 = 0x04;
 constexpr uint8_t kMag = 0x08;
 }  // namespace sections
 
@@ -207,6 +207,13 @@ struct __attribute__((packed)) Sample {
     int16_t gyro_z;  // deg/s
   };
   static_assert(sizeof(Imu) == 14, "no padding");
+  // The barometer.
+  struct __attribute__((packed)) Baro {
+    uint16_t baro_ut;  // uncompensated temperature, 16 bits: UT of a BMP180, adc_T / 16 of a BMP280
+    uint32_t baro_up;  // uncompensated pressure: 16 + oversampling bits of a BMP180, 20 bits of a BMP280
+    uint8_t baro_count;  // increases by one with each new baro_up; wraps
+  };
+  static_assert(sizeof(Baro) == 7, "no padding");
   // The inertial sensor at 0x69, in its own axes, read right after the first.
   struct __attribute__((packed)) Imu2 {
     int16_t accel2_x;  // g
@@ -218,13 +225,6 @@ struct __attribute__((packed)) Sample {
     int16_t gyro2_z;  // deg/s
   };
   static_assert(sizeof(Imu2) == 14, "no padding");
-  // The barometer.
-  struct __attribute__((packed)) Baro {
-    uint16_t baro_ut;  // uncompensated temperature, 16 bits: UT of a BMP180, adc_T / 16 of a BMP280
-    uint32_t baro_up;  // uncompensated pressure: 16 + oversampling bits of a BMP180, 20 bits of a BMP280
-    uint8_t baro_count;  // increases by one with each new baro_up; wraps
-  };
-  static_assert(sizeof(Baro) == 7, "no padding");
   // The magnetometer, in its own axes.
   struct __attribute__((packed)) Mag {
     int16_t mag_x;  // the scale depends on the family

@@ -1,9 +1,9 @@
-// The bits of a PS/2 line, seen from the host: one falling edge of the mouse's clock at a time.
+// The bits of one PS/2 line, from the host's side: one falling edge of the mouse's clock at a time.
 //
 // A transaction is an optional byte to the mouse and a number of bytes from it. Between two transactions the host holds
-// the clock low, so that the mouse can neither send nor disturb anything. falling_edge() is called from the pin-change
-// interrupt, and says what to do with the lines; it keeps all bits of a byte in one word with a marker bit, so that it
-// needs neither a counter nor a loop.
+// the clock low, which stops the mouse from sending. The pin-change interrupt calls falling_edge() and carries out the
+// action that it returns. All bits of a byte are kept in one word with a marker bit, which needs neither a counter nor a
+// loop.
 //
 // Timing and framing: A. Chapweske, "The PS/2 Mouse/Keyboard Protocol".
 #pragma once
@@ -14,26 +14,29 @@ class Ps2Bits {
   enum class Outcome : uint8_t {
     kRunning,
     kDone,
-    kBadParity,   // after which the clock is held: the mouse has sent the byte and waits
-    kBadFraming,  // start or stop bit wrong: in step no more
-    kRefused,     // the mouse did not acknowledge the byte it was sent
+    kBadParity,   // the clock is held: the mouse has sent the byte and waits
+    kBadFraming,  // start or stop bit wrong: out of step
+    kNotTaken,    // the mouse sent no acknowledge bit after the byte to it
+    kRefused,     // the first answer is not ACK (0xFA): RESEND (0xFE), ERROR (0xFC) or another byte
   };
   enum class Act : uint8_t { kNone, kDataLow, kDataHigh, kHoldClock };
 
+  static constexpr uint8_t kAcknowledge = 0xFA;
   static constexpr uint8_t kMaxAnswers = 4;
-  // One step of the time that falling_edge() is told; it may wrap.
+  // Unit of the time that falling_edge() receives; it may wrap.
   static constexpr uint8_t kStepUs = 64;
 
-  // Before the clock is let go: data is low then already, which is the start bit.
-  void begin_sending(uint8_t byte, uint8_t answers) {
+  // Call before the clock is released; data is low already, which is the start bit. `acknowledged`: the first answer must
+  // be ACK, any other byte ends the transaction.
+  void begin_sending(uint8_t byte, uint8_t answers, bool acknowledged) {
     shift_ = byte | (odd_parity(byte) ? kSendParity : 0) | kSendStop | kSendMarker;
     sending_ = true;
-    begin(answers);
+    begin(answers, acknowledged);
   }
-  void begin_listening(uint8_t answers) {
+  void begin_receiving(uint8_t answers) {
     shift_ = kReceiveMarker;
     sending_ = false;
-    begin(answers);
+    begin(answers, false);
   }
 
   __attribute__((always_inline)) Act falling_edge(bool data, uint8_t now) {
@@ -41,10 +44,10 @@ class Ps2Bits {
     last_edge_ = now;
     uint16_t shift = shift_;
     if (sending_) return send_bit(shift, data);
-    // A byte whose clock stopped for 2 ms is given up: this edge is the first of another one.
+    // A byte whose clock paused for 2 ms is abandoned: this edge is the first of a new byte.
     if (gap > kGapSteps && shift != kReceiveMarker) {
       shift = kReceiveMarker;
-      resyncs_++;
+      resyncs_ = resyncs_ + 1;
     }
     shift >>= 1;
     if (data) shift |= kReceiveMarker;
@@ -54,15 +57,17 @@ class Ps2Bits {
   }
 
   Outcome outcome() const { return outcome_; }
-  uint8_t received() const { return received_; }  // sound bytes
+  bool sending() const { return sending_; }
+  uint8_t received() const { return received_; }  // bytes without an error
   const uint8_t* bytes() const { return bytes_; }
-  uint16_t resyncs() const { return resyncs_; }
+  // Bytes abandoned; wraps. One byte, because the main loop reads it while interrupts are enabled.
+  uint8_t resyncs() const { return resyncs_; }
 
  private:
   static constexpr uint16_t kSendParity = 1 << 8;
   static constexpr uint16_t kSendStop = 1 << 9;
   static constexpr uint16_t kSendMarker = 1 << 10;
-  // Bits come in at the top and push the marker down: 11 of them put it at bit 0, the start bit at bit 1.
+  // Bits enter at the top and shift the marker down: after 11 bits it is bit 0, and the start bit is bit 1.
   static constexpr uint16_t kReceiveMarker = 1 << 11;
   static constexpr uint8_t kGapSteps = 2000 / kStepUs;
 
@@ -73,15 +78,16 @@ class Ps2Bits {
     return !(byte & 1);
   }
 
-  void begin(uint8_t answers) {
+  void begin(uint8_t answers, bool acknowledged) {
     expected_ = answers;
+    acknowledged_ = acknowledged;
     received_ = 0;
     outcome_ = Outcome::kRunning;
   }
 
   __attribute__((always_inline)) Act send_bit(uint16_t shift, bool data) {
-    if (shift == 1) {  // all is out: this is the mouse's acknowledge bit
-      if (data) return end(Outcome::kRefused);
+    if (shift == 1) {  // all bits are sent: this is the mouse's acknowledge bit
+      if (data) return end(Outcome::kNotTaken);
       sending_ = false;
       shift_ = kReceiveMarker;
       return Act::kNone;
@@ -97,10 +103,11 @@ class Ps2Bits {
     if (start || !stop) return end(Outcome::kBadFraming);
     if (parity != odd_parity(byte)) return end(Outcome::kBadParity);
     const uint8_t received = received_;
-    if (received == kMaxAnswers) return end(Outcome::kBadFraming);  // more than anyone asked for
+    if (received == kMaxAnswers) return end(Outcome::kBadFraming);  // more than requested
     bytes_[received] = byte;
     const uint8_t count = received + 1;
     received_ = count;
+    if (received == 0 && acknowledged_ && byte != kAcknowledge) return end(Outcome::kRefused);
     return count == expected_ ? end(Outcome::kDone) : Act::kNone;
   }
 
@@ -110,11 +117,12 @@ class Ps2Bits {
   }
 
   uint16_t shift_ = kReceiveMarker;
-  uint16_t resyncs_ = 0;
   uint8_t bytes_[kMaxAnswers];
   uint8_t last_edge_ = 0;
   uint8_t expected_ = 1;
+  volatile uint8_t resyncs_ = 0;
   volatile uint8_t received_ = 0;
   volatile Outcome outcome_ = Outcome::kDone;
   bool sending_ = false;
+  bool acknowledged_ = false;
 };

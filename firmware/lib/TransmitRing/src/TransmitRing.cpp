@@ -3,7 +3,7 @@
 #include <Crc16.h>
 #include <Messages.h>
 
-// COBS, for payloads below 254 bytes: one code byte in front, and every 0x00 becomes the distance to the next one.
+// COBS for payloads below 254 bytes: one code byte in front, and every 0x00 becomes the distance to the next one.
 class TransmitRing::Encoder {
  public:
   Encoder(uint8_t* ring, uint8_t at) : ring_(ring), code_at_(at), at_(at + 1) {}
@@ -17,7 +17,7 @@ class TransmitRing::Encoder {
   }
   uint8_t finish() {
     close_block();
-    ring_[code_at_] = 0;  // the delimiter stands where the next block would have begun
+    ring_[code_at_] = 0;  // the delimiter takes the place of the next block's code
     return at_;
   }
 
@@ -51,6 +51,8 @@ bool TransmitRing::put(uint8_t type, const void* body, uint8_t size) {
   }
   encoder.add(static_cast<uint8_t>(crc.value()));
   encoder.add(static_cast<uint8_t>(crc.value() >> 8));
-  head_ = encoder.finish();
+  const uint8_t end = encoder.finish();
+  __atomic_signal_fence(__ATOMIC_RELEASE);  // the bytes are in the ring before the interrupt sees the new head
+  head_ = end;
   return true;
 }

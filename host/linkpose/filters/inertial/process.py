@@ -67,7 +67,7 @@ _UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the h
 
 @compiled
 def process(
-    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint16], dead: NDArray[np.bool_],
+    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint32], dead: NDArray[np.bool_],
     imu: ImuCalibration, parameters: Record, states: Record, out: Record,
 ) -> None:  # fmt: skip
     """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.

@@ -1,4 +1,8 @@
-"""`linkpose flash` as a user types it, through Optiboot on the emulated board."""
+"""`linkpose flash` as a user types it, through Optiboot on the emulated board.
+
+The command waits by the wall clock: the emulated bootloader must answer within 1.6 s, for which it needs 0.5 s of its
+own time. Every other test of the upload runs in the board's time (test_bootloader.py).
+"""
 
 from __future__ import annotations
 
@@ -38,6 +42,7 @@ def test_the_prebuilt_firmware_is_built_from_these_sources(firmware_hex: Path) -
     assert same, "firmware.hex is stale: type `python firmware/platform/prebuilt.py`"
 
 
+@pytest.mark.realtime
 def test_a_blank_board_boots_the_prebuilt_firmware_with_no_program_on_the_path(
     blank: VirtualUno, tmp_path: Path
 ) -> None:
@@ -51,6 +56,7 @@ def test_a_blank_board_boots_the_prebuilt_firmware_with_no_program_on_the_path(
     assert shown["source revision"] == f"{image.identity.source_revision:08x}"
 
 
+@pytest.mark.realtime
 def test_platformio_builds_what_is_uploaded(firmware_hex: Path, blank: VirtualUno, tmp_path: Path) -> None:
     image = read_image(firmware_hex)
     with PtyServer(blank, tmp_path / "port"):

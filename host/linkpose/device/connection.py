@@ -31,14 +31,14 @@ class Disconnected(LinkposeError):
 
 @dataclass(slots=True)
 class Arrival:
-    """Messages that arrived together, and when (s, the link's clock)."""
+    """Messages that arrived together, and when (s, the clock of the connection)."""
 
     time_s: float
     messages: list[Message | OtherProtocol]
     data: bytes = field(repr=False)
 
 
-class Link:
+class Connection:
     """A port that is read all the time, so that nothing is lost while the program is busy elsewhere.
 
     The clock is `time.perf_counter` (`time.monotonic` steps by 15.6 ms on Windows before Python 3.13), or the port's

@@ -58,7 +58,8 @@ def test_every_raw_pair_gives_a_number_or_nan():
     ],
 )
 def test_die_temperature_by_family(family, count, celsius):
-    assert mpu6050.temperature(float(count), family) == pytest.approx(celsius, abs=0.01, nan_ok=True)
+    scale, offset = mpu6050.temperature_scale(family)
+    assert count * scale + offset == pytest.approx(celsius, abs=0.01, nan_ok=True)
 
 
 def test_magnetometer_scales():

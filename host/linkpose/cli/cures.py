@@ -1,0 +1,49 @@
+"""What to type: the one table that adds flags and commands to the library's errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from linkpose import errors
+
+FLASH = "type `linkpose flash`"
+
+# Error -> what the user types, from the error's facts. The most derived class counts.
+CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
+    errors.FileExists: lambda e: "name another file or add --force to replace it",
+    errors.CannotWrite: lambda e: "name a file in a folder you may write to",
+    errors.TooFewRows: lambda e: (
+        f"to score the common part alone, add --from {e.common_s[0]:.6g} --to {e.common_s[1]:.6g}"
+    ),
+    errors.PortNotFound: lambda e: "`linkpose ports` lists those there are",
+    errors.NotASerialPort: lambda e: "`linkpose ports` lists those there are",
+    errors.NoBoardFound: lambda e: (
+        ("connect it or choose with --port" if e.ports else "plug the board in")
+        + (", or try --port sim://link" if e.simulated_will_do else "")
+    ),
+    errors.SeveralBoardsFound: lambda e: "choose one with --port",
+    errors.NoFirmware: lambda e: f"{FLASH} to put linkpose's firmware on the board, or choose another port with --port",
+    errors.WrongFirmware: lambda e: FLASH if e.is_older else "type `pip install --upgrade linkpose`",
+    errors.MissingJ2S: lambda e: (
+        "type `linkpose calibrate joint`, give it with --j2s X,Y,Z, or estimate it with --j2s auto"
+    ),
+    errors.FilterCannotRun: lambda e: cure(e.reason),
+    errors.NoFilterRuns: lambda e: "; ".join(dict.fromkeys(filter(None, map(cure, e.reasons.values())))),
+    errors.NotPositiveDefinite: lambda e: (
+        "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
+    ),
+}
+
+
+def cure(error: errors.LinkposeError) -> str:
+    """What to type against an error; empty where the error's own text says it all."""
+    for kind in type(error).__mro__:
+        if kind in CURES:
+            return CURES[kind](error)
+    return ""
+
+
+def sentence(error: errors.LinkposeError) -> str:
+    """The error as the user reads it: what, why, what to type."""
+    return "; ".join(filter(None, (str(error), cure(error))))

@@ -1,0 +1,103 @@
+"""Standard streams that may be closed, full or without a reader.
+
+A message that cannot be shown is dropped, because the measurement is worth more than the message. A result that cannot
+be written is a failure with one sentence.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any, TextIO, cast
+
+from linkpose.errors import LinkposeError
+
+
+class _Stream:
+    """A text stream whose failures are handled. Everything else is the stream's own."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+class _Messages(_Stream):
+    """Drops what cannot be written."""
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            _discard(self._stream)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except (OSError, ValueError):
+            _discard(self._stream)
+
+
+class _Results(_Stream):
+    """Raises LinkposeError for what cannot be written."""
+
+    def write(self, text: str) -> int:
+        if text == "":  # click writes nothing to find out what the stream takes; a full disk refuses even that
+            return 0
+        with self._failing_well():
+            return self._stream.write(text)
+
+    def flush(self) -> None:
+        with self._failing_well():
+            self._stream.flush()
+
+    @contextlib.contextmanager
+    def _failing_well(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            _discard(self._stream)
+            if error.errno in (errno.EPIPE, errno.EINVAL):  # EINVAL: Windows
+                raise LinkposeError("the reader of the output has gone; stopped") from None
+            raise LinkposeError(f"cannot write the output: {error.strerror}; write it to another place") from None
+
+
+def _discard(stream: TextIO) -> None:
+    """What is still buffered goes nowhere: Python would try, and fail, to write it at the end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+class _Closed:
+    """Takes the place of a stdout that was closed before the start."""
+
+    encoding, errors = "utf-8", "strict"
+
+    def write(self, _text: str) -> int:
+        raise LinkposeError("cannot write the output: stdout is closed; write it to a file or a pipe")
+
+    def flush(self) -> None:
+        """Nothing is buffered."""
+
+    def isatty(self) -> bool:
+        return False
+
+
+@contextlib.contextmanager
+def safe_streams() -> Iterator[None]:
+    """Within this context, stdout and stderr fail as this module describes."""
+    before = sys.stdout, sys.stderr
+    nowhere = open(os.devnull, "w", encoding="utf-8") if sys.stderr is None else None  # noqa: SIM115, PTH123
+    sys.stdout = cast(TextIO, _Closed() if sys.stdout is None else _Results(sys.stdout))
+    sys.stderr = cast(TextIO, _Messages(nowhere or before[1]))
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+        if nowhere is not None:
+            nowhere.close()

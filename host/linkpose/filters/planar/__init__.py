@@ -1,0 +1,146 @@
+"""`planar-ekf`, `planar-ukf`: pose of a robot from its mice and gyro, with self-calibration of the mice.
+
+In each step from one reading of the mice to the next, the gyro measures ω + b, each mouse its own velocity, and a rest
+shows b. The pose then advances on the arc of the updated velocity. `state` lists the state, `moments` the two filters,
+`rest` the zero-rate updates; the fault tests are those of the `mice` filter, with this filter's calibration and bias.
+
+Angles, relative scales and positions of the mice follow from any drive with turns. Two things cannot be observed: the
+angle common to all mice, which defines "ahead", and their common scale beyond what the gyro and the positions of the
+mice show. Another floor, which changes the scale of all mice, is recognised when the robot turns. An error of the
+gyro's own scale is not observable; it is not in the standard deviation of the heading.
+
+Source: [Thesis], equations (1)-(17); [Mice], (6), (7).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from linkpose.filters._imu import ImuCalibration
+from linkpose.filters.mice import MiceParameters, check_placement
+from linkpose.filters.mice.reading import BIAS_STD
+from linkpose.filters.mice.state import Floats, fresh_state, parameters_record, placement_record
+from linkpose.filters.planar.process import SHOWN, process
+from linkpose.filters.planar.state import ANGLE, MICE, OF_MOUSE, POSITION, SCALE, PlanarParameters
+from linkpose.filters.planar.state import fresh_state as fresh_planar_state
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+
+__all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
+
+_COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
+
+
+@dataclass(frozen=True, slots=True)
+class FoundMouse:
+    """A mouse (1 for the first) as the drive has shown it, with standard deviations."""
+
+    mouse: int
+    counts_per_m: float
+    counts_per_m_std: float
+    angle_deg: float
+    angle_std_deg: float
+    x_m: float
+    y_m: float
+    position_std_m: float
+
+
+class _PlanarFilter:
+    """Either filter over blocks of samples."""
+
+    name: str
+    _is_ukf: bool
+
+    def __init__(
+        self, rig: Rig, parameters: MiceParameters | None = None, planar: PlanarParameters | None = None
+    ) -> None:
+        """The rig must place at least one mouse. Raises CannotRun for mice that all sit at one place."""
+        check_placement(rig.mouse)
+        self.parameters, self.planar = parameters or MiceParameters(), planar or PlanarParameters()
+        self._rig = rig
+        self._imu = ImuCalibration.of(rig.imu)
+        self._placed, self._placement = placement_record(rig.mouse), placement_record(rig.mouse)
+        self._parameters = parameters_record(self.parameters)
+        self._planar = _record_of(self.planar)
+        self._mice = fresh_state(BIAS_STD)
+        self.state = fresh_planar_state(len(rig.mouse), self.planar, self._imu.gyro_variance)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the estimate's columns, the unit last."""
+        prefix = self.name.replace("-", "_")
+        split = [name.partition("_")[::2] for name in _COLUMNS]
+        return (
+            *(f"{prefix}_{name}" for name in _COLUMNS),
+            *(f"{prefix}_{quantity}_std_{unit}" for quantity, unit in split),
+        )
+
+    @property
+    def rejected(self) -> int:
+        """Readings so far that gave no measurement of a mouse."""
+        return int(self.state[0].rejected + self._mice[0].rejected)
+
+    @property
+    def distrusted(self) -> int:
+        """Bit mask of the mice that are excluded now; bit 0 is mouse 1."""
+        return int(self._mice[0].distrusted)
+
+    @property
+    def found_mice(self) -> tuple[FoundMouse, ...]:
+        """Calibration of each mouse so far."""
+        return tuple(self._found(i) for i in range(len(self._rig.mouse)))
+
+    @property
+    def scale_change(self) -> tuple[float, float]:
+        """Common factor of the mice's counts per metre relative to the rig, and its standard deviation."""
+        state, mice = self.state[0], len(self._rig.mouse)
+        at = [int(MICE + OF_MOUSE * i + SCALE) for i in range(mice)]
+        mean = float(np.mean(state["mean"][at]))
+        return math.exp(-mean), math.sqrt(float(np.mean(state["covariance"][np.ix_(at, at)])))
+
+    def _found(self, i: int) -> FoundMouse:
+        state, mouse, at = self.state[0], self._rig.mouse[i], int(MICE + OF_MOUSE * i)
+        std = np.sqrt(np.diag(state["covariance"]))
+        per_m = mouse.counts_per_m * math.exp(-state["mean"][at + SCALE])
+        return FoundMouse(
+            mouse=i + 1,
+            counts_per_m=per_m,
+            counts_per_m_std=float(per_m * std[at + SCALE]),
+            angle_deg=mouse.angle_deg + math.degrees(state["mean"][at + ANGLE]),
+            angle_std_deg=math.degrees(std[at + ANGLE]),
+            x_m=float(mouse.x_m + state["mean"][at + POSITION]),
+            y_m=float(mouse.y_m + state["mean"][at + POSITION + 1]),
+            position_std_m=float(std[at + POSITION]),
+        )
+
+    def process(self, block: Measurements) -> Floats:
+        """x, y, heading (in [−π, π)), v_x, v_y, ω and their standard deviations at each of the N samples: (N, 12)."""
+        out = np.empty((len(block), 2 * SHOWN))
+        process(
+            block.time_s, block.mice_counts, block.gyro_rad_s, block.flags, self._is_ukf, self._placed[0],
+            self._placement[0], self._imu, self._parameters[0], self._planar[0], self._mice[0], self.state[0], out,
+        )  # fmt: skip
+        return out
+
+
+def _record_of(parameters: PlanarParameters) -> Any:
+    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
+    return np.array([tuple(parameters)], dtype).view(np.recarray)
+
+
+class PlanarEkf(_PlanarFilter):
+    """The extended Kalman filter."""
+
+    name = "planar-ekf"
+    _is_ukf = False
+
+
+class PlanarUkf(_PlanarFilter):
+    """The unscented Kalman filter, with the thesis's plain transform."""
+
+    name = "planar-ukf"
+    _is_ukf = True

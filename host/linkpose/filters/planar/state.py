@@ -1,0 +1,130 @@
+"""State, parameters and memory layout of the planar filters.
+
+The state is (x, y, θ, v_x, v_y, ω, b) and, for each mouse, (ε_i, α_i, δx_i, δy_i):
+
+    x, y, θ      pose on the floor (m, rad), 0 at the first sample
+    v_x, v_y, ω  mean velocity over the last step, in the robot's axes (m/s, rad/s)
+    b            gyro bias beyond the rig's (rad/s)
+    ε_i, α_i     logarithm of the mouse's metres per count, and its angle (rad), relative to the rig
+    δx_i, δy_i   position of the mouse relative to the rig (m)
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from linkpose.filters.mice.state import MOST
+
+# Indices. A NumPy integer, because the compiler gives each Python integer constant a type of its own.
+X, Y, HEADING, VX, VY, WZ, BIAS, MICE = (np.int64(k) for k in range(8))
+SCALE, ANGLE, POSITION, OF_MOUSE = (np.int64(k) for k in (0, 1, 2, 4))
+SIZE = int(MICE) + int(OF_MOUSE) * MOST
+ROWS = 2 * MOST + 3  # of the largest measurement
+QUEUE = 4  # blocks of the gyro's rate at rest
+
+_VECTOR = ("f8", (SIZE,))
+_MATRIX = ("f8", (SIZE, SIZE))
+
+STATE = np.dtype(
+    [
+        ("size", "i8"),  # of the state with the rig's mice
+        ("mean", *_VECTOR),
+        ("covariance", *_MATRIX),
+        ("start", *_VECTOR),  # standard deviations to begin with
+        ("gyro_variance", "f8"),  # of one sample ((rad/s)²), as the rests show it
+        ("gyro_samples", "f8"),  # weight of that estimate
+        # Rest.
+        ("rest_s", "f8"),  # how long no mouse has counted (s)
+        ("at_rest", "?"),
+        ("block_s", "f8"),  # of the current block
+        ("block_sum", "f8"),  # of its rates (rad/s)
+        ("block_squares", "f8"),
+        ("block_count", "i8"),
+        ("queue", "f8", (QUEUE, 3)),  # mean rate, number of rates, sum of squared deviations of finished blocks
+        ("queued", "i8"),
+        # Common scale of the mice against the gyro: sums over the last turns.
+        ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
+        ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
+        ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
+        ("floors", "i8"),  # how often the floor has changed
+        ("chi2", "f8"),  # of the last innovation
+        ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
+        # The measurement of a step: values, their variances, what the state predicts.
+        ("rows", "i8"),
+        ("value", "f8", (ROWS,)),
+        ("noise", "f8", (ROWS,)),
+        ("kind", "i8", (ROWS,)),
+        ("predicted", "f8", (ROWS,)),
+        ("cross", "f8", (SIZE, ROWS)),
+        ("innovation", "f8", (ROWS, ROWS)),
+        # Scratch.
+        ("root", *_MATRIX),
+        ("points", "f8", (2 * SIZE, SIZE)),
+        ("point", *_VECTOR),
+        ("moved", "f8", (2 * SIZE, 3)),
+        ("fresh", "f8", (3, SIZE)),
+        ("jacobian", "f8", (ROWS, SIZE)),
+        ("at_points", "f8", (2 * SIZE, ROWS)),
+        # Counters.
+        ("rejected", "i8"),  # readings that gave no measurement
+        ("restarts", "i8"),  # of a covariance that was not positive definite
+    ],
+    align=True,
+)
+
+
+class PlanarParameters(NamedTuple):
+    """What the filters assume of the robot, the gyro and the calibration of the mice: standard deviations (1σ)."""
+
+    # Motion: velocities of a small robot and how long they last (s). Halving the times doubles the variance with which
+    # a velocity may change, and the error while no mouse is of use.
+    speed_m_s: float = 0.6
+    speed_s: float = 1.5
+    turn_rad_s: float = 2.5
+    turn_s: float = 1.0
+    # Gyro: random walk of the bias (rad/s per √s) with an Allan deviation of 0.0023 °/s at 100 s; the axes of a real
+    # MPU-6050 had 0.003, 0.0013 and 0.0007 °/s. Doubled: a rest is trusted a quarter as long.
+    bias_rad_s: float = 0.35  # never calibrated: ±20 °/s (data sheet)
+    bias_walk: float = math.radians(4e-4)
+    # Mice: what `calibrate mice` leaves common to all mice: its line of 2 m, measured and driven straight to 2 mm ...
+    common_scale: float = 0.0012
+    common_angle_rad: float = math.radians(0.06)
+    # ... what may set them apart, as bought and mounted by eye: the drive determines it ...
+    own_scale: float = 0.03
+    own_angle_rad: float = math.radians(3.0)
+    # ... where a ruler puts them (±1 mm), and how fast height and floor change them (per √s).
+    position_m: float = 0.0006
+    scale_walk: float = 1e-4
+    angle_walk: float = 1e-4
+    # Another floor: change of the common scale once the gyro has shown one.
+    floor_scale: float = 0.05
+
+
+def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
+    """An array of one state record before the first sample."""
+    records = np.zeros(1, STATE).view(np.recarray)
+    state: Any = records[0]
+    state.size = int(MICE) + int(OF_MOUSE) * mice
+    state.gyro_variance, state.gyro_samples = gyro_variance, 20.0
+    covariance = state.covariance
+    for index, std in (
+        *((k, 1e-6) for k in (X, Y, HEADING)),
+        *((k, p.speed_m_s) for k in (VX, VY)),
+        (WZ, p.turn_rad_s),
+        (BIAS, p.bias_rad_s),
+    ):
+        covariance[index, index] = std * std
+    for i in range(mice):
+        a = MICE + OF_MOUSE * i
+        for j in range(mice):
+            b = MICE + OF_MOUSE * j
+            apart = (i == j) - 1.0 / mice
+            covariance[a + SCALE, b + SCALE] = p.common_scale**2 + apart * p.own_scale**2
+            covariance[a + ANGLE, b + ANGLE] = p.common_angle_rad**2 + apart * p.own_angle_rad**2
+        for k in range(2):
+            covariance[a + POSITION + k, a + POSITION + k] = p.position_m**2
+    state.start[:] = np.sqrt(np.diag(covariance))
+    return records

@@ -1,0 +1,85 @@
+"""Recording a session: samples become rows in SI units, rows go to the disk, and the end loses nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from linkpose.device.session import Placement, Session
+from linkpose.errors import InvalidValue, LinkposeError
+from linkpose.recording.csvfile import create
+from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
+from linkpose.sensors.conversion import BoardSettings, Converter
+from linkpose.sensors.health import HealthMonitor, expected_sensors
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Rig
+
+
+class Recorder:
+    """Converts a session's samples to measurements, and writes them to a recording if one is asked for.
+
+    A context manager: leaving it without `close` marks the recording as ended by a failure.
+    """
+
+    def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool = False) -> None:
+        """`path` None: convert only. Raises FileExists (unless `force`) and CannotWrite."""
+        if path is not None and path.suffix == ".bin":
+            raise InvalidValue(str(path), "is not a name for a recording, which is a CSV file: .bin is a raw capture")
+        self._session = session
+        settings = BoardSettings.of(session.hello)
+        mouse_ports = max(settings.mouse_ports, len(rig.mouse))
+        self._converter = Converter(settings, mouse_ports)
+        self.monitor = HealthMonitor(settings.sample_rate_hz, expected_sensors(session.hello, mouse_ports))
+        self._writer: RecordingWriter | None = None
+        if path is not None:
+            clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
+            head = metadata(session.hello, settings, session.port, rig, clock)
+            self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force)
+
+    def convert(self, placements: list[Placement]) -> Measurements:
+        """The samples as a block of measurements, with NaN for readings that are worth nothing.
+
+        The recording keeps all readings as they came. Its rows are with the operating system when this returns.
+        """
+        block = self._converter.convert_placed([p.sample for p in placements], [p.place for p in placements])
+        if self._writer is not None and placements:
+            self._writer.write_block(block)
+        checked, changes = self.monitor.check(block.measurements)
+        for change in changes:
+            self._session.notify(str(change))
+        return checked
+
+    def close(self, ended: str) -> None:
+        """Writes the closing line; `ended` is "duration", "interrupted" or "failure"."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            health = self._session.health()
+            status = health.status
+            board = {"frames_dropped": status.frames_dropped, "ticks_missed": status.ticks_missed} if status else None
+            timeline = self._session.timeline
+            with writer:
+                more = {"board": board, "sensors": self.monitor.as_dict(), "ended": ended}
+                writer.close(closing(timeline, health.corrupt, health.drift_ppm, **more))
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(LinkposeError):  # the failure that led here is on its way to the user
+            self.close("failure")
+
+
+@contextlib.contextmanager
+def raw_capture(path: Path | None, force: bool = False) -> Iterator[BinaryIO | None]:
+    """A new unbuffered file for every received byte, or None where no file is asked for.
+
+    Raises FileExists (unless `force`) and CannotWrite.
+    """
+    if path is None:
+        yield None
+        return
+    with os.fdopen(create(path, force), "wb", buffering=0) as file:
+        yield file

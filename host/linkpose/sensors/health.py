@@ -1,0 +1,408 @@
+"""Health of the sensors' data: which readings are worth using, and what is wrong with the others.
+
+The checks use the firmware's flags and the readings themselves, so that recordings of older firmware and of other
+programs are checked too. They are causal: blocks of any length give the same result, live and in replay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.wire.messages import DeviceState, Hello, SampleFlags
+
+DEVICE_NAMES = ("imu", "imu2", "baro", "mag")  # in the order of HELLO's devices
+
+Codes = NDArray[np.int8]
+Bools = NDArray[np.bool_]
+
+# A burst of the MPU-6050 that repeats to the last bit. Its accelerometer's noise at the slowest low-pass filter and the
+# widest range is 2.3 counts (data sheet: 400 µg/√Hz, 5 Hz, 16 g), so that three axes repeat 10 times by chance once in
+# 10²⁷ bursts. The firmware uses the same time. Twice of it lets twice as many repeated readings into the filters.
+FROZEN_S = 0.2
+FROZEN_REPEATS = 10  # for sensors slower than 50 Hz
+# One axis that repeats while the other two change. Twice of it exceeds the second within which a fault is reported.
+STUCK_S = 0.5
+STUCK_REPEATS = 25
+LIVELY_REPEATS = 5  # an axis that repeats so often is too quiet to compare another axis with it
+# BMP180: noise 3 to 6 Pa, one new reading in 30 ms.
+BARO_FROZEN_S = 1.0
+BARO_FROZEN_REPEATS = 20
+BARO_STALE_S = 3.0  # without a new reading
+PRESSURE_RANGE_PA = (30_000.0, 110_000.0)  # BMP180 data sheet, table 1
+TEMPERATURE_RANGE_DEGC = (-41.0, 126.0)  # of the die: the data sheet's operating range, and its tolerance
+
+REPORT_AFTER_S = 0.25  # a state that lasts so long is reported: one lost reading is counted only
+SET_UP_S = 3.0  # a sensor that HELLO announces as being set up may take so long
+USABLE_S = 0.25  # a frozen sensor passes as valid for FROZEN_S
+
+
+class Cause(IntEnum):
+    """Why a reading is invalid."""
+
+    OK = 0
+    SILENT = 1  # no reading
+    BLANK = 2  # all bytes equal
+    FROZEN = 3  # repeats to the last bit
+    OUT_OF_RANGE = 4
+    STUCK = 5  # one axis repeats while the others change
+    STARTING = 6  # being set up
+
+    @property
+    def label(self) -> str:
+        """As in the summary and the closing line."""
+        return {Cause.STARTING: "being set up"}.get(self, self.name.lower().replace("_", " "))
+
+
+_REASON = {
+    Cause.SILENT: "gives no valid reading",
+    Cause.BLANK: "reads all zeros",
+    Cause.FROZEN: "repeats the same reading",
+    Cause.OUT_OF_RANGE: "gives impossible readings",
+    Cause.STUCK: "repeats one axis while the others change",
+}
+_WIRING = "Check its wiring and its supply"
+_POWER = "Unplug the board and plug it in again; if it happens again, check the wiring or replace the sensor"
+_CURE = {
+    Cause.SILENT: _WIRING,
+    Cause.BLANK: _WIRING,
+    Cause.FROZEN: _POWER,
+    Cause.OUT_OF_RANGE: _POWER,
+    Cause.STUCK: _POWER,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A sensor's state changed."""
+
+    time_s: float  # of the first sample in the new state
+    sensor: str
+    cause: Cause
+    lasted_s: float  # of the state before
+
+    def __str__(self) -> str:
+        if self.cause == Cause.OK:
+            return f"{self.time_s:.2f} s: {_title(self.sensor)} is back after {self.lasted_s:.2f} s"
+        return f"{self.time_s:.2f} s: {_title(self.sensor)} {_REASON[self.cause]}. {_CURE[self.cause]}"
+
+
+def _title(sensor: str) -> str:
+    names = {"imu": "the IMU", "imu2": "the second IMU", "baro": "the barometer", "mag": "the magnetometer"}
+    return names.get(sensor, f"mouse {sensor.removeprefix('mouse')}")
+
+
+class SensorHealth:
+    """State and counts of one sensor."""
+
+    def __init__(self, sensor: str, starting: bool) -> None:
+        self.sensor = sensor
+        self.samples = 0
+        self.saturated = 0
+        self.invalid: dict[Cause, int] = {}
+        self.cause: Cause | None = None  # the state that was reported last; None before the first sample
+        self._starting = starting
+        self._since_s = 0.0  # of the reported state
+        self._pending: tuple[Cause, float] | None = None  # another state, and since when
+
+    @property
+    def valid(self) -> int:
+        """Valid samples."""
+        return self.samples - sum(self.invalid.values())
+
+    def is_usable(self, rate_hz: float) -> bool:
+        """Whether there is more than what a sensor gives before its fault is found."""
+        return self.valid > USABLE_S * rate_hz or 2 * self.valid > self.samples
+
+    def count(self, codes: Codes, time_s: Floats, saturated: Bools) -> list[Change]:
+        """Count a block of samples by their Cause; the changes of state that it completes."""
+        if self._starting:
+            codes = self._excuse(codes, time_s)
+        self.samples += len(codes)
+        self.saturated += int(np.count_nonzero(saturated))
+        if self._pending is None and self.cause is not None and (codes == int(self.cause)).all():
+            if self.cause:
+                self.invalid[self.cause] = self.invalid.get(self.cause, 0) + len(codes)
+            return []
+        for cause, number in zip(*np.unique(codes, return_counts=True), strict=True):
+            if cause != Cause.OK:
+                self.invalid[Cause(cause)] = self.invalid.get(Cause(cause), 0) + int(number)
+        first = np.flatnonzero(np.diff(codes, prepend=-1))
+        last = np.append(first[1:], len(codes)) - 1
+        segments = zip(codes[first].tolist(), time_s[first].tolist(), time_s[last].tolist(), strict=True)
+        return [change for segment in segments for change in self._advance(*segment)]
+
+    def _excuse(self, codes: Codes, time_s: Floats) -> Codes:
+        """A sensor that is being set up gives no reading yet."""
+        heard = np.maximum.accumulate(codes != Cause.SILENT)
+        self._starting = not heard[-1] and bool(time_s[-1] < SET_UP_S)
+        return np.where((codes == Cause.SILENT) & ~heard & (time_s < SET_UP_S), np.int8(Cause.STARTING), codes)
+
+    def _advance(self, code: int, first_s: float, last_s: float) -> list[Change]:
+        cause = Cause(code)
+        if cause == self.cause or cause == Cause.STARTING:
+            self._pending = None
+            return []
+        if self._pending is None or self._pending[0] != cause:
+            self._pending = (cause, first_s)
+        if last_s - self._pending[1] < REPORT_AFTER_S:
+            return []
+        change = Change(self._pending[1], self.sensor, cause, self._pending[1] - self._since_s)
+        silent = self.cause is None and cause == Cause.OK  # it began well
+        self.cause, self._since_s, self._pending = cause, change.time_s, None
+        return [] if silent else [change]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the summary and the closing line."""
+        state = self._pending[0] if self.cause is None and self._pending else self.cause
+        if state is None:
+            state = Cause.STARTING if self.samples == 0 or self._starting else Cause.SILENT
+        return {
+            "state": state.label,
+            "samples": self.samples,
+            "valid": self.valid,
+            "invalid": {cause.label: number for cause, number in sorted(self.invalid.items())},
+            "saturated": self.saturated,
+        }
+
+
+class _Repeats:
+    """For each sample and column, how often and how long the value has repeated, over the borders of blocks."""
+
+    def __init__(self) -> None:
+        self._last: Floats | None = None
+        self._count: NDArray[np.int64] | None = None
+        self._begin_s: Floats | None = None
+
+    def follow(self, values: Floats, time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """`values` (N, K); repetitions (N, K) and their duration in s (N, K). NaN repeats nothing."""
+        return self.run(self.same(values), time_s)
+
+    def same(self, values: Floats) -> Bools:
+        """Whether each value (N, K) equals the one before."""
+        before = np.full((1, values.shape[1]), np.nan) if self._last is None else self._last
+        self._last = values[-1:].copy()
+        return np.asarray(values == np.concatenate([before, values[:-1]]))
+
+    def restart(self, time_s: Floats) -> None:
+        """As `run` of a block in which nothing repeats."""
+        self._count, self._begin_s = np.zeros(1, np.int64), time_s[-1:].copy()
+
+    def run(self, same: Bools, time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
+        """`same` (N, K): the sample continues the run of the one before."""
+        size, columns = same.shape
+        count = self._count if self._count is not None else np.zeros(columns, np.int64)
+        begin_s = self._begin_s if self._begin_s is not None else np.full(columns, np.nan)
+        rows = np.arange(size)[:, None]
+        start = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
+        inside = start >= 0
+        counts = np.where(inside, rows - start, rows + 1 + count)
+        begins = np.where(inside, time_s[start], begin_s)
+        self._count, self._begin_s = counts[-1], begins[-1]
+        with np.errstate(invalid="ignore"):
+            return counts, time_s[:, None] - begins
+
+
+@dataclass(frozen=True, slots=True)
+class _ImuFlags:
+    """Flags of an inertial sensor."""
+
+    valid: int
+    saturated: int
+    causes: Mapping[int, Cause]
+
+
+def _imu_flags(number: str) -> _ImuFlags:
+    """As plain integers: an IntFlag costs several µs each time it meets an array."""
+    bit = {flag.name: int(flag) for flag in SampleFlags}
+    causes = {f"IMU{number}_{cause.name}": cause for cause in (Cause.BLANK, Cause.FROZEN, Cause.OUT_OF_RANGE)}
+    return _ImuFlags(
+        bit[f"IMU{number}_VALID"],
+        bit[f"ACCEL{number}_SATURATED"] | bit[f"GYRO{number}_SATURATED"],
+        {bit[name]: cause for name, cause in causes.items()},
+    )
+
+
+_IMU_FLAGS, _IMU2_FLAGS = _imu_flags(""), _imu_flags("2")
+_MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in (1, 2, 3, 4)}
+
+
+class _Imu:
+    """Checks an inertial sensor."""
+
+    def __init__(self, flags: _ImuFlags) -> None:
+        self._flags = flags
+        self._caused = sum(flags.causes)  # all of these bits
+        self._burst = _Repeats()
+        self._axes = _Repeats()
+        self._stuck = _Repeats()
+
+    def check(
+        self, accel: Floats, gyro: Floats, temp: Floats, flags: NDArray[np.integer[Any]], time_s: Floats
+    ) -> Codes:
+        """Cause (N,) of each sample."""
+        values = np.concatenate([accel, gyro], axis=1)
+        codes = np.zeros(len(values), np.int8)
+        same = self._axes.same(values)
+        if not same.any():  # most samples of a sensor with noise
+            for each in (self._axes, self._stuck, self._burst):
+                each.restart(time_s)
+            return self._judge(codes, values, temp, flags)
+        counts, _ = self._axes.run(same, time_s)
+        stuck_s = self._check_axes(same, counts, time_s)
+        repeats, held_s = self._burst.run(np.asarray(same.all(axis=1))[:, None], time_s)
+        codes[stuck_s.max(axis=1, initial=0.0) >= STUCK_S - 1e-6] = Cause.STUCK
+        codes[(repeats[:, 0] >= FROZEN_REPEATS) & (held_s[:, 0] >= FROZEN_S - 1e-6)] = Cause.FROZEN
+        return self._judge(codes, values, temp, flags)
+
+    def _judge(self, codes: Codes, values: Floats, temp: Floats, flags: NDArray[np.integer[Any]]) -> Codes:
+        """Add to `codes` what a sample shows by itself."""
+        codes[(temp < TEMPERATURE_RANGE_DEGC[0]) | (temp > TEMPERATURE_RANGE_DEGC[1])] = Cause.OUT_OF_RANGE
+        codes[~values[:, :3].any(axis=1)] = Cause.BLANK  # not even gravity
+        codes[~np.isfinite(values).all(axis=1)] = Cause.SILENT
+        if (flags & self._caused).any():
+            for flag, cause in self._flags.causes.items():
+                codes[flags & flag != 0] = cause
+        return codes
+
+    def _check_axes(self, same: Bools, counts: NDArray[np.int64], time_s: Floats) -> Floats:
+        """How long each axis has repeated while the two others of its kind changed; 0 for less than STUCK_REPEATS."""
+        lively = (counts < LIVELY_REPEATS).reshape(len(counts), 2, 3)
+        others = lively[:, :, [1, 0, 0]] & lively[:, :, [2, 2, 1]]
+        repeats, held_s = self._stuck.run(same & others.reshape(same.shape), time_s)
+        return np.where(repeats >= STUCK_REPEATS, held_s, 0.0)
+
+
+class _Baro:
+    """Checks a barometer."""
+
+    def __init__(self) -> None:
+        self._value = _Repeats()
+        self._fresh = _Repeats()
+        self._readings = 0  # equal ones in a row, the first excluded
+
+    def check(self, pressure: Floats, fresh: Bools, time_s: Floats) -> Codes:
+        """Cause (N,) of each sample."""
+        codes = np.zeros(len(pressure), np.int8)
+        counts, held_s = self._value.follow(pressure[:, None], time_s)
+        readings = self._count_readings(fresh, counts[:, 0])
+        _, stale_s = self._fresh.run(~fresh[:, None], time_s)
+        with np.errstate(invalid="ignore"):
+            codes[(readings >= BARO_FROZEN_REPEATS) & (held_s[:, 0] >= BARO_FROZEN_S)] = Cause.FROZEN
+            codes[stale_s[:, 0] >= BARO_STALE_S] = Cause.FROZEN
+            codes[(pressure < PRESSURE_RANGE_PA[0]) | (pressure > PRESSURE_RANGE_PA[1])] = Cause.OUT_OF_RANGE
+        codes[np.isnan(pressure)] = Cause.SILENT
+        return codes
+
+    def _count_readings(self, fresh: Bools, repeats: NDArray[np.int64]) -> NDArray[np.int64]:
+        """How many new readings in a row had the same value, up to each sample."""
+        total = np.cumsum(fresh) + self._readings
+        before = np.concatenate([[self._readings], total[:-1]])
+        changed = repeats == 0
+        base = np.maximum.accumulate(np.where(changed, before, 0))
+        equal = total - base
+        self._readings = int(equal[-1])
+        return equal
+
+
+def expected_sensors(hello: Hello, mouse_ports: int) -> dict[str, str]:
+    """The sensors of a board for HealthMonitor: all its devices, and the mouse ports that a recording has."""
+    states = [device.state for device in hello.devices] + [mouse.state for mouse in hello.mice[:mouse_ports]]
+    names = [*DEVICE_NAMES, *(f"mouse{port}" for port in range(1, len(hello.mice) + 1))]
+    words = {DeviceState.ABSENT: "absent", DeviceState.STARTING: "being set up"}
+    return {name: words.get(DeviceState(state), "ok") for name, state in zip(names, states, strict=False)}
+
+
+class HealthMonitor:
+    """Checks consecutive blocks of measurements of one board or recording."""
+
+    def __init__(self, rate_hz: float, sensors: Mapping[str, str]) -> None:
+        """`sensors`: "imu", "imu2", "baro", "mag", "mouse1" ... with "ok", "being set up" or "absent"."""
+        self._rate_hz = rate_hz
+        self._samples = 0
+        self._absent = [name for name, state in sensors.items() if state == "absent"]
+        self.sensors = {
+            name: SensorHealth(name, starting=state == "being set up")
+            for name, state in sensors.items()
+            if state != "absent"
+        }
+        self._imu = _Imu(_IMU_FLAGS)
+        self._baro = _Baro()
+
+    def check(self, block: Measurements) -> tuple[Measurements, list[Change]]:
+        """The block with NaN for every invalid value, and the sensors whose state changed."""
+        if not len(block):
+            return block, []
+        self._samples += len(block)
+        changes: list[Change] = []
+        flags, time_s = block.flags.astype(np.int64), block.time_s
+        if "imu" in self.sensors:
+            block = self._check_imu(block, flags, changes)
+        if "baro" in self.sensors:
+            block = self._check_baro(block, changes)
+        for port in range(block.mice_counts.shape[1]):
+            name = f"mouse{port + 1}"
+            if (health := self.sensors.get(name)) is not None:
+                silent = np.asarray(np.isnan(block.mice_counts[:, port]).any(axis=1)).astype(np.int8)
+                overflow = flags & _MOUSE_OVERFLOW[name] != 0
+                changes += health.count(silent, time_s, overflow)
+        return block, changes
+
+    def _check_imu(self, block: Measurements, flags: NDArray[np.int64], changes: list[Change]) -> Measurements:
+        codes = self._imu.check(block.accel_m_s2, block.gyro_rad_s, block.imu_temp_degC, flags, block.time_s)
+        changes += self.sensors["imu"].count(codes, block.time_s, flags & _IMU_FLAGS.saturated != 0)
+        bad = codes != 0
+        if not bad.any():
+            return block
+        return replace(
+            block,
+            accel_m_s2=np.where(bad[:, None], np.nan, block.accel_m_s2),
+            gyro_rad_s=np.where(bad[:, None], np.nan, block.gyro_rad_s),
+            imu_temp_degC=np.where(bad, np.nan, block.imu_temp_degC),
+            flags=(block.flags & ~np.where(bad, _IMU_FLAGS.valid, 0).astype(block.flags.dtype)),
+        )
+
+    def _check_baro(self, block: Measurements, changes: list[Change]) -> Measurements:
+        codes = self._baro.check(block.pressure_Pa, block.baro_fresh, block.time_s)
+        changes += self.sensors["baro"].count(codes, block.time_s, np.zeros(0, np.bool_))
+        bad = codes != 0
+        if not bad.any():
+            return block
+        return replace(
+            block,
+            pressure_Pa=np.where(bad, np.nan, block.pressure_Pa),
+            baro_temp_degC=np.where(bad, np.nan, block.baro_temp_degC),
+            baro_fresh=block.baro_fresh & ~bad,
+        )
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """State and counts of every sensor, by name."""
+        absent: dict[str, dict[str, Any]] = {name: {"state": "absent"} for name in self._absent}
+        return absent | {name: health.as_dict() for name, health in self.sensors.items()}
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether an inertial sensor or a mouse gave usable data. True before the first sample."""
+        kinds = [health for name, health in self.sensors.items() if name.startswith(("imu", "mouse"))]
+        return not self._samples or any(health.is_usable(self._rate_hz) for health in kinds if health.samples)
+
+    @property
+    def why_unusable(self) -> str:
+        """The sentence for data of which nothing can be used."""
+        reasons = [
+            f"{_title(name)} {_REASON[max(health.invalid, key=lambda cause: health.invalid[cause])]}"
+            for name, health in self.sensors.items()
+            if health.invalid and _REASON.keys() & health.invalid.keys()
+        ]
+        return (
+            f"no usable data: {'; '.join(reasons) or 'no inertial sensor and no mouse is connected'}. {_WIRING_OF_ALL}"
+        )
+
+
+_WIRING_OF_ALL = "Check the wiring and the supply of the sensors; `linkpose info` shows what the board finds"

@@ -1,0 +1,166 @@
+"""evaluate: σ against errors, yaw and position without an absolute origin, chains, windows, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from linkpose.cli.cures import cure
+from linkpose.cli.evaluate import command
+from linkpose.errors import TooFewRows
+from linkpose.evaluation.scores import evaluate
+from linkpose.evaluation.statistics import Statistics
+from linkpose.recording.table import Table
+
+T = np.arange(4000) / 100
+RNG = np.random.default_rng(0)
+NOISE = RNG.standard_normal(len(T))
+
+
+def table(kind="estimate", **columns):
+    return Table(Path(f"{kind}.csv"), kind, {"time_s": T, **columns}, {}, None, 2)
+
+
+def motion(t=T):
+    return 1.5 + 0.1 * np.sin(3 * t) + 0.05 * np.sin(1.3 * t + 1)
+
+
+def score(estimate, truth, **window):
+    (found,) = evaluate(estimate, truth, **window).scores
+    return found
+
+
+def test_an_honest_sigma_has_a_nees_of_one():
+    estimate = table(joint_height_m=motion() + 0.01 * NOISE, joint_height_std_m=np.full(len(T), 0.01))
+    row = score(estimate, table("truth", height_m=motion())).as_dict()
+    assert row["height_nees"] == pytest.approx(1.0, abs=0.05)
+    assert row["height_within_2sigma"] == pytest.approx(0.954, abs=0.01)
+    assert row["quantities"]["height"]["p95"] == pytest.approx(1.96, abs=0.06)  # cm
+    assert row["quantities"]["height"]["nees"] == row["height_nees"]
+
+
+@pytest.mark.parametrize(
+    ("claimed", "verdict"),
+    [(1.0, "σ is right: 9"), (0.5, "σ is 2.0 times too small: 6"), (3.0, "σ is 3.0 times too large: 100 %")],
+)
+def test_the_verdict_says_by_how_much_sigma_is_off(claimed, verdict):
+    found = Statistics.of(NOISE, np.full(len(T), claimed)).verdict()
+    assert found is not None and found.startswith(verdict)
+
+
+def test_a_sigma_that_was_rounded_to_zero_is_that_of_its_last_digit():
+    found = Statistics.of(np.full(100, 1e-6), np.zeros(100), least_std=1e-6)
+    assert found.nees == pytest.approx(1.0) and Statistics.of(np.ones(9), np.zeros(9)).nees is None
+
+
+def test_what_is_not_known_yet_is_left_out_and_counted():
+    height, std = motion() + 0.01, np.full(len(T), 0.01)
+    height[:1500], std[:1500] = np.nan, np.nan
+    found = score(table(joint_height_m=height, joint_height_std_m=std), table("truth", height_m=motion()))
+    assert (found.rows, found.known_rows, found.empty_rows) == (2500, 2500, 1500)
+    assert found.statistics()["height"].rmse == pytest.approx(1.0)
+
+
+def test_from_and_to_limit_the_rows():
+    height = motion() + np.where(T < 20, 0.05, 0.01)
+    estimate, truth = table(joint_height_m=height), table("truth", height_m=motion())
+    assert score(estimate, truth, from_s=20.0).statistics()["height"].rmse == pytest.approx(1.0)
+    late = score(estimate, truth, from_s=10.0, to_s=19.995)
+    assert late.rows == 1000 and late.statistics()["height"].mean == pytest.approx(5.0)
+
+
+def test_less_than_half_of_the_rows_is_no_score():
+    """A reference that ends early, and one whose rows are too far apart to be compared."""
+    truth = table("truth", height_m=np.where(T < 12, motion(), np.nan))
+    with pytest.raises(TooFewRows, match=r"only 1200 of 4000 estimates of joint .* less than half") as error:
+        evaluate(table(joint_height_m=motion()), truth)
+    assert cure(error.value) == "to score the common part alone, add --from 0 --to 11.99"
+    assert score(table(joint_height_m=motion()), truth, from_s=0.0, to_s=11.99).rows == 1200
+    sparse = Table(Path("truth.csv"), "truth", {"time_s": T[:1000:10], "height_m": motion()[:1000:10]}, {}, None, 2)
+    with pytest.raises(TooFewRows, match=r"only 100 of 400 estimates of joint"):
+        evaluate(table(joint_height_m=motion()), sparse)
+
+
+def turned(x, y, degrees):
+    z = (x + 1j * y) * np.exp(1j * np.radians(degrees))
+    return z.real, z.imag
+
+
+def test_yaw_and_position_count_from_the_start():
+    """The estimate begins at 0°, the truth at 130°: turned about the joint by that, they agree but for the drift."""
+    x, y, yaw = 0.3 * np.sin(T), 0.2 * np.cos(T) - 0.2, 20 * np.sin(T)
+    drift = 1.5 * T / 60
+    ours = turned(x, y, 0.0)
+    estimate = table(
+        joint_inertial_height_m=motion(), joint_inertial_x_m=ours[0] + 0.01, joint_inertial_y_m=ours[1],
+        joint_inertial_z_m=motion() + 0.02, joint_inertial_yaw_deg=yaw + drift,
+        joint_inertial_yaw_std_deg=np.full(len(T), 0.5),
+    )  # fmt: skip
+    theirs = turned(x, y, 130.0)
+    absolute = (yaw + 130 + 180) % 360 - 180
+    row = score(estimate, table("truth", height_m=motion(), x_m=theirs[0], y_m=theirs[1], yaw_deg=absolute)).as_dict()
+    assert row["yaw_drift_deg_per_min"] == pytest.approx(1.5, rel=1e-3)
+    assert row["yaw_rmse_deg"] == pytest.approx(np.sqrt(np.mean(drift**2)), rel=1e-3)
+    assert row["position_rmse_cm"] == pytest.approx(np.hypot(1.0, 2.0), rel=1e-3)
+    assert row["yaw_within_2sigma"] == pytest.approx(1.0) and "yaw_nees" in row
+    assert "x_rmse_cm" not in row and row["quantities"]["z"]["mean"] == pytest.approx(2.0)
+
+
+def about(axis, degrees):
+    half = np.radians(degrees) / 2
+    parts = {"qw": np.cos(half), "qx": 0 * half, "qy": 0 * half, "qz": 0 * half}
+    return parts | {f"q{axis}": np.sin(half)}
+
+
+def test_a_ball_joint_is_scored_by_the_rotation_between_estimate_and_truth():
+    angle = 100 * np.sin(T)
+    ours = {f"chain_{name}": -value for name, value in about("z", angle + 2).items()}  # −q is the same rotation
+    theirs = {f"chain_{name}": value for name, value in about("z", angle).items()}
+    estimate = table(**ours, chain_rotation_std_deg=np.full(len(T), 2.0))
+    row = score(estimate, table("truth", **theirs)).as_dict()
+    assert row["rotation_rmse_deg"] == pytest.approx(2.0)
+    assert row["rotation_nees"] == pytest.approx(1.0) and row["rotation_within_2sigma"] == 1.0
+
+
+def test_a_hinge_is_scored_by_its_angle():
+    estimate = table(chain_angle_deg=179 + NOISE, chain_angle_std_deg=np.ones(len(T)))
+    row = score(estimate, table("truth", chain_angle_deg=np.full(len(T), 179.0))).as_dict()
+    assert row["angle_rmse_deg"] == pytest.approx(1.0, abs=0.03) and row["angle_nees"] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("late_s", [1e6, 1e12, 1e300])
+def test_one_late_stamp_takes_no_memory_and_no_score_away(late_s):
+    time_s = T + 7.3
+    time_s[-1] = late_s
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    reference = Table(Path("truth.csv"), "truth", {"time_s": time_s, "height_m": motion()}, {}, None, 2)
+    found = score(table(joint_height_m=motion() + 0.01), reference)
+    assert found.time_offset_s == pytest.approx(7.3, abs=1e-3)
+    assert found.statistics()["height"].rmse == pytest.approx(1.0, abs=0.01)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kB
+
+
+def write(path, of):
+    np.savetxt(
+        path, np.column_stack(list(of.columns.values())), delimiter=",", header=",".join(of.columns), comments=""
+    )
+    return str(path)
+
+
+def test_the_command_prints_figures_verdicts_and_rows(tmp_path):
+    estimate = table(joint_height_m=motion() + 0.02 * NOISE, joint_height_std_m=np.full(len(T), 0.01))
+    files = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", table("truth", height_m=motion())))
+    picture = tmp_path / "e.svg"
+    done = CliRunner().invoke(command, [*files, "--from", "10", "--plot", str(picture)], catch_exceptions=False)
+    assert "joint: 3000 of 3000 rows compared." in done.stdout
+    assert "height: σ is 2.0 times too small: 6" in done.stdout and "NEES" in done.stdout
+    assert all(len(line) <= 80 for line in done.stdout.splitlines()[:6])
+    assert picture.read_text().startswith("<?xml")
+    row = json.loads(CliRunner().invoke(command, [*files, "--json"]).stdout)
+    assert {"height_rmse_cm", "height_nees", "height_within_2sigma", "time_offset_s"} <= set(row)
+    assert CliRunner().invoke(command, [*files, "--from", "9", "--to", "3"]).exit_code == 2

@@ -1,0 +1,105 @@
+"""Recordings whose values contradict their units or each other: named, with what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from linkpose.errors import FileFormatError
+from linkpose.recording.reader import load_recording
+
+HEAD = '# linkpose recording 1\n# {"settings": {"sample_rate_hz": 100}}\n'
+NAMES = [
+    "time_s",
+    *(f"accel_{a}_m_s2" for a in "xyz"),
+    *(f"gyro_{a}_rad_s" for a in "xyz"),
+    "pressure_Pa",
+    "baro_fresh",
+]
+N = 600
+
+
+def columns() -> dict[str, np.ndarray]:
+    """Six seconds of a link that swings by ±0.5 rad about its y axis, with rests at both ends."""
+    rng = np.random.default_rng(3)
+    time_s = np.arange(N) / 100
+    swing = np.clip(np.minimum(time_s - 1, 5 - time_s), 0, 1)
+    angle = 0.5 * swing * np.sin(2 * np.pi * 0.8 * time_s)
+    gyro_y = np.gradient(angle, time_s)
+    values = [time_s, -9.81 * np.sin(angle), np.zeros(N), 9.81 * np.cos(angle), np.zeros(N), gyro_y, np.zeros(N)]
+    noise = [0, 0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3]
+    noisy = [value + rng.normal(0, std, N) if std else value for value, std in zip(values, noise, strict=True)]
+    return dict(zip(NAMES, [*noisy, 101_300 + np.round(rng.normal(0, 4, N)), np.ones(N)], strict=True))
+
+
+def remarks(tmp_path: Path, change: Callable[[dict[str, np.ndarray]], object]) -> str:
+    table = columns()
+    change(table)
+    path = tmp_path / "r.csv"
+    rows = "\n".join(",".join(f"{value:.9g}" for value in row) for row in np.column_stack(list(table.values())))
+    path.write_text(f'{HEAD}{",".join(NAMES)}\n{rows}\n# {{"samples": {N}}}\n')
+    recording = load_recording(path)
+    return "\n".join(recording.remarks)
+
+
+def scale(factor: float, *names: str) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(table: dict[str, np.ndarray]) -> None:
+        for name in NAMES:
+            if name.startswith(names):
+                table[name] = table[name] * factor
+
+    return change
+
+
+def put(name: str, row: int | slice, value: float) -> Callable[[dict[str, np.ndarray]], None]:
+    return lambda table: table[name].__setitem__(row, value)
+
+
+def test_a_plausible_recording_has_no_remark(tmp_path: Path) -> None:
+    assert remarks(tmp_path, lambda table: None) == ""
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (scale(2.0, "accel"), "accel_* is 19.6 m/s² while the sensor is still"),
+        (scale(0.5, "accel"), "accel_* is 4.9"),
+        (scale(1000.0, "accel"), "is it in mm/s²? multiply it by 0.001"),
+        (scale(0.0, "accel"), "the IMU reads all zeros"),
+        (scale(180 / np.pi, "gyro"), "is it in °/s?"),
+        (scale(10.0, "time"), "multiply time_s by 0.1"),
+        (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
+        (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
+    ],
+    ids=["twice", "half", "mm/s²", "zero", "°/s", "time", "mmHg", "hPa"],
+)
+def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str) -> None:
+    assert sentence in remarks(tmp_path, change)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (put("time_s", slice(None), 1.0), "time_s is 1 in all rows; it must increase"),
+        (put("time_s", N - 1, np.inf), f"line {N + 3}: time_s"),
+        (put("baro_fresh", 10, 2.0), "line 14: baro_fresh is 2; it must be 0 or 1"),
+    ],
+    ids=["one stamp", "inf", "fresh"],
+)
+def test_an_impossible_value_is_refused_with_its_line(
+    tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str
+) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        remarks(tmp_path, change)
+    assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize("pressure", [500.0, 200_000.0])
+def test_one_impossible_pressure_is_left_out(tmp_path: Path, pressure: float) -> None:
+    assert remarks(tmp_path, put("pressure_Pa", 100, pressure)) == ""
+    recording = load_recording(tmp_path / "r.csv")
+    assert np.isnan(recording.measurements.pressure_Pa[100])
+    assert recording.health["baro"]["invalid"] == {"out of range": 1}

@@ -1,0 +1,55 @@
+"""simulate: all outputs are checked before one is written, and what does not fit is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+KINDS = {
+    "link": ("--duration", 3),
+    "mice": ("--duration", 3),
+    "indoor": ("--duration", 5),
+    "underwater": ("--duration", 5),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_is_written_where_one_output_exists(kind, refused, tmp_path):
+    (tmp_path / "truth.csv").write_text("mine")
+    sentence = refused("simulate", kind, "-o", tmp_path / "out.csv", "--truth", tmp_path / "truth.csv", *KINDS[kind])
+    assert "truth.csv exists already" in sentence and "--force" in sentence
+    assert [path.name for path in tmp_path.iterdir()] == ["truth.csv"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_two_outputs_of_one_name_are_refused(kind, refused, tmp_path):
+    sentence = refused("simulate", kind, "-o", tmp_path / "x.csv", "--truth", tmp_path / "x.csv", *KINDS[kind])
+    assert "is named for two outputs" in sentence and not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_missing_is_named(refused, tmp_path):
+    sentence = refused("simulate", "link", "-o", tmp_path / "no" / "r.csv", "--truth", tmp_path / "t.csv")
+    assert "there is no folder" in sentence and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["link", "mice"])
+def test_a_duration_that_does_not_fit_is_refused(kind, refused, tmp_path):
+    sentence = refused("simulate", kind, "-o", tmp_path / "r", "--truth", tmp_path / "t", "--duration", "1e9")
+    assert "10,000,000 is the limit: simulate at most 100000 s" in sentence and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("duration", ["0", "-3", "nan", "inf", "x"])
+def test_a_duration_that_is_no_time_is_wrong_usage(duration, linkpose, tmp_path):
+    done = linkpose("simulate", "link", "-o", tmp_path / "r", "--truth", tmp_path / "t", "--duration", duration)
+    assert done.status == 2 and "Traceback" not in done.err
+
+
+def test_what_to_type_next_is_said_unless_quiet(linkpose, tmp_path):
+    typed = ("simulate", "link", "-o", tmp_path / "r.csv", "--truth", tmp_path / "t.csv", "--duration", 3)
+    assert linkpose(*typed).err == f"next: linkpose estimate {tmp_path / 'r.csv'} -o estimate.csv\n"
+    assert linkpose(*typed, "--force", "-q") == (0, "", "")
+
+
+def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):
+    linkpose("simulate", "link", "-o", tmp_path / "r.csv", "--truth", tmp_path / "t.csv", "--duration", 3, "-q")
+    header = next(line for line in (tmp_path / "t.csv").read_text().splitlines() if not line.startswith("#"))
+    assert header == "time_s,height_m,roll_deg,pitch_deg,x_m,y_m,yaw_deg"
