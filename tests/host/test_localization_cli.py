@@ -223,3 +223,21 @@ def test_rows_from_standard_input_become_poses_at_once(linkpose, monkeypatch, tm
     assert lines[0].startswith("time_s,ekf_x_m,ekf_y_m,ekf_heading_rad,ekf_x_std_m")
     assert [float(line.split(",")[0]) for line in lines[1:]] == [0.0, 0.0, 0.5, 1.0, 2.0, 2.5, 3.0, 3.5]
     assert float(lines[-1].split(",")[1]) == pytest.approx(3.0, abs=0.05)
+
+
+def test_turn_rates_of_a_carmen_log_are_not_degrees(indoor, linkpose, tmp_path):
+    """Lines a millisecond apart, as in public logs: the odometry's steps give hundreds of rad/s."""
+    log, grid, _ = indoor
+    lines = [line for line in log.read_text().splitlines() if line.startswith("ODOM")][:40]
+    moved = tmp_path / "fast.log"
+    texts = []
+    for i, line in enumerate(lines):
+        words = line.split()
+        words[3], words[7] = f"{0.02 * i:.3f}", f"{100 + 0.0001 * i:.4f}"
+        texts.append(" ".join(words))
+    scan = next(line for line in log.read_text().splitlines() if line.startswith("FLASER")).split()
+    scan[-3] = "101.0"
+    moved.write_text("\n".join([*texts, " ".join(scan)]) + "\n")
+    result = linkpose("localize", moved, "--map", grid, "--start", "12,12,0")
+    assert "degrees" not in result.err
+    assert result.status == 0

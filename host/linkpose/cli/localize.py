@@ -249,7 +249,8 @@ def command(
         _stream(settings, filters, beacons)
         return
     truth = read_truth(truth_path) if truth_path else None
-    read = read_carmen(log) if is_carmen(log) else read_events(log)
+    carmen = is_carmen(log)
+    read = read_carmen(log) if carmen else read_events(log)
     for remark in read.remarks:
         click.echo(remark, err=True)
     events = read.events
@@ -262,7 +263,8 @@ def command(
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
     settings["estimate"] = _estimated(settings["estimate"], events)
     chosen = {name: _settings(settings, name, read.start) for name in names}
-    check_units(events, beacons, str(log))
+    if not carmen:  # its units are defined, and poses a millisecond apart give any turn rate
+        check_units(events, beacons, str(log))
     for method in names:
         check(events, method, chosen[method], grid, beacons, str(log))
     if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
