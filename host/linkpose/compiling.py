@@ -89,7 +89,10 @@ def _user_cache() -> Path:
 
 
 def _make(folder: Path) -> None:
-    """Create the folder and remove those out of use, or mark it as used. Raises OSError."""
+    """Create the folder and remove those out of use, or mark it as used.
+
+    Raises OSError, also where others can write the folder.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
         folder.mkdir(mode=0o700)
@@ -167,8 +170,8 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        stamp: Any = self._impl.locator.get_source_stamp()
-        self._cache_file: Any = _CheckedFiles(self._cache_path, self._impl.filename_base, stamp)
+        source_stamp = self._impl.locator.get_source_stamp()
+        self._cache_file: Any = _CheckedFiles(self._cache_path, self._impl.filename_base, source_stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled function for these types of arguments, None if it is not cached."""

@@ -220,8 +220,10 @@ class LiveEstimator:
 class EstimateWriter(CsvFile):
     """An estimate CSV under way. Raises LinkposeError as `CsvFile` does."""
 
-    def __init__(self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool) -> None:
-        super().__init__(path, "estimate", head, columns, force)
+    def __init__(
+        self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool, plain: bool = False
+    ) -> None:
+        super().__init__(path, "estimate", head, columns, force, plain)
 
 
 class FilterEstimates:

@@ -141,7 +141,7 @@ def check_the_scalar_update(rng):
 
 
 def check_the_joint_constraint(rng):
-    """A rotation clear of the noise: the extended Kalman update, in which δd uses the excited part of the rate."""
+    """All components clear of the noise: the extended Kalman update, with the excited rotation in front of δd."""
     _, s = random_state(rng)
     unconstrained(s)
     reading = s.gyro_bias + np.array([2.0, -1.5, 1.0])
@@ -152,7 +152,7 @@ def check_the_joint_constraint(rng):
     h = np.zeros((3, SIZE))
     h[:, V:BG] = np.eye(3)
     h[:, BG:BA], h[:, MG:D] = -skew(d), -skew(d) @ by_matrix(reading - s.gyro_bias)
-    excited = dense_excited_part(s.spread, rate, IMU.gyro_variance)
+    excited = np.array(joint_velocity.excited_part(s.spread, tuple(rate), IMU.gyro_variance))
     h[:, D:PSI] = -skew(excited)
     product = 0.5 * np.trace(p[BG:BA, BG:BA]) * np.trace(p[D:PSI, D:PSI])
     share = max(0.01, Q.least_residual**2)
@@ -165,18 +165,13 @@ def check_the_joint_constraint(rng):
     np.testing.assert_allclose(s.nominal, corrected(nominal, change), rtol=0, atol=1e-9)
 
 
-def dense_excited_part(spread, rate, variance):
-    """G ω with G = S² (S² + τ² I)⁻¹, by an eigendecomposition of S."""
-    threshold = joint_velocity.CLEAR * variance + 0.0025 * np.trace(spread)
-    values, vectors = np.linalg.eigh(spread)
-    return vectors @ np.diag(values**2 / (values**2 + threshold**2)) @ vectors.T @ rate
-
-
 def check_the_excited_part(rng):
-    """G ω, the part of the rate that the constraint uses for J2S."""
+    """G = S² (S² + τ² I)⁻¹ by an eigendecomposition."""
     root = rng.standard_normal((3, 3))
     spread, rate = root @ root.T * [1.0, 1.0, 1.0], rng.standard_normal(3)
-    expected = dense_excited_part(spread, rate, 1e-4)
+    threshold = joint_velocity.CLEAR * 1e-4 + 0.0025 * np.trace(spread)
+    values, vectors = np.linalg.eigh(spread)
+    expected = vectors @ np.diag(values**2 / (values**2 + threshold**2)) @ vectors.T @ rate
     np.testing.assert_allclose(joint_velocity.excited_part(spread, tuple(rate), 1e-4), expected, rtol=0, atol=1e-9)
 
 
@@ -184,10 +179,10 @@ def check_the_free_velocity(rng):
     _, s = random_state(rng)
     unconstrained(s)
     s.speed_square, nominal, p = 0.04, s.nominal.copy(), s.covariance.copy()
-    q = record_of(InertialParameters(has_joint=0.0))[0]
+    q = record_of(InertialParameters(has_joint=0.0, suspect=1e9))[0]
     h = np.zeros((3, SIZE))
     h[:, V:BG] = np.eye(3)
-    change, covariance = dense_update(p, h, 0.04 * 2 * q.correlation_s / 0.04 * np.eye(3), -s.velocity)
+    change, covariance = dense_update(p, h, 0.04 * 2 * q.least_correlation_s / 0.04 * np.eye(3), -s.velocity)
     free_velocity.update_free_velocity(s, 0.04, q)
     np.testing.assert_allclose(s.covariance, covariance, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.nominal, corrected(nominal, change), rtol=0, atol=1e-9)

@@ -374,9 +374,10 @@ def test_a_stamp_that_is_no_time_is_passed_by(name, stamp):
     time_s[1000] = stamp
     f = filters.create(name, run.rig)
     estimate = f.process(replace(block, time_s=time_s))
+    plain = filters.create(name, run.rig).process(block)
     assert f.rejected == 1
     assert np.isfinite(estimate).all()
-    assert np.abs(estimate[:, 0] - run.truth().height_m).max() < 0.05
+    assert np.abs(np.delete(estimate[:, 0] - plain[:, 0], 1000)).max() < 0.005
 
 
 @pytest.mark.parametrize("gap_s", [5.0, 1e6])

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from linkpose.errors import FileFormatError
+from linkpose.errors import FileExists, FileFormatError
 from linkpose.recording import columns
-from linkpose.recording.csvfile import head
+from linkpose.recording.csvfile import CsvFile, head
 from linkpose.recording.reader import load_recording
 from linkpose.recording.table import read_table
 
@@ -192,3 +192,44 @@ def test_any_bytes_are_a_table_or_a_sentence(tmp_path_factory, data):
         assert str(path) in str(error)
     else:
         assert len({len(column) for column in table.columns.values()}) == 1
+
+
+def test_a_plain_file_has_its_metadata_beside_it(tmp_path):
+    """numpy and pandas read it without options; linkpose reads the same as from its own file."""
+    import pandas as pd
+
+    rows = {"time_s": [0.0, 0.01], "tilt_height_m": [1.5, 1.25]}
+    closing = {"rows": 2}
+    for name, plain in (("own.csv", False), ("plain.csv", True)):
+        with CsvFile(tmp_path / name, "estimate", METADATA, list(rows), False, plain) as file:
+            file.write("0.00,1.5\n0.01,1.25\n")
+            file.close(closing)
+    path = tmp_path / "plain.csv"
+    assert path.read_text() == "time_s,tilt_height_m\n0.00,1.5\n0.01,1.25\n"
+    assert pd.read_csv(path).to_dict("list") == rows
+    assert np.genfromtxt(path, names=True, delimiter=",")["tilt_height_m"].tolist() == rows["tilt_height_m"]
+    own, found = read_table(tmp_path / "own.csv", "estimate"), read_table(path, "estimate")
+    assert (found.kind, found.metadata, found.closing) == (own.kind, own.metadata, own.closing)
+    assert found.metadata == METADATA and found.closing == closing
+    with pytest.raises(FileFormatError, match="is a linkpose estimate, not a recording"):
+        read_table(path, "recording")
+    path.unlink()
+    with pytest.raises(FileExists, match=r"plain\.meta\.json exists already"):
+        CsvFile(path, "estimate", METADATA, list(rows), False, True)
+    assert not path.exists()
+    (tmp_path / "plain.meta.json").write_text("[]")
+    path.write_text("time_s,tilt_height_m\n0.00,1.5\n")
+    with pytest.raises(FileFormatError, match="not a JSON object"):
+        read_table(path)
+
+
+def test_the_documented_calls_of_numpy_and_pandas_read_linkposes_own_files(tmp_path):
+    import pandas as pd
+
+    path = tmp_path / "run.csv"
+    path.write_text(written([(1_000_000, 0, 9_800_000, 100, 0, 0, 100_000, 3)] * 3))
+    own = read_table(path).columns
+    frame = pd.read_csv(path, comment="#")
+    assert all(np.array_equal(frame[name], own[name]) for name in own)
+    found = np.genfromtxt(path, names=True, delimiter=",", skip_header=2)
+    assert all(np.array_equal(found[name], own[name]) for name in own)

@@ -38,6 +38,7 @@ class Request:
     smooth: bool
     json_lines: bool
     force: bool
+    plain: bool
 
 
 @click.command(name="estimate")
@@ -60,6 +61,7 @@ class Request:
 @options.rig_and_j2s
 @board_settings
 @options.force
+@options.plain
 @options.as_json
 @options.verbosity
 def command(
@@ -77,6 +79,7 @@ def command(
     j2s_std: float | None,
     board: dict[str, int],
     force: bool,
+    plain: bool,
     json_lines: bool,
     verbose: bool,
     quiet: bool,
@@ -97,7 +100,7 @@ def command(
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -172,7 +175,7 @@ def _live(
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))
         if record:
-            connected.record(record, force=request.force)
+            connected.record(record, force=request.force, plain=request.plain)
         head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
@@ -285,10 +288,11 @@ class _Sink:
         self._json = request.json_lines
         self._file: EstimateWriter | None = None
         if request.output is not None:
-            self._file = EstimateWriter(request.output, head, estimator.columns, request.force)
+            self._file = EstimateWriter(request.output, head, estimator.columns, request.force, request.plain)
         self._prints = self._file is None and not self._json and not sys.stdout.isatty()
         if self._prints:
-            _print(csv_head("estimate", head, estimator.columns))
+            header = ",".join(estimator.columns) + "\n"
+            _print(header if request.plain else csv_head("estimate", head, estimator.columns))
 
     def write(self, estimates: Any) -> None:
         if self._file is not None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from linkpose.localization.events import Log
     from linkpose.localization.localizer import Method
     from linkpose.localization.settings import Settings
-    from linkpose.localization.tables import Score
+    from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
 
 RANGE_STD_M = 0.1
@@ -231,7 +231,8 @@ def command(
     """Estimate a robot's path from a LOG of odometry and measurements, and a map or beacons.
 
     LOG is a CARMEN log (ODOM, FLASER, ROBOTLASER1) or a CSV with one measurement a row: time_s,kind,a,b,c, where kind
-    is odometry, range, bearing_range, depth, velocity, attitude or pose.
+    is odometry, range, bearing_range, depth, velocity, attitude or pose. With `-`, rows of the CSV are read from
+    standard input, and poses are written to standard output as they come.
     """
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
@@ -244,8 +245,12 @@ def command(
 
     grid = load_map(map_path) if map_path else None
     beacons = read_beacons(beacons_path) if beacons_path else {}
+    if str(log) == "-":
+        _stream(settings, filters, beacons)
+        return
     truth = read_truth(truth_path) if truth_path else None
-    read = read_carmen(log) if is_carmen(log) else read_events(log)
+    carmen = is_carmen(log)
+    read = read_carmen(log) if carmen else read_events(log)
     for remark in read.remarks:
         click.echo(remark, err=True)
     events = read.events
@@ -258,7 +263,8 @@ def command(
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
     settings["estimate"] = _estimated(settings["estimate"], events)
     chosen = {name: _settings(settings, name, read.start) for name in names}
-    check_units(events, beacons, str(log))
+    if not carmen:  # its units are defined, and poses a millisecond apart give any turn rate
+        check_units(events, beacons, str(log))
     for method in names:
         check(events, method, chosen[method], grid, beacons, str(log))
     if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
@@ -281,6 +287,29 @@ def command(
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
+
+
+def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:
+    """Reads rows from standard input and writes a row of CSV for each."""
+    import sys
+
+    from linkpose.localization.stream import localize_stream
+
+    name = filters[0] if filters else "ekf"
+    if len(filters) > 1 or name not in ("ekf", "ukf") or not beacons or settings["smooth"]:
+        raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth")
+    if settings["estimate"] == ("none",):
+        settings["estimate"] = ()
+    method = cast("Method", name)
+    header = False
+    for names, row in localize_stream(sys.stdin, method, _settings(settings, method, None), beacons):
+        if not header:
+            columns = [f"{name}_{state}" for state in names] + [f"{name}_{_std_name(state)}" for state in names]
+            click.echo(",".join(["time_s", *columns]))
+            header = True
+        std = [max(float(value), 0.0) ** 0.5 for value in row.covariance.diagonal()]
+        click.echo(",".join([f"{row.time_s:.6f}", *(f"{value:.9g}" for value in (*row.state.tolist(), *std))]))
+        sys.stdout.flush()
 
 
 def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:

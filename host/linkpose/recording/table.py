@@ -7,16 +7,18 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from linkpose.errors import CannotRead, FileFormatError
+from linkpose.errors import CannotRead, FileFormatError, MissingLibrary
+from linkpose.recording.csvfile import metadata_path
 from linkpose.recording.delimited import Cells, split_cells, to_utf8
 from linkpose.sensors.measurements import Floats
 
+PARQUET_KEY = b"linkpose"  # of the metadata in a Parquet file's schema
 _PLAIN_HEADER = re.compile(rb"[^\";\t]*[A-Za-z_][^\";\t]*")
 
 
@@ -59,13 +61,33 @@ def read_table(path: Path, kind: str | None = None) -> Table:
     line of linkpose's own, as a killed program leaves it, is left out. Raises FileFormatError naming the file and the
     line for whatever else is not a number, a row of another length, or a time that runs backwards.
     """
-    data = to_utf8(read_bytes(path))
-    table = _read_own(path, data) or _read_other(path, data)
+    data = read_bytes(path)
+    if data.startswith(b"PAR1"):
+        table = _read_parquet(path)
+    else:
+        data = to_utf8(data)
+        table = _read_own(path, data) or _read_other(path, data)
+    if not table.kind:
+        table = _with_metadata_beside(table)
     if kind is not None and table.kind not in ("", kind):
         raise FileFormatError(path, f"{path} is a linkpose {table.kind}, not a {kind}")
     if "time_s" in table.columns:
         check_times(path, table.columns["time_s"], table.first_line)
     return table
+
+
+def _with_metadata_beside(table: Table) -> Table:
+    """The table with the kind and the metadata that NAME.meta.json beside NAME.csv holds, if it is there."""
+    beside = metadata_path(table.path)
+    if not beside.is_file():
+        return table
+    content = _json(beside, read_bytes(beside).decode("utf-8", "replace"), 1)
+    metadata, closing = content.get("metadata"), content.get("closing")
+    if not isinstance(metadata, dict) or not isinstance(content.get("kind"), str):
+        raise FileFormatError(beside, f"{beside} has no kind or no metadata; write it again, or remove it")
+    return replace(
+        table, kind=content["kind"], metadata=metadata, closing=closing if isinstance(closing, dict) else None
+    )
 
 
 def _read_own(path: Path, data: bytes) -> Table | None:
@@ -97,6 +119,32 @@ def _read_other(path: Path, data: bytes) -> Table:
     metadata, remarks = _metadata(cells) if found else ({}, ())
     closing = cells.tail[-1].as_object() if cells.tail else None
     return Table(path, found, cells.number_columns(), metadata, closing, cells.lines[0], remarks)
+
+
+def _read_parquet(path: Path) -> Table:
+    """A Parquet file of linkpose, or of any program, with columns of numbers."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise MissingLibrary("pyarrow", path) from error
+    try:
+        found = pyarrow.parquet.read_table(path)
+        columns = {
+            name: column.cast(pyarrow.float64()).to_numpy().astype(np.float64)
+            for name, column in zip(found.column_names, found.columns, strict=True)
+            if not name.startswith("__index_level_")
+        }
+    except (pyarrow.ArrowException, OSError) as error:
+        raise FileFormatError(path, f"{path} is no Parquet table of numbers: {error}") from error
+    if not columns or not found.num_rows:
+        raise FileFormatError(path, f"{path} has no row; nothing was recorded")
+    own = (found.schema.metadata or {}).get(PARQUET_KEY)
+    content = _json(path, own.decode("utf-8", "replace"), 1) if own else {}
+    metadata, closing = (
+        part if isinstance(part := content.get(name), dict) else None for name in ("metadata", "closing")
+    )
+    return Table(path, str(content.get("kind", "")), columns, metadata or {}, closing, 1)
 
 
 def _metadata(cells: Cells) -> tuple[dict[str, Any], tuple[str, ...]]:
