@@ -115,11 +115,12 @@ class Board:
         if not monitor.is_usable:
             raise NoUsableData(monitor.why_unusable)
 
-    def record(self, path: str | PathLike[str], *, force: bool = False) -> None:
-        """Writes what `stream` yields to a recording (CSV) too. Raises FileExists (unless `force`) and CannotWrite."""
+    def record(self, path: str | PathLike[str], *, force: bool = False, plain: bool = False) -> None:
+        """Writes what `stream` yields to a recording (CSV) too; `plain`: without comment lines, metadata beside it.
+        Raises FileExists (unless `force`) and CannotWrite."""
         from linkpose.recorder import Recorder
 
-        self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force))
+        self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force, plain))
 
     def mark(self, time_s: float) -> None:
         """Notes an instant: the closing line of the recording, if there is one, lists it under `marks`."""

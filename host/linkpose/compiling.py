@@ -1,12 +1,15 @@
-"""The compiler of the filters' steps (numba), and where its machine code is kept from run to run.
+"""The compiler of the filters' steps (numba), and the cache of their machine code.
 
-Numba looks only at the file of a cached function. What that function calls or reads in other files is in its machine
-code too, and would go stale unseen by an edit or an upgrade. So the code is kept in a folder that is named by all
-sources it may come from: other sources, another folder. That is in NUMBA_CACHE_DIR where the user has set it, in the
-user's cache directory, or beside this file, whichever first can be written; nowhere, and each run compiles anew.
+Numba checks only the file of a cached function. The machine code also contains what that function calls in other files,
+so an edit or an upgrade there would go unnoticed. The cache folder is therefore named after a fingerprint of all
+sources: other sources, another folder. It lies in NUMBA_CACHE_DIR where that is set, in the user's cache directory, or
+beside this file: the first place that can be written is used. If none can be written, every run recompiles.
 
-Decorators: `compiled` for any function, `inlined` for a long part of a step, which is put into its caller before that
-is compiled (else it stays a call), `inner` for what only compiled code calls.
+Machine code and its pickled index run with the user's rights. They are loaded only from a folder and files that the
+user owns and that nobody else can write, and each file carries a checksum: a damaged file is recompiled.
+
+Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls; `inlined` for a
+long part of a step that the compiler would otherwise leave as a call.
 """
 
 from __future__ import annotations
@@ -15,7 +18,9 @@ import contextlib
 import functools
 import hashlib
 import os
+import pickle
 import shutil
+import stat
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -23,7 +28,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -35,8 +40,7 @@ _SOURCES = (
     "errors.py",
     "filters/**/*.py",
     "localization/**/*.py",
-    "recording/__init__.py",
-    "recording/fixedpoint.py",
+    "recording/**/*.py",
     "sensors/**/*.py",
     "wire/**/*.py",
 )
@@ -46,7 +50,7 @@ _OTHERS_KEPT = 2  # those last used: another version of this package may be at w
 
 
 def cache_folder(package: Path = _PACKAGE) -> Path | None:
-    """Where the machine code of this package's sources is kept, made if need be; None where nothing can be written."""
+    """The folder for the machine code of this package's sources, created if missing; None if no place is writable."""
     name = _PREFIX + _fingerprint(package)
     for root in _roots(package):
         folder = root / "linkpose" / name
@@ -85,15 +89,27 @@ def _user_cache() -> Path:
 
 
 def _make(folder: Path) -> None:
-    """Makes the folder and removes those that are out of use, or marks it as used. Raises OSError."""
+    """Create the folder and remove those out of use, or mark it as used.
+
+    Raises OSError, also where others can write the folder.
+    """
     folder.parent.mkdir(parents=True, exist_ok=True)
     try:
-        folder.mkdir()
+        folder.mkdir(mode=0o700)
     except FileExistsError:
+        if not _is_private(os.lstat(folder)):
+            raise PermissionError(f"{folder} can be written by others") from None
         os.utime(folder)
     else:
         _remove_unused(folder)
-    tempfile.TemporaryFile(dir=folder).close()  # a read-only file system tells it only so
+    tempfile.TemporaryFile(dir=folder).close()  # a read-only file system shows only now
+
+
+def _is_private(entry: os.stat_result) -> bool:
+    """Whether a file or folder belongs to this user and nobody else can write it; Windows keeps its own lists."""
+    if not hasattr(os, "geteuid"):
+        return True
+    return entry.st_uid == os.geteuid() and not entry.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _remove_unused(new: Path) -> None:
@@ -106,27 +122,71 @@ def _remove_unused(new: Path) -> None:
         shutil.rmtree(other, ignore_errors=True)
 
 
-class _KeptCode(FunctionCache):  # type: ignore[misc]
-    """The kept code of one function, which is compiled instead where a file is damaged or cannot be written.
+class _CheckedFiles(IndexDataCacheFile):  # type: ignore[misc]
+    """Numba's index and data files, each behind a checksum, readable only if private to the user."""
 
-    Processes that keep code of the same function at once may overwrite each other's: code of other arguments is not
-    taken.
+    def _load_index(self) -> Any:
+        """Data file names by signature; empty if the index is missing, damaged, of other sources or not private."""
+        try:
+            version, source, names = pickle.loads(_read_checked(self._index_path))
+        except (OSError, ValueError):
+            return {}
+        return names if (version, source) == (self._version, self._source_stamp) else {}
+
+    def _save_index(self, overloads: Any) -> None:
+        self._write((self._version, self._source_stamp, overloads), self._index_path)
+
+    def _load_data(self, name: str) -> Any:
+        """Raises OSError or ValueError for a file that is missing, damaged or not private."""
+        return pickle.loads(_read_checked(self._data_path(name)))
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._write(data, self._data_path(name))
+
+    def _write(self, data: Any, path: str) -> None:
+        content = self._dump(data)
+        with self._open_for_write(path) as file:
+            Path(file.name).chmod(0o600)
+            file.write(hashlib.blake2b(content).digest() + content)
+
+
+def _read_checked(path: str) -> bytes:
+    """Content of a cache file. Raises ValueError where the checksum or the owner is wrong, OSError as `open` does."""
+    with Path(path).open("rb") as file:
+        if not _is_private(os.fstat(file.fileno())):
+            raise ValueError(f"{path} can be written by others")
+        digest, content = file.read(hashlib.blake2b().digest_size), file.read()
+    if hashlib.blake2b(content).digest() != digest:
+        raise ValueError(f"{path} is damaged")
+    return content
+
+
+class _KeptCode(FunctionCache):  # type: ignore[misc]
+    """The cached code of one function; the function is compiled if a file is damaged or cannot be written.
+
+    Processes that store code of the same function at once may overwrite each other's file, so the signature of what was
+    loaded is compared.
     """
 
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        source_stamp = self._impl.locator.get_source_stamp()
+        self._cache_file: Any = _CheckedFiles(self._cache_path, self._impl.filename_base, source_stamp)
+
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled function for these types of arguments, None where it is not kept."""
+        """The compiled function for these types of arguments, None if it is not cached."""
         try:
             loaded = super().load_overload(sig, target_context)
             if loaded is None or tuple(loaded.signature.args) == tuple(sig):
                 return loaded
-        except Exception:  # a damaged pickle raises anything
+        except Exception:  # code of another numba or LLVM raises anything
             pass
         with contextlib.suppress(OSError):
             self.flush()
         return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keeps it, unless the disk is full or the folder has gone."""
+        """Store it, unless the disk is full or the folder has gone."""
         with contextlib.suppress(OSError):
             super().save_overload(sig, data)
 
@@ -161,10 +221,6 @@ compiled = _decorator(True)
 inlined = _decorator(False, inline="always")
 # Without wrappers for Python and without a file of its own: both cost half of the time to compile.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
-
-
-# The name under which the writer of estimates as text is marked: every run needs it, whatever its filters.
-TEXT = "text"
 
 
 def mark_compiled(name: str) -> None:

@@ -55,6 +55,14 @@ class CannotWrite(FileError):
         self.reason = reason
 
 
+class MissingLibrary(LinkposeError):
+    """A file format needs a library that is not installed. `library` is its name."""
+
+    def __init__(self, library: str, path: object) -> None:
+        super().__init__(f'{path} needs the library {library}. Install it: pip install "linkpose[files]"')
+        self.library, self.path = library, str(path)
+
+
 class TooFewRows(LinkposeError):
     """Less than half of a filter's estimates have a reference: a score would be that of another run than the user's.
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from linkpose import filters, quantities
-from linkpose.compiling import TEXT
 from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns
+from linkpose.precompile import TEXT
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, load_recording
@@ -167,7 +167,7 @@ class LiveEstimator:
     """
 
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
-        """`is_ready` says of a filter's name, and of compiling.TEXT, whether it can run now; if so, it always can."""
+        """`is_ready` says of a filter's name, and of precompile.TEXT, whether it can run now; if so, it always can."""
         self._filters = estimator.filters
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
@@ -220,8 +220,10 @@ class LiveEstimator:
 class EstimateWriter(CsvFile):
     """An estimate CSV under way. Raises LinkposeError as `CsvFile` does."""
 
-    def __init__(self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool) -> None:
-        super().__init__(path, "estimate", head, columns, force)
+    def __init__(
+        self, path: Path, head: dict[str, Any], columns: Sequence[str], force: bool, plain: bool = False
+    ) -> None:
+        super().__init__(path, "estimate", head, columns, force, plain)
 
 
 class FilterEstimates:

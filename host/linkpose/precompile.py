@@ -11,8 +11,10 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
-from linkpose import filters
-from linkpose.compiling import TEXT, can_keep_code, is_compiled, mark_compiled
+from linkpose import compiling, filters
+
+# The name of what writes estimates as text: every run needs it, whatever its filters.
+TEXT = "text"
 
 
 class Precompilation:
@@ -26,9 +28,9 @@ class Precompilation:
         """
         self._names = [*names, TEXT]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter
-        if not can_keep_code():
+        if not compiling.can_keep_code():
             return
-        missing = [name for name in reversed(self._names) if not is_compiled(name)]
+        missing = [name for name in reversed(self._names) if not compiling.is_compiled(name)]
         inertial = [name for name in missing if name.endswith("-inertial")]
         for group in (inertial, [name for name in missing if name not in inertial]):
             if not group:
@@ -41,7 +43,7 @@ class Precompilation:
     def is_ready(self, name: str) -> bool:
         """Whether a filter can run without waiting for the compiler; also if nothing compiles it any more."""
         process = self._processes.get(name)
-        return process is None or is_compiled(name) or process.poll() is not None
+        return process is None or compiling.is_compiled(name) or process.poll() is not None
 
     @property
     def waiting(self) -> list[str]:
@@ -82,7 +84,7 @@ def compile_here(name: str) -> None:
         format_rows(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))
     else:
         filters.warm_up([name])
-    mark_compiled(name)
+    compiling.mark_compiled(name)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,11 @@ class Recorder:
     A context manager: leaving it without `close` marks the recording as ended by a failure.
     """
 
-    def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool = False) -> None:
-        """`path` None: convert only. Raises FileExists (unless `force`) and CannotWrite."""
+    def __init__(self, session: Session, path: Path | None, rig: Rig, force: bool = False, plain: bool = False) -> None:
+        """`path` None: convert only; `plain`: metadata beside the file.
+
+        Raises FileExists (unless `force`) and CannotWrite.
+        """
         if path is not None and path.suffix == ".bin":
             raise InvalidValue(str(path), "is not a name for a recording, which is a CSV file: .bin is a raw capture")
         self._session = session
@@ -38,7 +41,7 @@ class Recorder:
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
             head = metadata(session.hello, settings, session.port, rig, clock)
-            self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force)
+            self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force, plain)
 
     def convert(self, placements: list[Placement]) -> Measurements:
         """The samples as a block of measurements, with NaN for readings that are worth nothing.

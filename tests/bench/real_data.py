@@ -2,13 +2,17 @@
 
     python tests/bench/real_data.py [--data FOLDER] [--json]
 
-FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder and broad, each as its authors
-published it; one that is not there is named and left out. Nothing is calibrated beforehand. The error is the root mean
-square angle between the tilts.
+FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder, broad and openaxes_robot, each as
+its authors published it; a missing one is named and skipped. Nothing is calibrated beforehand. The error is the root
+mean square angle between the tilts.
 
-Sensor and reference do not share a clock: the sensors' readings come late by what their filter and the logger take. The
-delay is the lag of the gyro behind the reference's rate, one for all trials of a kind, and is the rig's. VQF's estimate
-is scored as it comes, and (vqf_undelayed_deg) turned on by the last rate for the same time.
+Sensor and reference do not share a clock: the readings arrive late by what the sensor's filter and the logger take. The
+delay is the lag of the gyro behind the reference's rate, one for all trials of a kind. All filters get the same
+handling: ours through the rig, VQF's estimate is turned on by the last rate less VQF's own bias. Beside the score at
+that fixed delay stands the score at each filter's own best lag. The peer of --smooth is offline VQF.
+
+`chosen_on` marks the trials on which constants of the filters were chosen; the others were held out. The last lines
+give for each set and filter the geometric mean of the ratios to VQF, over all and over held-out trials, and the worst.
 """
 
 from __future__ import annotations
@@ -23,27 +27,39 @@ from typing import NamedTuple
 import numpy as np
 from _report import RECORDINGS
 from scipy.io import loadmat
-from vqf import VQF
+from vqf import VQF, offlineVQF
 
 from linkpose import filters
+from linkpose.filters.smoother import JointInertialSmoother
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig
 
 PENDULUM_J2S = Joint((-0.15, 0.0, 0.0), 0.03)  # by a ruler
-PENDULUM_DELAY_S, BROAD_DELAY_S, ENCODER_DELAY_S = 0.0057, 0.0038, 0.011
+PENDULUM_DELAY_S, BROAD_DELAY_S, ENCODER_DELAY_S, ROBOT_DELAY_S = 0.0057, 0.0038, 0.011, 0.0
+CHOSEN_ON = {"broad 01", "broad 15", "broad 24", "pendulum 02a_Trial1"}
+MOST_LAG_S = 0.06
 
 
 class Case(NamedTuple):
     """A recording with the truth of its tilt."""
 
+    data: str
     name: str
     time_s: Floats
     accel_m_s2: Floats
     gyro_rad_s: Floats
     error_deg: Callable[[Floats], float]  # of tilts (N, 3)
     joint: Joint | None
-    delay_s: float = 0.0
+    delay_s: float
+
+    def best_deg(self, tilt: Floats) -> float:
+        """The error at the estimate's own best lag."""
+        step = (self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
+        most, at = round(MOST_LAG_S / step), np.arange(len(tilt))
+        stride = max(1, most // 12)
+        lags = range(-most, most + 1, stride)
+        return min(self.error_deg(tilt[np.clip(at + lag, 0, len(tilt) - 1)]) for lag in lags)
 
 
 def pendulum(folder: Path) -> Iterator[Case]:
@@ -57,7 +73,8 @@ def pendulum(folder: Path) -> Iterator[Case]:
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         error_deg = _against(tilt, np.ones(len(tilt), bool))
-        yield Case(path.stem[9:22], time_s, accel, gyro, error_deg, PENDULUM_J2S, PENDULUM_DELAY_S)
+        name = "pendulum " + path.stem[13:23]
+        yield Case("repoimu_pendulum", name, time_s, accel, gyro, error_deg, PENDULUM_J2S, PENDULUM_DELAY_S)
 
 
 def broad(folder: Path) -> Iterator[Case]:
@@ -68,12 +85,13 @@ def broad(folder: Path) -> Iterator[Case]:
         tilt = _matrices(data["opt_quat"])[:, 2, :]
         use = data["movement"].ravel().astype(bool) & np.isfinite(tilt).all(axis=1)
         time_s = np.arange(len(accel)) / float(data["sampling_rate"].item())
-        yield Case("broad " + path.stem[:2], time_s, accel, gyro, _against(tilt, use), None, BROAD_DELAY_S)
+        error_deg = _against(tilt, use)
+        yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, error_deg, None, BROAD_DELAY_S)
 
 
 def encoder(folder: Path) -> Iterator[Case]:
     """An MPU-6050 on a motor's shaft, with an encoder: the angle about the shaft, less its mean error."""
-    for path in sorted(folder.glob("raw_*.mat")):
+    for path in sorted(folder.glob("raw_[rp]*.mat")):  # yaw is no tilt
         across = 0 if "pitch" in path.stem else 1  # the shaft lies along y in the trials of pitch, else along x
         data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
         gyro = np.column_stack([data[f"all_gyro_2_{axis}"] for axis in "xyz"])
@@ -88,8 +106,41 @@ def encoder(folder: Path) -> Iterator[Case]:
             return float(np.degrees(min(np.std(difference) for difference in both)))
 
         force, rate = STANDARD_GRAVITY * accel[use], np.radians(gyro[use])
-        start = time_s[use][0]
-        yield Case("encoder " + path.stem[4:], time_s[use] - start, force, rate, error_deg, None, ENCODER_DELAY_S)
+        name, start = "encoder " + path.stem[4:], time_s[use][0]
+        yield Case("mpu6050_encoder", name, time_s[use] - start, force, rate, error_deg, None, ENCODER_DELAY_S)
+
+
+def robot(folder: Path) -> Iterator[Case]:
+    """A robot arm, encoder truth; the sensor's mounting on its link, and the upward direction, are fitted."""
+    for path in sorted(folder.glob("*_imu.csv")):
+        read = np.loadtxt(path, delimiter=",", skiprows=1)
+        truth = np.loadtxt(path.with_name(path.name.replace("_imu", "_truth")), delimiter=",", skiprows=1)
+        n = min(len(read), len(truth))
+        accel, gyro = np.ascontiguousarray(read[:n, 1:4]), np.ascontiguousarray(read[:n, 4:7])
+        time_s = (truth[:n, 0] - truth[0, 0]) * 1e-6
+        rotation = _mounted(_matrices(truth[:n, 1:5]), gyro, time_s)
+        up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
+        tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
+        error_deg = _against(tilt, np.ones(len(tilt), bool))
+        yield Case("openaxes_robot", "robot " + path.stem[:-4], time_s, accel, gyro, error_deg, None, ROBOT_DELAY_S)
+
+
+def _mounted(rotation: Floats, gyro: Floats, time_s: Floats) -> Floats:
+    """Rotations (N, 3, 3) from the sensor, for those from the link or to it: the mounting that fits the rates best."""
+    fits = []
+    for turned in (rotation, rotation.transpose(0, 2, 1)):
+        step = np.einsum("nji,njk->nik", turned[:-1], turned[1:])
+        angle = np.column_stack(
+            [step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]]
+        )
+        rate = 0.5 * angle / np.diff(time_s)[:, None]
+        u, _, v = np.linalg.svd(rate.T @ gyro[:-1])
+        mount = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        fits.append((float(np.square(rate @ mount - gyro[:-1]).sum()), turned @ mount))
+    return min(fits, key=lambda fit: fit[0])[1]
+
+
+SETS = {"repoimu_pendulum": pendulum, "mpu6050_encoder": encoder, "broad": broad, "openaxes_robot": robot}
 
 
 def _matrices(quaternion: Floats) -> Floats:
@@ -103,35 +154,68 @@ def _matrices(quaternion: Floats) -> Floats:
 
 def _against(truth: Floats, use: Floats) -> Callable[[Floats], float]:
     def error_deg(tilt: Floats) -> float:
-        cosine = np.clip((tilt * truth).sum(axis=1)[use], -1, 1)
+        use_here = use & np.isfinite(tilt).all(axis=1)
+        cosine = np.clip((tilt * truth).sum(axis=1)[use_here], -1, 1)
         return float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2))))
 
     return error_deg
 
 
-def tilt_of(name: str, case: Case) -> Floats:
-    """A filter's tilts (N, 3)."""
+def block_of(case: Case) -> Measurements:
+    """The recording as measurements of an inertial sensor alone."""
     n = len(case.time_s)
     nothing = np.full(n, np.nan)
-    block = Measurements(
+    return Measurements(
         case.time_s, case.accel_m_s2, case.gyro_rad_s, nothing, nothing, nothing, np.zeros(n, bool),
         np.empty((n, 0, 2)), np.ones(n, np.uint16),
     )  # fmt: skip
-    estimate = filters.create(name, Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))).process(block)
-    roll, pitch = np.radians(estimate[:, 2]), np.radians(estimate[:, 3])
+
+
+def tilt_of(name: str, case: Case) -> Floats:
+    """A filter's tilts (N, 3)."""
+    rig = Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))
+    made = JointInertialSmoother(rig) if name == "--smooth" else filters.create(name, rig)
+    roll, pitch = np.radians(made.process(block_of(case))[:, 2:4]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
 
 
-def vqf_tilt(case: Case) -> Floats:
-    """VQF's tilts (N, 3)."""
+def vqf_tilt(case: Case, offline: bool) -> Floats:
+    """VQF's tilts (N, 3), turned on by the last rate less its bias for as long as the readings are late."""
     step = (case.time_s[-1] - case.time_s[0]) / (len(case.time_s) - 1)
-    return _matrices(VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)["quat6D"])[:, 2, :]
-
-
-def undelayed(tilt: Floats, case: Case) -> Floats:
-    """Tilts (N, 3) turned on by the last rate for as long as the readings are late."""
-    turned = tilt - np.cross(case.delay_s * case.gyro_rad_s, tilt)
+    if offline:
+        found = offlineVQF(case.gyro_rad_s, case.accel_m_s2, None, step)
+    else:
+        found = VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)
+    tilt = _matrices(found["quat6D"])[:, 2, :]
+    turned = tilt - np.cross(case.delay_s * (case.gyro_rad_s - found["bias"]), tilt)
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
+
+
+def rows(case: Case) -> Iterator[dict[str, object]]:
+    """The scores of each filter on a recording."""
+    peers = {offline: vqf_tilt(case, offline) for offline in ((False, True) if case.joint else (False,))}
+    for used in (*(("joint-inertial", "--smooth", "joint") if case.joint else ()), "tilt", "tilt-inertial"):
+        tilt, peer = tilt_of(used, case), peers[used == "--smooth"]
+        scores = {"ours_deg": case.error_deg(tilt), "vqf_deg": case.error_deg(peer)}
+        scores |= {"ours_best_lag_deg": case.best_deg(tilt), "vqf_best_lag_deg": case.best_deg(peer)}
+        ratios = {"ratio": scores["ours_deg"] / scores["vqf_deg"]}
+        ratios["ratio_best_lag"] = scores["ours_best_lag_deg"] / scores["vqf_best_lag_deg"]
+        about = {"set": case.data, "data": case.name, "filter": used, "chosen_on": case.name in CHOSEN_ON}
+        yield {**about, **scores, **ratios}
+
+
+def summary(found: list[dict[str, object]]) -> Iterator[dict[str, object]]:
+    """Geometric means and the worst ratio of each set and filter."""
+    for key in dict.fromkeys((row["set"], row["filter"]) for row in found):
+        mine = [row for row in found if (row["set"], row["filter"]) == key]
+        out: dict[str, object] = {"set": key[0], "filter": key[1], "trials": len(mine)}
+        for name in ("ratio", "ratio_best_lag"):
+            values = np.array([float(str(row[name])) for row in mine])
+            held_out = values[[not row["chosen_on"] for row in mine]]
+            out[name] = float(np.exp(np.log(values).mean()))
+            out[f"{name}_held_out"] = float(np.exp(np.log(held_out).mean())) if len(held_out) else None
+            out[f"{name}_worst"] = float(values.max())
+        yield out
 
 
 def main() -> None:
@@ -139,19 +223,21 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=RECORDINGS)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    for name, read in (("repoimu_pendulum", pendulum), ("mpu6050_encoder", encoder), ("broad", broad)):
+    found: list[dict[str, object]] = []
+    for name, read in SETS.items():
         if not (options.data / name).is_dir():
-            print(f"{options.data / name} is not there: left out", file=sys.stderr)
+            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
             continue
         for case in read(options.data / name):
-            peer = vqf_tilt(case)
-            vqf, late = case.error_deg(peer), case.error_deg(undelayed(peer, case))
-            for used in (*(("joint-inertial", "joint") if case.joint else ()), "tilt", "tilt-inertial"):
-                ours = case.error_deg(tilt_of(used, case))
-                row = {"data": case.name, "filter": used, "ours_deg": ours, "vqf_deg": vqf, "ratio": ours / vqf}
-                row |= {"delay_s": case.delay_s, "vqf_undelayed_deg": late}
-                text = f"{case.name:18} {used:15} {ours:7.3f}°   vqf {vqf:7.3f}°   ratio {ours / vqf:.2f}"
-                print(json.dumps(row) if options.json else f"{text}   vqf undelayed {late:7.3f}°")
+            for row in rows(case):
+                found.append(row)
+                print(json.dumps(row) if options.json else _text(row))
+    for row in summary(found):
+        print(json.dumps(row) if options.json else _text(row))
+
+
+def _text(row: dict[str, object]) -> str:
+    return "  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items())
 
 
 if __name__ == "__main__":

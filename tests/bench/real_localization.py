@@ -2,9 +2,9 @@
 
     python tests/bench/real_localization.py [--data FOLDER] [--json]
 
-FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth and wean, each as its authors published
-it. A recording that is not there is named and left out. The options of each are what a user would type who knows the
-sensors: nothing is tuned in the code.
+FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
+recording that is not there is named and left out. Each recording is run with the default options and with those of a
+user who knows the sensors.
 """
 
 from __future__ import annotations
@@ -25,10 +25,13 @@ from _report import RECORDINGS
 
 from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD, Reading, flaser_angles, format_reading
-from linkpose.localization.grid import GridMap, load_map
+from linkpose.localization.grid import GridMap
+from linkpose.localization.maps import load_map
 
 PLAZA_RMS_M = {"Plaza1": 0.40, "Plaza2": 0.59}  # what a tuned EKF of others reached
 MRCLAM_RMS_M, LABYRINTH_RMS_M = 0.17, 0.15
+TAG_RMS_M, AUV_RMS_M = 0.090, 5.3  # a constant-velocity EKF with a bias; GTSAM's batch optimum
+FILES = 5  # log, --beacons, file, --truth, file: what is no option of the filter
 MRCLAM_ROBOTS = range(1, 6)
 WEAN_START_SPREAD = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.1), (-0.5, 0.0, -0.1), (0.0, 0.5, -0.1), (0.0, -0.5, 0.1))
 WEAN_CANDIDATES = 30
@@ -250,10 +253,42 @@ def wean(folder: Path, out: Path) -> Iterable[dict[str, object]]:
             }
 
 
+def uwb_tag(folder: Path, out: Path) -> list[Case]:
+    """A tag without odometry among eight anchors, in linkpose's own form."""
+    files = [str(folder / "ranges.csv"), "--beacons", str(folder / "beacons.csv"), "--truth", str(folder / "truth.csv")]
+    return [Case("uwb_tag", files, TAG_RMS_M)]
+
+
+def auv_lbl(folder: Path, out: Path) -> list[Case]:
+    """An underwater vehicle with acoustic ranges every 6 s, in linkpose's own form."""
+    names = (folder / f"goats14{part}.csv" for part in ("", "_b", "_t"))
+    log, beacons, truth = map(str, names)
+    return [Case("goats14", [log, "--beacons", beacons, "--truth", truth, "--range-std", "3"], AUV_RMS_M)]
+
+
+def laser_maps(folder: Path, out: Path) -> Iterable[dict[str, object]]:
+    """Two buildings, with the start given and without, beside Monte-Carlo localisation in the same run."""
+    for name in ("intel", "freiburg-101"):
+        truth = folder / f"{name}.truth.csv"
+        start, x, y, heading = np.loadtxt(truth, delimiter=",", skiprows=1, max_rows=1)
+        lines = (folder / f"{name}.log").read_text().splitlines()
+        log = out / f"{name}.log"
+        log.write_text("\n".join(line for line in lines if float(line.split()[-1]) >= start - 1e-6) + "\n")
+        common = [str(log), "--map", str(folder / f"{name}.yaml"), "--truth", str(truth)]
+        given = f"--start={x},{y},{heading}"
+        for options in ([], [given], [given, "--filter", "mcl"]):
+            (row,) = run_localize([*common, *options])
+            yield {"bench": name, "options": " ".join(options) or "default", **row}
+
+
 def with_truth(cases: Iterable[Case]) -> Iterable[dict[str, object]]:
+    """Each case with the default options, and with the documented ones for both filters."""
     for case in cases:
+        for row in run_localize(case.arguments[:FILES]):
+            yield {"bench": case.name, "options": "default", **row, "others_position_rmse_m": case.limit_m}
         for row in run_localize([*case.arguments, "--filter", "ekf", "--filter", "ukf"]):
-            yield {"bench": case.name, **row, "others_position_rmse_m": case.limit_m}
+            options = " ".join(case.arguments[FILES:]) or "default"
+            yield {"bench": case.name, "options": options, **row, "others_position_rmse_m": case.limit_m}
 
 
 def main() -> None:
@@ -265,6 +300,9 @@ def main() -> None:
         "plaza": lambda folder, out: with_truth(plaza(folder, out)),
         "mrclam": lambda folder, out: with_truth(mrclam(folder, out)),
         "uwb_labyrinth": lambda folder, out: with_truth(uwb_labyrinth(folder, out)),
+        "uwb_tag": lambda folder, out: with_truth(uwb_tag(folder, out)),
+        "auv_lbl": lambda folder, out: with_truth(auv_lbl(folder, out)),
+        "laser_maps": laser_maps,
         "wean": wean,
     }
     with tempfile.TemporaryDirectory() as out:

@@ -52,7 +52,7 @@ def test_a_line_of_unknown_length_will_do_where_the_turn_tells_the_scale(mice):
 def test_one_mouse_needs_the_length():
     run, line = driven("line", mice=ring(1))
     _, turn = driven("turn", mice=ring(1))
-    with pytest.raises(LinkposeError, match="give it with --length"):
+    with pytest.raises(LinkposeError, match="measure the length of the line"):
         calibrate_mice([turn, line], run.rig, None)
 
 

@@ -268,7 +268,7 @@ def saved(path: Path, block: Measurements, accel_unit: float = 1.0) -> str:
     ("sides", "says"),
     [
         (SIX_SIDES[:1], "1 rest in 1 attitude\n"),
-        (SIX_SIDES, "no residual from 6 attitudes, which always fit"),
+        (SIX_SIDES, "6 attitudes always fit; record more to get a residual"),
         (np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]), "residual 0.00"),
     ],
 )

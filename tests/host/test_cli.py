@@ -68,7 +68,7 @@ def test_a_filter_that_cannot_run_is_named_with_its_reason(linkpose, refused, tm
     recording.write_text("".join(lines))
     done = linkpose("estimate", recording, "-o", tmp_path / "e.csv")
     assert done.status == 0
-    assert "joint needs J2S" in done.err and "--j2s X,Y,Z" in done.err
+    assert "joint-inertial needs J2S" in done.err and "--j2s X,Y,Z" in done.err
     names = read_table(tmp_path / "e.csv", "estimate").columns
     assert "tilt_roll_deg" in names and "joint_height_m" not in names
     assert "the filter joint cannot run" in refused("estimate", recording, "--filter", "joint")
@@ -235,7 +235,7 @@ def test_nothing_heavy_is_imported_for_help_ports_info_and_record():
     code = (
         "import sys; import linkpose.cli; from linkpose.cli import COMMANDS\n"
         "import linkpose.cli.ports, linkpose.cli.info, linkpose.cli.record, linkpose.cli.live\n"
-        "import linkpose.device.session, linkpose.recording.writer, linkpose.recording.csvfile\n"
+        "import linkpose.device.ports, linkpose.recording.csvfile\n"
         "print([m for m in ('numpy', 'numba', 'scipy', 'matplotlib', 'rich') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=HOST)
@@ -325,7 +325,9 @@ def test_the_environment_may_name_the_port(monkeypatch, linkpose):
 def test_ports_json(monkeypatch, linkpose):
     monkeypatch.setattr(ports, "find_ports", lambda: [UNO, OTHER])
     listed = [json.loads(line) for line in linkpose("ports", "--json").out.splitlines()]
-    assert [list(port) for port in listed] == [["port", "description", "vid", "pid", "serial", "is_uno", "busy"]] * 2
+    assert [list(port) for port in listed] == [
+        ["port", "description", "vid", "pid", "serial", "is_uno", "busy", "location", "chip"]
+    ] * 2
     assert listed[0]["is_uno"] and not listed[1]["is_uno"]
     assert "UNO" in linkpose("ports").out
 

@@ -161,12 +161,15 @@ def test_the_code_is_kept_in_the_users_cache(platform, variables, place, package
     assert folder is not None and folder.parent == tmp_path / place / "linkpose"
 
 
+@pytest.mark.parametrize("damage", ["cut", "flip"])
 @pytest.mark.parametrize("ending", [".nbi", ".nbc"])
-def test_a_damaged_file_is_compiled_and_kept_anew(ending, package, tmp_path):
+def test_a_damaged_file_is_compiled_and_stored_anew(ending, damage, package, tmp_path):
     host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
     run(HEIGHT, host, **place)
     for path in (tmp_path / "cache").rglob(f"*{ending}"):
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 4
+        path.write_bytes(content if damage == "flip" else content[: len(content) // 3])
     assert run(HEIGHT, host, **place) == "1.5 0"
     assert run(HEIGHT, host, **place) == "1.5 1"
 
@@ -206,3 +209,19 @@ def test_a_full_disk_costs_no_more_than_the_compiling(tmp_path):
 def test_other_users_of_the_compiler_keep_their_place():
     code = "import numba, linkpose.localization.linalg, linkpose.filters.baro\nprint(repr(numba.config.CACHE_DIR))"
     assert run(code, HOST, NUMBA_CACHE_DIR="") == "''"
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="POSIX file modes")
+def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, tmp_path):
+    host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
+    run(HEIGHT, host, **place)
+    files = list((tmp_path / "cache").rglob("*.nb?"))
+    for path in files:
+        path.chmod(0o666)
+    assert run(HEIGHT, host, **place) == "1.5 0"
+    assert run(HEIGHT, host, **place) == "1.5 1"
+    folder = next((tmp_path / "cache" / "linkpose").iterdir())
+    folder.chmod(0o777)
+    elsewhere = {**place, "XDG_CACHE_HOME": tmp_path / "mine"}
+    assert run(HEIGHT, host, **elsewhere) == "1.5 0"
+    assert list((tmp_path / "mine").rglob("*.nbc"))

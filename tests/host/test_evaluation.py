@@ -10,11 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
 
 from linkpose.cli.evaluate import command
 from linkpose.cli.plot import command as plot
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.motive import read_motive
+from linkpose.evaluation.motive import read_any, read_motive
 from linkpose.simulation.link import LinkRun
 
 T = np.arange(0, 30, 0.01)
@@ -257,6 +258,47 @@ def test_motive_export_as_reference(tmp_path):
     assert found["height_rmse_cm"] == pytest.approx(1.0, abs=0.02)
     assert found["roll_rmse_deg"] == pytest.approx(0, abs=0.02)
     assert found["pitch_rmse_deg"] == pytest.approx(0.5, abs=0.01)
+
+
+def rigid_body(path, run, time_s, up="y", separator=",", decimal="."):
+    """The export of a rigid body alone, created upright, in centimetres; not tracked in its first frames."""
+    tilt = run.at(time_s).tilt
+    x = np.cross(np.cross(tilt, [1.0, 0, 0]), tilt)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    axes = np.stack([x, np.cross(tilt, x), tilt], axis=1)  # n's axes seen in s: turns s into n
+    room = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if up == "y" else np.eye(3)  # east, north, up -> room
+    head = ["Format Version", "1.24", "Rotation Type", "Quaternion", "Length Units", "Centimeters"]
+    titles = ["Frame", "Time (Seconds)", "X", "Y", "Z", "W", "X", "Y", "Z", ""]
+    parts = ["", "", *["Rotation"] * 4, *["Position"] * 3, "Mean Marker Error"]
+    rows = [head, [], ["", "Type", *["Rigid Body"] * 8], ["", "Name", *["plate"] * 8], parts, titles]
+    for i, (t, rotation) in enumerate(zip(time_s, axes, strict=True)):
+        quaternion = Rotation.from_matrix(room @ rotation @ room.T).as_quat()
+        position = 100 * (room @ (rotation @ np.array(run.j2s_m) + [0.3, -0.2, 0.7]))
+        cells = [f"{value:.6f}".replace(".", decimal) for value in (t, *quaternion, *position)]
+        rows.append([str(i), *cells, ""] if i > 5 else [str(i), cells[0], *[""] * 8])
+    path.write_text("\r\n".join(separator.join(row) for row in rows) + "\r\n", encoding="utf-8-sig")
+    return path
+
+
+@pytest.mark.parametrize(("up", "separator", "decimal"), [("y", ",", "."), ("z", ";", ","), ("y", "\t", ",")])
+def test_a_rigid_body_alone_is_a_reference(tmp_path, up, separator, decimal):
+    run, time_s = LinkRun(2, 1, 30.0), np.arange(0, 30, 1 / 50)
+    found = read_any(rigid_body(tmp_path / "take.csv", run, time_s, up, separator, decimal), up)
+    truth = run.at(time_s)
+    height = truth.tilt @ np.array(run.j2s_m)
+    assert np.isnan(found.columns["height_m"][:6]).all()
+    assert np.allclose(found.columns["height_m"][6:], height[6:], atol=1e-4)
+    roll = np.degrees(np.arctan2(truth.tilt[:, 1], truth.tilt[:, 2]))
+    assert np.allclose(found.columns["roll_deg"][6:], roll[6:], atol=1e-3)
+    pitch = np.degrees(np.arcsin(-truth.tilt[:, 0]))
+    assert np.allclose(found.columns["pitch_deg"][6:], pitch[6:], atol=1e-3)
+    assert any("rigid body plate is the reference" in remark for remark in found.remarks)
+
+
+def test_a_rigid_body_that_is_never_tracked_is_named(tmp_path):
+    path = rigid_body(tmp_path / "take.csv", LinkRun(2, 1, 30.0), np.arange(5) / 50)
+    with pytest.raises(LinkposeError, match="no frame with the rigid body"):
+        read_motive(path)
 
 
 def test_motive_exports_in_another_frame_are_doubted(tmp_path):

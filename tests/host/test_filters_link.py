@@ -374,9 +374,10 @@ def test_a_stamp_that_is_no_time_is_passed_by(name, stamp):
     time_s[1000] = stamp
     f = filters.create(name, run.rig)
     estimate = f.process(replace(block, time_s=time_s))
+    plain = filters.create(name, run.rig).process(block)
     assert f.rejected == 1
     assert np.isfinite(estimate).all()
-    assert np.abs(estimate[:, 0] - run.truth().height_m).max() < 0.05
+    assert np.abs(np.delete(estimate[:, 0] - plain[:, 0], 1000)).max() < 0.005
 
 
 @pytest.mark.parametrize("gap_s", [5.0, 1e6])
@@ -427,7 +428,7 @@ def test_joint_at_other_rates(rate_hz):
 
 
 def test_without_j2s_the_reason_and_the_cure_are_named():
-    with pytest.raises(filters.CannotRun, match=r"calibrate joint.*--j2s X,Y,Z"):
+    with pytest.raises(filters.CannotRun, match="joint needs J2S, the vector from the joint centre to the sensor"):
         filters.create("joint", Rig())
     with pytest.raises(filters.CannotRun, match="joint-inertial"):
         filters.create("joint", Rig(joint=Joint((0.0, 0.0, 0.0), 1.0)))

@@ -14,6 +14,7 @@ from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.kalman import (
+    CONSTANT_VELOCITY,
     HOLONOMIC,
     PLANAR_TWIST,
     SUBMERSIBLE,
@@ -23,14 +24,21 @@ from linkpose.localization.kalman import (
     Transform,
 )
 from linkpose.localization.linalg import wrap_angle
-from linkpose.localization.localizer import Settings, localize
+from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
 from linkpose.localization.odometry import with_mice_odometry
+from linkpose.localization.settings import Settings
 from linkpose.simulation.indoor import office_map
 from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, simulate_underwater
 
 CONTROL, HOLD = np.array([0.8, 0.2]), np.array([0.1, 0.1])
-MOTIONS = {"unicycle": UNICYCLE, "holonomic": HOLONOMIC, "submersible": SUBMERSIBLE, "planar_twist": PLANAR_TWIST}
+MOTIONS = {
+    "constant_velocity": CONSTANT_VELOCITY,
+    "unicycle": UNICYCLE,
+    "holonomic": HOLONOMIC,
+    "submersible": SUBMERSIBLE,
+    "planar_twist": PLANAR_TWIST,
+}
 
 
 def predicted(model, state, parameters, size, grid=None):
@@ -139,7 +147,7 @@ def test_motion_jacobians(name, turn):
 
 MEASUREMENTS = {
     "beacon_range": (models.BEACON_RANGE, [[4.0, 1, 2, 5, 7, 8], [0, 9, -1, -1, -1, 8]], 2),
-    "landmark": (models.LANDMARK, [[4.0, 1], [-3, 2]], 4),
+    "landmark": (models.LANDMARK, [[4.0, 1, 7, 8], [-3, 2, -1, 8]], 4),
     "direct": (models.DIRECT, [[2.0, -1], [0, 1]], 2),
     "mouse_velocity": (models.MOUSE_VELOCITY, [[0.1, 0.05], [-0.1, 0.2]], 4),
     "rate_gyro": (models.RATE_GYRO, [[0.0, 0]], 1),
@@ -169,7 +177,13 @@ def test_beam_slopes_of_a_plain_wall():
 
 
 def test_model_numbers_differ():
-    motions = [models.UNICYCLE, models.HOLONOMIC, models.SUBMERSIBLE, models.PLANAR_TWIST]
+    motions = [
+        models.UNICYCLE,
+        models.HOLONOMIC,
+        models.SUBMERSIBLE,
+        models.PLANAR_TWIST,
+        models.CONSTANT_VELOCITY,
+    ]
     sensors = [
         models.BEAMS,
         models.BEACON_RANGE,
@@ -178,7 +192,7 @@ def test_model_numbers_differ():
         models.MOUSE_VELOCITY,
         models.RATE_GYRO,
     ]
-    assert sorted(motions) == [0, 1, 2, 3]
+    assert sorted(motions) == [0, 1, 2, 3, 4]
     assert sorted(sensors) == [0, 1, 2, 3, 4, 5]
 
 
@@ -188,7 +202,9 @@ def test_angles_cross_the_half_turn(name):
     results = []
     for heading in (0.0, math.pi):
         c, s = math.cos(heading), math.sin(heading)
-        landmark = np.array([[-4.0 * c - 0.5 * s, -4.0 * s + 0.5 * c]])  # behind the robot: the bearing is near π, too
+        landmark = np.array(
+            [[-4.0 * c - 0.5 * s, -4.0 * s + 0.5 * c, -1, -1]]
+        )  # behind the robot: the bearing is near π, too
         bearing = wrap_angle(math.atan2(0.5, -4.0) + 0.1)
         measured = np.array([4.1, bearing])
         sight = Measurement(models.LANDMARK, measured, np.diag([0.04, 0.01]), landmark, 2, (False, True))
@@ -400,3 +416,56 @@ def test_a_wrong_start_is_opened_again():
     track = localize(log, "ukf", settings, None, beacons)
     assert track.widened > 0
     assert np.linalg.norm(track.position_m[-100:] - truth(track.time_s[-100:]), axis=1).max() < 0.5
+
+
+def tag_among_beacons(bias=0.2):
+    """A tag at 1.5 m height that walks a circle of 2 m among four beacons at that height; nothing but ranges."""
+    rng = np.random.default_rng(6)
+    beacons = {"A1": (-4.0, -4.0, 1.5), "0xDD05": (4.0, -4.0, 1.5), "c": (4.0, 4.0, 1.5), "d": (-4.0, 4.0, 1.5)}
+    log = []
+    for i in range(300):
+        time = 0.1 * i
+        place = np.array([2.0 * math.cos(0.4 * time), 2.0 * math.sin(0.4 * time)])
+        for name, (x, y, _) in beacons.items():
+            distance = math.dist(place, (x, y)) + bias + rng.normal(0.0, 0.05)
+            log.append(Event(time, "range", (distance,), name))
+    return log, beacons
+
+
+def test_a_tag_without_odometry_moves_and_finds_its_start():
+    log, beacons = tag_among_beacons()
+    settings = Settings(RangeNoise("fixed", 0.05), estimate=("bias",))
+    for smooth in (False, True):
+        track = localize(log, "ekf", replace(settings, smooth=smooth), None, beacons)
+        true = np.column_stack((2.0 * np.cos(0.4 * track.time_s), 2.0 * np.sin(0.4 * track.time_s)))
+        error = np.linalg.norm(track.position_m - true, axis=1)
+        assert np.sqrt(np.mean(error[50:] ** 2)) < (0.05 if smooth else 0.1)
+        assert track.state[-1, track.names.index("range_bias_m")] == pytest.approx(0.2, abs=0.05)
+        assert track.heading_rad is None
+        (verdict,) = track.consistency.verdicts()
+        assert 0.7 < verdict.noise_factor < 1.3
+
+
+def test_a_bias_for_each_beacon_and_the_verdict_on_its_noise():
+    log, beacons = tag_among_beacons(0.0)
+    log = [replace(e, values=(e.values[0] + 0.3,)) if e.beacon == "0xDD05" else e for e in log]
+    settings = Settings(RangeNoise("fixed", 0.05), estimate=("bias:each",))
+    track = localize(log, "ekf", settings, None, beacons)
+    biases = [track.state[-1, track.names.index(f"range_bias_{name}_m")] for name in beacons]
+    assert np.array(biases) - biases[0] == pytest.approx([0.0, 0.3, 0.0, 0.0], abs=0.08)
+    small = localize(log, "ekf", replace(settings, ranges=RangeNoise("fixed", 0.01), gate=None), None, beacons)
+    assert "times too small" in small.consistency.verdicts()[0].sentence()
+    assert {verdict.sensor for verdict in small.consistency.verdicts(each=True)} == {f"range:{b}" for b in beacons}
+
+
+def test_smoothing_lowers_the_error_in_a_silence_of_the_beacons():
+    log, beacons, truth = drive_among_beacons(silent=(15.0, 45.0))
+    settings = Settings(RangeNoise("fixed", 0.1), speed_std_m_s=0.02, turn_std_rad_s=0.02)
+    errors = []
+    for smooth in (False, True):
+        track = localize(log, "ekf", replace(settings, smooth=smooth), None, beacons)
+        rows = (track.time_s > 30.0) & (track.time_s < 45.0)
+        error = track.position_m[rows] - truth(track.time_s[rows])
+        errors.append(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+        assert np.mean(np.abs(error) < 2 * track.std[rows, :2]) > 0.9
+    assert errors[1] < 0.85 * errors[0]

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.grid import GridMap, cast_ray, load_map, save_map
+from linkpose.localization.grid import FREE, OCCUPIED, UNKNOWN, GridMap, cast_ray
+from linkpose.localization.maps import load_map, save_map
 
 YAML = (
     "image: map.pgm\nresolution: 0.1\norigin: [-1.0, 2.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -75,7 +77,7 @@ def test_reads_what_map_server_writes(tmp_path, name, negate):
     assert grid.geometry.tolist() == [0.1, -1.0, 2.0, 0.0]
     assert grid.size_m == pytest.approx((0.6, 0.4))
     blocked = np.zeros((4, 6))
-    blocked[3, 5], blocked[0, 0] = 1, 1
+    blocked[3, 5], blocked[0, 0] = OCCUPIED, UNKNOWN
     assert (grid.blocked == blocked).all()
 
 
@@ -115,4 +117,75 @@ def test_a_bad_map_is_named_with_the_cure(tmp_path, text, reason):
 
 def test_a_map_that_is_not_there(tmp_path):
     with pytest.raises(LinkposeError, match="No such file"):
+        load_map(tmp_path / "map.yaml")
+
+
+def shown(tmp_path, image, **keys):
+    """The cells of a one-row map with these pixels."""
+    image.save(tmp_path / "map.png")
+    text = YAML.replace("map.pgm", "map.png")
+    for key, value in keys.items():
+        text = "".join(line for line in text.splitlines(True) if not line.startswith(key)) + f"{key}: {value}\n"
+    (tmp_path / "map.yaml").write_text(text)
+    return load_map(tmp_path / "map.yaml").blocked[0].tolist()
+
+
+def row_of(pixels, dtype=np.uint8):
+    return Image.fromarray(np.array([pixels], dtype))
+
+
+def test_images_of_other_depths_and_with_alpha(tmp_path):
+    wall_free = [OCCUPIED, FREE, UNKNOWN]
+    assert shown(tmp_path, row_of([0, 65000, 52685], np.uint16)) == wall_free
+    assert shown(tmp_path, row_of([[0, 255], [254, 255], [254, 0]])) == wall_free  # grey and alpha
+    assert shown(tmp_path, row_of([[0, 0, 0, 255], [254, 254, 254, 255], [0, 0, 0, 9]])) == wall_free
+    assert shown(tmp_path, Image.fromarray(np.array([[False, True]])).convert("1")) == [OCCUPIED, FREE]
+    assert shown(tmp_path, row_of([0, 254, 205]).convert("P")) == wall_free
+
+
+def test_words_numbers_and_modes_of_a_map_file(tmp_path):
+    assert shown(tmp_path, row_of([0, 254]), negate='"0"', resolution="1e-1") == [OCCUPIED, FREE]
+    assert shown(tmp_path, row_of([0, 254]), negate="true") == [FREE, OCCUPIED]
+    assert shown(tmp_path, row_of([0, 100, 50, 255]), mode="raw") == [FREE, OCCUPIED, UNKNOWN, UNKNOWN]
+    assert shown(tmp_path, row_of([0, 254, 128]), mode="scale") == [OCCUPIED, FREE, UNKNOWN]
+    with pytest.raises(LinkposeError, match="mode is 'tri'"):
+        shown(tmp_path, row_of([0, 254]), mode="tri")
+
+
+def test_a_map_without_a_wall_or_in_degrees_is_refused(tmp_path):
+    with pytest.raises(LinkposeError, match="no cell of the map is a wall"):
+        shown(tmp_path, row_of([254, 254]))
+    with pytest.raises(LinkposeError, match=r"in degrees, write 1\.5708"):
+        shown(tmp_path, row_of([0, 254]), origin="[0, 0, 90]")
+
+
+def test_hostile_map_files_are_refused_at_once(tmp_path):
+    row_of([0, 254]).save(tmp_path / "map.pgm")
+    digits = "9" * 400
+    bomb = "a: &a [x,x,x,x,x,x,x,x]\n" + "".join(
+        f"{n}: &{n} [{','.join([f'*{m}'] * 8)}]\n" for m, n in zip("abcdefgh", "bcdefghi", strict=True)
+    )
+    for text, reason in (
+        (YAML.replace("[-1.0, 2.0, 0.0]", f"[-1.0, {digits}, 0]"), "origin is"),
+        (YAML.replace("resolution: 0.1", f"resolution: {digits}"), "resolution is 999"),
+        (YAML.replace("resolution: 0.1", "resolution: 1e200"), "resolution is 1e"),
+        (YAML.replace("2.0", "9" * 5000), "not YAML"),
+        (bomb + YAML, "aliases"),
+        ("[" * 5000, "not YAML"),
+        ("#" * 70000, "larger than 65536 bytes"),
+    ):
+        (tmp_path / "map.yaml").write_text(text)
+        with pytest.raises(LinkposeError, match=reason) as failure:
+            load_map(tmp_path / "map.yaml")
+        assert len(str(failure.value)) < 600
+
+
+def test_an_image_that_is_no_file_or_too_large_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "map.pgm")
+    (tmp_path / "map.yaml").write_text(YAML)
+    with pytest.raises(LinkposeError, match="no regular file"):
+        load_map(tmp_path / "map.yaml")
+    (tmp_path / "map.pgm").unlink()
+    (tmp_path / "map.pgm").write_bytes(b"P5 30000 30000 255\n")
+    with pytest.raises(LinkposeError, match="30000 x 30000 cells"):
         load_map(tmp_path / "map.yaml")

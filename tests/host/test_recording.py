@@ -182,8 +182,8 @@ def swap(lines, at, old, new):
 
 
 BAD_FILES = {
-    "a foreign file": (lambda _: ["x,y\n", "1,2\n"], "is no linkpose recording: its first line is 'x,y'"),
-    "an empty file": (lambda _: [], "is no linkpose recording"),
+    "a foreign file": (lambda _: ["x,y\n", "1,2\n"], "has no column time_s; it has x, y"),
+    "an empty file": (lambda _: [], "ends before its first row"),
     "only a head": (lambda lines: lines[:3], "has a header but no row"),
     "cut in its head": (lambda lines: [*lines[:2], "time_s,se"], "ends before its first row"),
     "a later version": (

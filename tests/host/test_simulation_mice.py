@@ -157,8 +157,8 @@ def test_simulate_estimate_and_evaluate(linkpose, tmp_path):
     assert linkpose("simulate", "mice", "-o", recording, "--truth", truth, *arguments).status == 0
     header = next(line for line in truth.read_text().splitlines() if not line.startswith("#"))
     assert header == "time_s,x_m,y_m,heading_rad,vx_m_s,vy_m_s,wz_rad_s"
-    done = linkpose("estimate", recording, "-o", out)
-    assert done.status == 0 and "without imu-baro: " in done.err
+    done = linkpose("estimate", recording, "-o", out, "-v")
+    assert done.status == 0 and "not running: imu-baro" in done.err
     scores = planar_scores(linkpose, out, truth)
     assert {"mice", "planar-ekf", "planar-ukf"} <= set(scores)
     for name in ("mice", "planar-ekf", "planar-ukf"):
@@ -210,8 +210,8 @@ def test_a_wrong_address_is_refused(refused, port, reason):
 def test_a_link_recording_has_no_use_for_mice(linkpose, tmp_path):
     recording, truth, out = (tmp_path / name for name in ("r.csv", "t.csv", "e.csv"))
     linkpose("simulate", "link", "-o", recording, "--truth", truth, "--duration", 3)
-    done = linkpose("estimate", recording, "-o", out)
-    assert "without planar-ekf, planar-ukf, mice: no mouse gives counts" in done.err
+    done = linkpose("estimate", recording, "-o", out, "-v")
+    assert "not running: planar-ekf, planar-ukf, mice: no mouse gives counts" in done.err
     assert "mice" not in out.read_text().splitlines()[2]
 
 

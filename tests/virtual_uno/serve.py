@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 sys.path.insert(0, str(HERE.parents[1] / "host"))
 
-from bootloader import BOOT_ADDRESS, build_optiboot  # noqa: E402
+from bootloader import BootloaderImage, build_optiboot  # noqa: E402
 from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
 
@@ -100,13 +100,13 @@ def _parse() -> argparse.Namespace:
 
 
 @contextlib.contextmanager
-def _program(options: argparse.Namespace) -> Iterator[tuple[Path, int]]:
+def _program(options: argparse.Namespace) -> Iterator[BootloaderImage]:
     """The .hex that the board begins with, and where in it a reset begins."""
     if not options.blank:
-        yield options.hex, 0
+        yield BootloaderImage(options.hex, 0)
         return
     with tempfile.TemporaryDirectory() as folder:
-        yield build_optiboot(Path(folder)), BOOT_ADDRESS
+        yield build_optiboot(Path(folder))
 
 
 def _run(options: argparse.Namespace) -> LinkRun | MiceRun:

@@ -83,7 +83,7 @@ def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | 
     places = np.array([complex(mouse.x_m, mouse.y_m) for mouse in rig.mouse])
     design, target = _equations(drives, places, length_m)
     if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
-        raise LinkposeError("these drives do not tell the scale; measure the line and give it with --length M")
+        raise LinkposeError("these drives do not determine the scale; measure the length of the line and give it")
     solution, covariance, residual = _least_squares(design, target)
     _check_fit(residual, len(rig.mouse))
     return [_described(i, solution, covariance, _own(residual, i, drives, len(places))) for i in range(len(places))]

@@ -23,6 +23,7 @@ COMMANDS = {
     "record": "Record the sensors into a CSV file.",
     "estimate": "Run the filters, live or over a recording.",
     "calibrate": "Calibrate sensors, J2S and mice from recordings; writes rig.toml.",
+    "convert": "Convert estimates and recordings for other programs.",
     "evaluate": "Compare estimates with a reference.",
     "simulate": "Make a recording and its truth from a simulated rig.",
     "reproduce": "Recompute the tables and figures of the three papers.",

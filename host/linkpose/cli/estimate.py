@@ -39,6 +39,7 @@ class Request:
     smooth: bool
     json_lines: bool
     force: bool
+    plain: bool
     page: PageOptions
 
 
@@ -63,6 +64,7 @@ class Request:
 @options.page
 @board_settings
 @options.force
+@options.plain
 @options.as_json
 @options.verbosity
 def command(
@@ -83,6 +85,7 @@ def command(
     view_port: int | None,
     board: dict[str, int],
     force: bool,
+    plain: bool,
     json_lines: bool,
     verbose: bool,
     quiet: bool,
@@ -109,7 +112,7 @@ def command(
     page.check()
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, page)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, page)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -185,7 +188,7 @@ def _live(
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))
         if record:
-            connected.record(record, force=request.force)
+            connected.record(record, force=request.force, plain=request.plain)
         page = stack.enter_context(
             request.page.open(estimator.columns, estimator.rig, connected.port, console.say, on_mark=connected.mark)
         )
@@ -307,10 +310,11 @@ class _Sink:
         self._json = request.json_lines
         self._file: EstimateWriter | None = None
         if request.output is not None:
-            self._file = EstimateWriter(request.output, head, estimator.columns, request.force)
+            self._file = EstimateWriter(request.output, head, estimator.columns, request.force, request.plain)
         self._prints = self._file is None and not self._json and not sys.stdout.isatty()
         if self._prints:
-            _print(csv_head("estimate", head, estimator.columns))
+            header = ",".join(estimator.columns) + "\n"
+            _print(header if request.plain else csv_head("estimate", head, estimator.columns))
 
     def write(self, estimates: Any) -> None:
         if self._file is not None:

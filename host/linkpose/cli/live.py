@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.device.session import Health, summary
 from linkpose.errors import LinkposeError, printable
 
 if TYPE_CHECKING:
     from linkpose.board import Board
+    from linkpose.device.session import Health
     from linkpose.sensors.measurements import Measurements
 
 Block = TypeVar("Block")
@@ -116,6 +116,8 @@ def ending_well() -> Iterator[None]:
 
 def show_summary(console: Console, health: Health, json_lines: bool, where: str) -> None:
     """The summary on stderr, and as the last line of stdout with --json."""
+    from linkpose.device.session import summary
+
     console.say(f"{health_line(health)}{where}")
     if json_lines:
         click.echo(json.dumps(summary(health)))

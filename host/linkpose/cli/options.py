@@ -211,6 +211,12 @@ def force(function: Function) -> Function:
     return click.option("--force", is_flag=True, help="Replace an existing file.")(function)
 
 
+def plain(function: Function) -> Function:
+    return click.option(
+        "--plain", is_flag=True, help="Write no comment lines; the metadata go to NAME.meta.json beside NAME.csv."
+    )(function)
+
+
 def verbosity(function: Function) -> Function:
     function = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")(function)
     return click.option("-v", "--verbose", is_flag=True, help="Say more.")(function)

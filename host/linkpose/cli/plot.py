@@ -74,7 +74,7 @@ def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
     """What --map and --beacons put under the path."""
     if map_file is None and beacons is None:
         return None
-    from linkpose.localization.grid import load_map
+    from linkpose.localization.maps import load_map
     from linkpose.localization.tables import read_beacons
     from linkpose.plotting import Scene
 

@@ -19,6 +19,7 @@ from linkpose.cli.board_settings import board_settings
 @click.option("--rig", "rig_file", type=options.FILE, help="Rig file to store with the recording.")
 @board_settings
 @options.force
+@options.plain
 @options.as_json
 @options.verbosity
 def command(
@@ -29,6 +30,7 @@ def command(
     rig_file: Path | None,
     board: dict[str, int],
     force: bool,
+    plain: bool,
     json_lines: bool,
     verbose: bool,
     quiet: bool,
@@ -42,7 +44,7 @@ def command(
     live.refuse_same_file(path, raw)
     console = live.Console(quiet, verbose)
     with Board(port, settings=board, rig=rig_file, raw=raw, force=force, notify=console.say) as connected:
-        connected.record(path, force=force)
+        connected.record(path, force=force, plain=plain)
         console.detail(f"firmware {connected.hello}")
         console.say(f"recording to {path}" + ("" if duration else ", Ctrl-C ends"))
 

@@ -1,28 +1,40 @@
-"""References from OptiTrack: the CSV that Motive exports, with three markers on the sensor's plate.
+"""References from OptiTrack: the CSV that Motive exports, with three markers on the sensor's plate or its rigid body.
 
 Marker 1 is at the sensor, marker 2 lies in the direction of its x axis and marker 3 on the side of its y axis, as on
 the set square of [Link]. They define the sensor's axes, and with the upward direction the tilt Z. Marker 1 moves on a
 sphere about the joint centre. The sphere is fitted, and the height is counted from its centre, wherever the origin is.
+
+A take without three markers is read by its rigid body: the pivot replaces marker 1, and the quaternion gives the axes.
+Motive aligns the axes of a new rigid body with the room's. The body must therefore be created while the sensor's x axis
+points along the room's X axis and its z axis upwards, or be turned to that orientation in Motive afterwards.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.recording.delimited import to_utf8
 from linkpose.recording.table import Table, check_times, read_bytes, read_table
 from linkpose.sensors.measurements import Floats
 
-_SIGNATURE = b"Format Version,"
+_SIGNATURE = re.compile(rb'"?Format Version"?([,;\t])')
+# The sensor's axes x, y, z (rows) in the axes of a rigid body that was created upright, by the axis that points up.
+_SENSOR_IN_BODY = {
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "z": np.eye(3),
+}
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker moves
 _WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be scored are better than a centimetre
 _LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
+_QUATERNION_TOLERANCE = 0.01  # of its norm; Motive prints six decimals
 _STILL = 10.0  # radius over noise: noise alone also fits a sphere, with a radius of about 2.5 times its deviation
 _CLEARLY_WIDER_DEG = 15.0
 _FARTHEST = 1e9  # in any unit
@@ -32,63 +44,128 @@ _MOST_STEPS = 50
 
 def read_any(path: Path, up: str) -> Table:
     """A Motive export by `read_motive`, any other CSV by `read_table`, with their errors."""
-    is_motive = read_bytes(path)[:64].removeprefix(b"\xef\xbb\xbf").startswith(_SIGNATURE)
+    is_motive = _SIGNATURE.match(to_utf8(read_bytes(path)[:64]))
     return read_motive(path, up) if is_motive else read_table(path)
 
 
 def read_motive(path: Path, up: str = "y") -> Table:
-    """Time, height, roll and pitch of the plate as a reference; rows with a hidden marker are NaN.
+    """Time, height, roll and pitch of the plate as a reference; rows with a hidden marker or body are NaN.
 
     `up` is the axis of the room that points upwards: "y" unless Motive exports with Z up.
     Raises LinkposeError naming the file and what is missing in it.
     """
-    take = _read_take(path)
-    time_s, markers = take.time_s, take.markers
+    take = _read_take(path, up)
     axis = "xyz".index(up)
-    tilt = _tilt(markers, np.eye(3)[axis])
-    height = markers[:, 0, axis] - _joint_height(path, markers[:, 0], axis)
+    tilt = take.axes[:, :, axis]
     columns = {
-        "time_s": time_s,
-        "height_m": height,
+        "time_s": take.time_s,
+        "height_m": take.position_m[:, axis] - _joint_height(path, take, axis),
         "roll_deg": np.degrees(np.arctan2(tilt[:, 1], tilt[:, 2])),
         "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
     }
     columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, take.first_line, (*take.remarks, *_order_remarks(path, markers)))
+    return Table(path, "motive", columns, {}, None, take.first_line, tuple(take.remarks))
 
 
 @dataclass(frozen=True, slots=True)
 class _Take:
-    """The three markers of the plate over time."""
+    """The plate over time, NaN where it is hidden."""
 
     time_s: Floats  # (N,)
-    markers: Floats  # (N, 3 markers, 3) in metres, NaN where a marker is hidden
+    position_m: Floats  # (N, 3) of the sensor in the room
+    axes: Floats  # (N, 3 axes, 3): the sensor's axes in the room
+    what: str  # what is at the sensor
     first_line: int
     remarks: list[str]
 
 
-def _read_take(path: Path) -> _Take:
-    try:
-        rows = list(csv.reader(io.StringIO(read_bytes(path).decode("utf-8-sig", "replace"))))
-    except csv.Error as error:
-        raise LinkposeError(f"{path} is damaged: {error}; export the take as CSV again") from error
+def _read_take(path: Path, up: str) -> _Take:
+    rows = _read_rows(path)
     header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
     if header is None:
         raise LinkposeError(f"{path} has no row that begins with Frame,Time (Seconds): export the take as CSV again")
-    body, first_line = [row for row in rows[header + 1 :] if row], header + 2
+    body, first_line = [row for row in rows[header + 1 :] if any(row)], header + 2
     if not body:
         raise LinkposeError(f"{path} has a header but no frame: export the take with its frames")
     starts, unlabeled = _marker_columns(rows[:header], rows[header])
-    if len(starts) < 3:
-        cure = "label the plate's three in Motive" if unlabeled else "export Markers as well"
+    bodies = _body_columns(rows[:header], rows[header])
+    if len(starts) < 3 and not bodies:
+        cure = "label the plate's three in Motive" if unlabeled else "export Markers, or the rigid body as Quaternion"
         raise LinkposeError(f"{path} has {len(starts)} labeled markers with X, Y, Z; three are needed: {cure}")
     remarks = [f"{path}: markers left out as unlabeled: {unlabeled}"] if unlabeled else []
-    used = [_time_column(rows[header]), *(start + axis for start in starts[:3] for axis in range(3))]
+    fields = [start + axis for start in starts[:3] for axis in range(3)] if len(starts) >= 3 else bodies[0].columns
+    used = [_time_column(rows[header]), *fields]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
     check_times(path, table[:, 0], first_line)
+    has_markers, unit = len(starts) >= 3, _unit(path, rows[0])
     if not np.isfinite(table).all(axis=1).any():
-        raise LinkposeError(f"{path} has no frame with all three markers: fill their gaps in Motive")
-    return _Take(table[:, 0], _unit(path, rows[0]) * table[:, 1:].reshape(-1, 3, 3), first_line, remarks)
+        missing = "all three markers: fill their gaps" if has_markers else "the rigid body: reconstruct and solve it"
+        raise LinkposeError(f"{path} has no frame with {missing} in Motive")
+    if has_markers:
+        markers = unit * table[:, 1:].reshape(-1, 3, 3)
+        remarks += _order_remarks(path, markers)
+        return _Take(table[:, 0], markers[:, 0], _axes_of_markers(markers), "marker 1", first_line, remarks)
+    remarks.append(
+        f"{path}: the rigid body {bodies[0].name} is the reference: its pivot must be at the sensor, and its axes were "
+        "the room's when the sensor's x axis pointed along X and its z axis up"
+    )
+    if len(bodies) > 1:
+        remarks.append(f"{path}: rigid bodies left out: {', '.join(body.name for body in bodies[1:])}")
+    axes = _axes_of_body(path, table[:, 1:5], up)
+    return _Take(table[:, 0], unit * table[:, 5:], axes, "the rigid body", first_line, remarks)
+
+
+def _read_rows(path: Path) -> list[list[str]]:
+    """The cells of the file, whatever separates them."""
+    data = to_utf8(read_bytes(path))
+    signature = _SIGNATURE.match(data)
+    separator = signature[1].decode() if signature else ","
+    try:
+        rows = list(csv.reader(io.StringIO(data.decode("utf-8", "replace")), delimiter=separator))
+    except csv.Error as error:
+        raise LinkposeError(f"{path} is damaged: {error}; export the take as CSV again") from error
+    return [[cell.strip() for cell in row] for row in rows]
+
+
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """A rigid body: the columns of its quaternion x, y, z, w and its position."""
+
+    name: str
+    columns: list[int]
+
+
+def _body_columns(above: list[list[str]], header: list[str]) -> list[_Body]:
+    """The rigid bodies with position and quaternion."""
+    kinds = next((row for row in above if row[1:2] == ["Type"]), [])
+    names = next((row for row in above if row[1:2] == ["Name"]), [])
+    parts = next((row for row in above[::-1] if "Position" in row), [])
+    found: dict[str, dict[str, int]] = {}
+    for i, axis in enumerate(header):
+        if i < min(len(kinds), len(names), len(parts)) and kinds[i].lower() == "rigid body":
+            found.setdefault(names[i], {})[f"{parts[i]} {axis.upper()}"] = i
+    wanted = [f"Rotation {axis}" for axis in "XYZW"] + [f"Position {axis}" for axis in "XYZ"]
+    return [
+        _Body(name, [columns[part] for part in wanted])
+        for name, columns in found.items()
+        if all(part in columns for part in wanted)
+    ]
+
+
+def _axes_of_body(path: Path, quaternion: Floats, up: str) -> Floats:
+    """The sensor's axes (N, 3 axes, 3) in the room, from the body's quaternions (N, 4): x, y, z, w."""
+    size = np.linalg.norm(quaternion, axis=1)
+    if np.nanmax(np.abs(size - 1), initial=0) > _QUATERNION_TOLERANCE:
+        raise LinkposeError(f"{path}: the rotation of the rigid body is no unit quaternion: export it as Quaternion")
+    x, y, z, w = (quaternion / size[:, None]).T
+    body = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
+            [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
+            [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)  # the body's axes in the room
+    return np.asarray(_SENSOR_IN_BODY[up] @ body)
 
 
 def _unit(path: Path, head: list[str]) -> float:
@@ -125,7 +202,7 @@ def _marker_columns(above: list[list[str]], header: list[str]) -> tuple[list[int
 
 
 def _number(path: Path, row: list[str], column: int, line: int) -> float:
-    text = row[column].strip() if column < len(row) else ""
+    text = row[column].replace(",", ".") if column < len(row) else ""
     if not text:
         return float("nan")
     try:
@@ -153,34 +230,35 @@ def _order_remarks(path: Path, markers: Floats) -> list[str]:
     ]
 
 
-def _tilt(markers: Floats, up: Floats) -> Floats:
-    """Z (N, 3) from markers (N, 3 markers, 3)."""
+def _axes_of_markers(markers: Floats) -> Floats:
+    """The sensor's axes (N, 3 axes, 3) in the room, from markers (N, 3 markers, 3)."""
     x = markers[:, 1] - markers[:, 0]
     z = np.cross(x, markers[:, 2] - markers[:, 0])
     with np.errstate(invalid="ignore", divide="ignore"):
         x = x / np.linalg.norm(x, axis=1, keepdims=True)
         z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    return np.column_stack([x @ up, np.cross(z, x) @ up, z @ up])
+    return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _joint_height(path: Path, positions: Floats, up: int) -> float:
-    """Height (m) of the centre of the sphere on which the positions (N, 3) lie; raises LinkposeError unless they do."""
+def _joint_height(path: Path, take: _Take, up: int) -> float:
+    """Height (m) of the centre of the sphere on which the sensor moves; raises LinkposeError unless it does."""
+    positions, what = take.position_m, take.what
     seen = positions[np.isfinite(positions).all(axis=1)]
     if len(seen) < 10:
-        raise LinkposeError(f"{path}: marker 1 is seen in {len(seen)} frames only; no joint can be fitted to that")
+        raise LinkposeError(f"{path}: {what} is seen in {len(seen)} frames only; no joint can be fitted to that")
     middle = seen.mean(axis=0)
     centre, radius, noise, std = _fit_sphere(seen - middle)
     if radius < _STILL * noise:
         raise LinkposeError(
-            f"{path}: marker 1 hardly moves, so the joint cannot be located: tilt the link to all sides in the take"
+            f"{path}: {what} hardly moves, so the joint cannot be located: tilt the link to all sides in the take"
         )
     if noise > _WORST_SPHERE_M:
         raise LinkposeError(
-            f"{path}: marker 1 is {100 * noise:.1f} cm rms off any sphere: is the joint fixed to the ground?"
+            f"{path}: {what} is {100 * noise:.1f} cm rms off any sphere: is the joint fixed to the ground?"
         )
     if std[up] > _WORST_HEIGHT_STD_M:
         raise LinkposeError(
-            f"{path}: the motion of marker 1 locates the joint's height to ±{100 * std[up]:.1f} cm only: "
+            f"{path}: the motion of {what} locates the joint's height to ±{100 * std[up]:.1f} cm only: "
             "tilt the link further; turning about the vertical does not help"
         )
     return float(middle[up] + centre[up])

@@ -12,9 +12,11 @@ from dataclasses import dataclass, field, replace
 
 from linkpose.experiments.variants import Progress, Variant, verdict
 from linkpose.localization.kalman import FilterName
-from linkpose.localization.localizer import Settings, Track, localize
+from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise
+from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score
+from linkpose.localization.track import Track
 from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, UnderwaterRun, self_check, simulate_underwater
 
 FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")

@@ -43,14 +43,18 @@ class InertialParameters(NamedTuple):
     # Parts of rate and force that scale and misalignment in the state do not explain (nonlinearity, vibration).
     gyro_misfit: float = 0.0
     accel_misfit: float = 0.0
-    correlation_s: float = 0.15  # correlation time of the free velocity and of the misfits (s)
+    # Bounds of the measured correlation time of the free velocity and of the misfits (s): taps of 2 Hz to slow circles.
+    least_correlation_s: float = 0.1
+    most_correlation_s: float = 1.0
     largest_bias_rad_s: float = 1.0  # beyond it the state is impossible and the filter begins anew
     # Free velocity (unused with a joint).
     first_speed_m_s: float = 0.5  # σ before it has been measured
-    least_speed_m_s: float = 0.05  # σ at rest
+    least_speed_m_s: float = 0.1  # σ at rest
     most_speed_m_s: float = 2.0  # σ of an arm that throws
     swing_time_s: float = 1.0  # over which acceleration is integrated to measure σ (s)
     speed_memory_s: float = 2.0  # over which the result is averaged (s)
+    # A squared velocity beyond this many times its expected mean square shows a covariance that is too small.
+    suspect: float = 6.0
     grow_s: float = 1.0  # in which a covariance that is too small grows e-fold (s)
     steady_memory_s: float = 0.1  # over which rate and force must stay the same (s)
     swing_share: float = 3.0  # a rate that changes by so much in that time changes by this times as much in a motion

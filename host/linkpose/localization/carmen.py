@@ -12,20 +12,25 @@ exact arc that joins them, valid from the first to the second.
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import Event, Log, Scan, read_number
+from linkpose.localization.events import Event, Log, LogFile, Scan, count, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
 
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams
 FLASER_MAX_RANGE_M = 80.0  # a SICK scanner's; the line does not say
+# Readings this near to the longest of the log are equal to it, and so many of them are no coincidence.
+SAME_RANGE_M, SHARED_READINGS = 0.005, 10
+FIRST_TIME_S = 60.0  # a log whose clock starts at 0 has its next line within this time
+HEAD_LINES, LONGEST_HEAD = 1000, 200  # how far `is_carmen` looks
 Pose = tuple[float, float, float]
 
 
@@ -48,63 +53,94 @@ class Reading:
 def is_carmen(path: Path) -> bool:
     """Whether a file's first line that is no comment begins with a CARMEN keyword or another log's parameter line."""
     try:
-        with path.open(encoding="utf-8") as file:
-            for text in file:
-                if text.strip() and not text.startswith("#"):
-                    return text.split(maxsplit=1)[0].isupper() and "," not in text
-    except UnicodeDecodeError:
-        return False
+        with path.open(encoding="latin-1") as file:
+            for text in itertools.islice(file, HEAD_LINES):
+                words = text[:LONGEST_HEAD].split(maxsplit=1)
+                if words and not text.startswith("#"):
+                    return words[0].isascii() and words[0].isupper() and "," not in text
     except OSError as error:
         raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
     return False
 
 
-def read_carmen(path: Path) -> tuple[Log, Pose]:
-    """Reads a log into events in order of its own time, and the odometry's first pose.
+def read_carmen(path: Path) -> LogFile:
+    """Reads a log into events in order of time, with the odometry's first pose as `start`.
 
-    Lines of other sensors are passed over. Raises LinkposeError with file, line and cure for a damaged line.
+    Lines of other sensors are passed over. Lines that are not in order of time are sorted, lines without a time (0) and
+    a last line that is cut short are left out; `remarks` has the counts. Raises LinkposeError with file, line and cure
+    for a damaged line.
     """
     readings: list[Reading] = []
+    remarks: list[str] = []
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="latin-1") as file:  # parameter lines of public logs hold Latin-1
             for number, text in enumerate(file, 1):
                 words = text.split()
                 if words and words[0] in KEYWORDS:
-                    readings.append(_read_line(path, number, words))
-                    _check_order(path, readings[-2:])
-    except UnicodeDecodeError as error:
-        raise LinkposeError(f"{path} is not a CARMEN log: {error}") from error
+                    try:
+                        readings.append(_read_line(path, number, words))
+                    except LinkposeError:
+                        if text.endswith("\n"):
+                            raise
+                        remarks.append(f"{path}: the last line is cut short and left out")
     except OSError as error:
         raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
-    if not readings:
+    timed = _timed(readings)
+    if not timed:
         raise LinkposeError(
             f"{path} holds no {', '.join(KEYWORDS[:-1])} or {KEYWORDS[-1]} lines; give a CARMEN log or a CSV log"
         )
-    return as_log(readings), readings[0].odometry
+    if len(timed) < len(readings):
+        remarks.append(f"{path}: {count(len(readings) - len(timed), 'line')} without a time left out")
+    ordered, moved = in_order(timed)
+    if moved:
+        remarks.append(f"{path}: {count(moved, 'line')} moved into the order of time")
+    return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks))
 
 
-def _check_order(path: Path, pair: list[Reading]) -> None:
-    if len(pair) == 2 and pair[1].time_s < pair[0].time_s:
-        raise LinkposeError(
-            f"{path} line {pair[1].line}: time runs backwards, from {pair[0].time_s:.6f} to {pair[1].time_s:.6f} s; "
-            "sort the lines by their time"
-        )
+def _timed(readings: list[Reading]) -> list[Reading]:
+    """Without the readings whose time is 0, unless that is where the log's own clock starts."""
+    others = [reading for reading in readings if reading.time_s != 0.0]
+    if not others or (readings[0].time_s == 0.0 and abs(others[0].time_s) < FIRST_TIME_S):
+        leading = list(itertools.takewhile(lambda reading: reading.time_s == 0.0, readings))
+        return leading + others
+    return others
+
+
+def _without_echo(readings: list[Reading]) -> list[Reading]:
+    """FLASER lines do not state the longest range: a longest reading that many beams share means "no echo"."""
+    scans = [reading.ranges_m for reading in readings if reading.ranges_m is not None and len(reading.ranges_m)]
+    longest = max((float(ranges.max()) for ranges in scans), default=0.0)
+    if sum(int(np.count_nonzero(ranges > longest - SAME_RANGE_M)) for ranges in scans) < SHARED_READINGS:
+        return readings
+    limit = longest - SAME_RANGE_M
+    return [replace(reading, max_range_m=min(reading.max_range_m, limit)) for reading in readings]
 
 
 def as_log(readings: list[Reading]) -> Log:
-    """Controls between the odometry's poses, and the scans."""
+    """Controls between the odometry's poses, and the scans; `readings` are in order of time.
+
+    Lines of one instant have one pose, which is the last scan's, or the last line's where there is no scan: the
+    odometry is cumulative, and a pose between two lines of one instant must not be lost.
+    """
+    groups = [list(group) for _, group in itertools.groupby(readings, key=lambda reading: reading.time_s)]
+    poses = [_pose_of(group) for group in groups]
     log: Log = []
-    for i, reading in enumerate(readings):
-        time = reading.time_s
-        if i == len(readings) - 1:
-            log.append(Event(time, "odometry", (0.0, 0.0)))
-        elif readings[i + 1].time_s > reading.time_s:  # of two lines at one instant the second has the control
-            later = readings[i + 1]
-            arc = _arc(reading.odometry, later.odometry, later.time_s - reading.time_s)
-            log.append(Event(time, "odometry", arc))
-        if reading.ranges_m is not None and reading.angles_rad is not None:
-            log.append(_scan(time, reading, reading.ranges_m, reading.angles_rad))
+    for i, (group, pose) in enumerate(zip(groups, poses, strict=True)):
+        time = group[0].time_s
+        last = i == len(groups) - 1
+        control = (0.0, 0.0) if last else _arc(pose, poses[i + 1], groups[i + 1][0].time_s - time)
+        log.append(Event(time, "odometry", control))
+        for reading in group:
+            if reading.ranges_m is not None and reading.angles_rad is not None:
+                log.append(_scan(reading, pose, reading.ranges_m, reading.angles_rad))
     return log
+
+
+def _pose_of(group: list[Reading]) -> Pose:
+    """The odometry's pose at an instant with several lines."""
+    scans = [reading for reading in group if reading.ranges_m is not None]
+    return (scans or group)[-1].odometry
 
 
 def format_reading(reading: Reading) -> str:
@@ -186,15 +222,10 @@ def flaser_angles(count: int) -> Floats:
     return np.radians(step_deg * np.arange(count, dtype=np.float64) - 90.0)
 
 
-def _scan(time_s: float, reading: Reading, ranges: Floats, angles: Floats) -> Scan:
-    """The readings nearest to the 19 beams that lie within the scanner's field, and the laser's place on the robot."""
-    chosen: list[int] = []
-    if len(angles):
-        step = abs(angles[1] - angles[0]) if len(angles) > 1 else 0.0
-        seen = (angles.min() - 1.5 * step < BEAM_ANGLES_RAD) & (angles.max() + 1.5 * step > BEAM_ANGLES_RAD)
-        chosen = sorted({int(np.argmin(np.abs(angles - angle))) for angle in BEAM_ANGLES_RAD[seen]})
-    echo = np.where((ranges[chosen] > 0.0) & (ranges[chosen] < reading.max_range_m), ranges[chosen], np.nan)
-    dx, dy = reading.laser[0] - reading.odometry[0], reading.laser[1] - reading.odometry[1]
-    c, s = math.cos(reading.odometry[2]), math.sin(reading.odometry[2])
-    mount = (c * dx + s * dy, c * dy - s * dx, wrap_angle(reading.laser[2] - reading.odometry[2]))
-    return Scan(time_s, echo, angles[chosen], mount, reading.max_range_m, reading.line)
+def _scan(reading: Reading, robot: Pose, ranges: Floats, angles: Floats) -> Scan:
+    """The whole scan, NaN where there is no echo, and the laser's place on the robot, whose odometry is at `robot`."""
+    echo = np.where((ranges > 0.0) & (ranges < reading.max_range_m), ranges, np.nan)
+    dx, dy = reading.laser[0] - robot[0], reading.laser[1] - robot[1]
+    c, s = math.cos(robot[2]), math.sin(robot[2])
+    mount = (c * dx + s * dy, c * dy - s * dx, wrap_angle(reading.laser[2] - robot[2]))
+    return Scan(reading.time_s, echo, angles, mount, reading.max_range_m, reading.line)

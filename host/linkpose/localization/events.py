@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import math
 import os
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Protocol, TypeVar
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
@@ -56,39 +58,85 @@ class Scan:
 Log = list[Event | Scan]
 
 
-def read_events(path: Path) -> Log:
-    """Reads a CSV log. Raises LinkposeError with file, line and cure for whatever cannot be a measurement."""
-    log: Log = []
-    header_seen = False
-    last = -math.inf
+class _Timed(Protocol):
+    @property
+    def time_s(self) -> float: ...
+
+
+Timed = TypeVar("Timed", bound=_Timed)
+
+
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """A log as read from a file: its events, the start that it states (x m, y m, heading rad), and what was changed."""
+
+    events: Log
+    start: tuple[float, float, float] | None
+    remarks: tuple[str, ...]
+
+
+def count(number: int, noun: str) -> str:
+    """1 line, 2 lines."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def in_order(items: list[Timed]) -> tuple[list[Timed], int]:
+    """The items in order of time (a stable sort), and how many had an earlier time than one before."""
+    latest, moved = -math.inf, 0
+    for item in items:
+        moved += item.time_s < latest
+        latest = max(latest, item.time_s)
+    return (sorted(items, key=lambda item: item.time_s) if moved else items), moved
+
+
+def read_events(path: Path) -> LogFile:
+    """Reads a CSV log. Rows that are not in order of time are sorted, negative ranges are left
+    out; `remarks` has the counts. Raises LinkposeError with file, line and cure for whatever cannot be a measurement.
+    """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            for line, row in enumerate(csv.reader(file), 1):
-                if not row or row[0].startswith("#"):
-                    continue
-                if not header_seen:
-                    _check_header(path, line, row)
-                    header_seen = True
-                    continue
-                event = _read_row(path, line, row)
-                if event.time_s < last:
-                    raise LinkposeError(
-                        f"{path} line {line}: time runs backwards, from {last:.6g} to {event.time_s:.6g} s; "
-                        "sort the rows by time_s"
-                    )
-                last = event.time_s
-                log.append(event)
-    except (UnicodeDecodeError, csv.Error) as error:
+            events = list(stream_events(file, path))
+    except UnicodeDecodeError as error:
         raise LinkposeError(
             f"{path} is not a CSV file: {error}; give a log with the header {','.join(HEADER)}"
         ) from error
     except OSError as error:
         raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
-    if not log:
+    kept = [event for event in events if not is_negative(event)]
+    if not kept:
         raise LinkposeError(
             f"{path} holds no measurements; a log has the header {','.join(HEADER)} and one row a measurement"
         )
-    return log
+    remarks = []
+    if len(kept) < len(events):
+        remarks.append(f"{path}: {count(len(events) - len(kept), 'negative range')} left out")
+    ordered, moved = in_order(kept)
+    if moved:
+        remarks.append(f"{path}: {count(moved, 'row')} moved into the order of time")
+    return LogFile(list(ordered), None, tuple(remarks))
+
+
+def stream_events(lines: Iterable[str], path: Path) -> Iterator[Event]:
+    """The measurements of the lines of a CSV log, one by one as they come, negative ranges among them."""
+    header_seen = False
+    try:
+        for line, row in enumerate(csv.reader(lines), 1):
+            if not row or not "".join(row).strip() or row[0].startswith("#"):
+                continue
+            if header_seen:
+                yield _read_row(path, line, row)
+            else:
+                _check_header(path, line, row)
+                header_seen = True
+    except csv.Error as error:
+        raise LinkposeError(
+            f"{path} is not a CSV file: {error}; give a log with the header {','.join(HEADER)}"
+        ) from error
+
+
+def is_negative(event: Event) -> bool:
+    """Whether it is a range below 0, as some radios report near an anchor; it is no measurement."""
+    return event.kind in NAMED and event.values[0] < 0.0
 
 
 def format_event(event: Event) -> str:
@@ -124,16 +172,16 @@ def _read_row(path: Path, line: int, row: list[str]) -> Event:
     cells = [cell.strip() for cell in row[2 : 2 + len(fields)]]
     if len(cells) < len(fields) or "" in cells:
         raise LinkposeError(f"{path} line {line}: {kind} needs {', '.join(fields)}; complete or delete the row")
-    beacon = beacon_name(read_number(cells.pop(0), path, line)) if kind in NAMED else ""
+    beacon = beacon_name(cells.pop(0)) if kind in NAMED else ""
     values = tuple(read_number(cell, path, line) for cell in cells)
-    if kind in NAMED and values[0] < 0:
-        raise LinkposeError(f"{path} line {line}: the range is {values[0]:g} m; a range is 0 or more")
     return Event(read_number(row[0], path, line), kind, values, beacon, line)
 
 
-def beacon_name(number: float) -> str:
-    """One spelling for a beacon's number: 5, 05 and 5.0 are the same beacon."""
-    return f"{number:g}"
+def beacon_name(cell: str) -> str:
+    """One spelling for a beacon: 5, 05 and 5.0 are the same; any other name stays as it is."""
+    name = cell.strip()
+    match = re.fullmatch(r"0*(\d+)(?:\.0*)?", name)
+    return match[1] if match else name
 
 
 def read_number(cell: str, path: Path, line: int) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from linkpose.localization.ukf import ukf_step
 
 FilterName = Literal["ekf", "ukf"]
 Bools = NDArray[np.bool_]
-# The spread beyond which a filter that linearises knows no more than "anywhere".
+# Standard deviations beyond which a linearised filter gains nothing from being wider.
 WIDEST = {"x_m": 50.0, "y_m": 50.0, "heading_rad": 1.0}
 
 
@@ -44,6 +44,7 @@ class Motion:
 
 
 UNICYCLE = Motion(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
+CONSTANT_VELOCITY = Motion(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 0, 2)
 HOLONOMIC = Motion(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
 SUBMERSIBLE = Motion(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
 PLANAR_TWIST = Motion(
@@ -106,6 +107,7 @@ class KalmanFilter:
     gate: float | None = None
     transform: Transform = field(default_factory=Transform)
     grid: GridMap = field(default_factory=no_map)
+    d2: Floats = field(init=False, default_factory=lambda: np.empty(0))  # νᵀ S⁻¹ ν of the last step's blocks
     _angle_rows: dict[tuple[tuple[bool, ...], int], Bools] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -155,7 +157,25 @@ class KalmanFilter:
                 f"the {self.name}'s covariance is no longer positive definite; "
                 "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
             )
+        self.d2 = d2
         return np.asarray(d2 <= threshold)
+
+    def copy(self) -> KalmanFilter:
+        """A filter with the same state that goes on by itself."""
+        return replace(self)
+
+    @property
+    def pose_indices(self) -> NDArray[np.intp]:
+        """Where x, y and heading are in the state."""
+        return np.array([self.motion.states.index(name) for name in ("x_m", "y_m", "heading_rad")])
+
+    def place(self, pose: Floats, std: Floats) -> None:
+        """Sets x, y, heading to `pose` (3,) with standard deviations `std` (3,), uncorrelated with the other states."""
+        at = self.pose_indices
+        self.state[at] = pose
+        self.covariance[at, :] = 0.0
+        self.covariance[:, at] = 0.0
+        self.covariance[at, at] = std**2
 
     def _angles_of(self, measurement: Measurement) -> Bools:
         """Which of the states, and after them of the measurement's rows, are angles."""

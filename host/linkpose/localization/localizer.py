@@ -2,103 +2,55 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.localization import models
+from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import GridMap, no_map
-from linkpose.localization.kalman import (
-    HOLONOMIC,
-    SUBMERSIBLE,
-    UNICYCLE,
-    FilterName,
-    KalmanFilter,
-    Measurement,
-    Motion,
-    Transform,
-    covariance_root,
-)
+from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
+from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
+from linkpose.localization.noise import check_correlation
+from linkpose.localization.settings import Pose, Settings
+from linkpose.localization.smoother import History
 from linkpose.localization.tables import Beacons
+from linkpose.localization.track import Track
+from linkpose.localization.vehicle import (
+    CONTROLS,
+    DIVING,
+    at_their_height,
+    control_holds,
+    first_pose,
+    kinds_of,
+    noise_root,
+    place_from_ranges,
+    start_state,
+    vehicle_of,
+)
 
-Pose = tuple[float, float, float]
-DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
-CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
-# When the gate has refused most of so many measurements of a kind, the pose is taken to be wrong, not the sensor.
+Method = Literal["scan-match", "ekf", "ukf", "mcl"]
+# When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
 PATIENCE = 10
-WIDENING = 3.0  # of the pose's standard deviations, then
-# What can be estimated -> the state's name and its standard deviation at the start.
-CONSTANTS = {"scale": ("range_scale_error", 0.1), "bias": ("range_bias_m", 0.3)}
+WIDENING = 3.0  # factor on the pose's standard deviations then
 
 
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How good the sensors are (standard deviations) and how the filter treats them.
+class Row(NamedTuple):
+    """The estimate after the measurements of one instant: state (n,) and covariance (n, n), NaN while not known."""
 
-    `speed_std_m_s` and `turn_std_rad_s` are the errors of one odometry sample, `velocity_std_m_s` those of one velocity
-    sample on each axis; each holds until the next sample. `start` is the pose at the log's start, with `start_std` (m,
-    rad).
-    """
-
-    ranges: RangeNoise = field(default_factory=RangeNoise)
-    bearing_std_rad: float = 0.05
-    depth_std_m: float = 0.05
-    attitude_std_rad: float = 0.01
-    speed_std_m_s: float = 0.1
-    turn_std_rad_s: float = 0.1
-    motion_correlation: float = 0.0
-    velocity_std_m_s: float = 0.1
-    yaw_acceleration_std_rad_s2: float = 0.1
-    gate: float | None = 0.997
-    transform: Transform = field(default_factory=Transform)
-    estimate: tuple[str, ...] = ()
-    start: Pose | None = None
-    start_std: tuple[float, float] = (0.5, 0.1)
-
-
-@dataclass(frozen=True, slots=True)
-class Track:
-    """What a filter made of a log: a row for each instant with a measurement.
-
-    `state` (N, n) in the order of `names`, `covariance` (N, n, n). `applied` and `rejected` count measurements: a
-    range, a beam, a landmark, a depth, an attitude. `rejected_ranges` holds time and beacon of each range that the gate
-    refused. `widened` counts how often the pose was opened again, since most was refused.
-    """
-
-    names: tuple[str, ...]
-    time_s: Floats
+    time_s: float
     state: Floats
     covariance: Floats
-    applied: int
-    rejected: int
-    rejected_ranges: frozenset[tuple[float, str]]
-    widened: int
-
-    @property
-    def position_m(self) -> Floats:
-        """(N, 2), or (N, 3) under water."""
-        return self.state[:, : 3 if "z_m" in self.names else 2]
-
-    @property
-    def heading_rad(self) -> Floats:
-        return self.state[:, self.names.index("heading_rad")]
-
-    @property
-    def std(self) -> Floats:
-        """(N, n) standard deviations."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 def localize(
     log: Log,
-    name: FilterName,
+    name: Method,
     settings: Settings,
     grid: GridMap | None = None,
     beacons: Beacons | None = None,
@@ -106,63 +58,127 @@ def localize(
 ) -> Track:
     """Estimates the path of a robot from its log, which the messages call `origin`.
 
-    Raises LinkposeError when map, beacons, start or noise do not fit the log, or a covariance ceases to be one.
+    Raises LinkposeError when map, beacons, start or noise do not fit the log, or a covariance is no longer one.
     """
-    _check(log, settings, grid, beacons or {}, origin)
-    return _Run(log, name, settings, grid or no_map(), beacons or {}).track()
+    check(log, name, settings, grid, beacons or {}, origin)
+    if name == "mcl":
+        from linkpose.localization.mcl import localize_mcl
+
+        return localize_mcl(log, settings, grid or no_map())
+    run = Localizer(log, name, settings, grid, beacons or {})
+    holds = control_holds(log, run.control_kind)
+    rows: list[Row] = []
+    instants: list[float] = []
+    for first, last in batches(log):
+        row = run.feed(log[first:last], holds.get(first))
+        instants.append(row.time_s)
+        if rows and row.time_s == rows[-1].time_s:
+            rows[-1] = row
+        else:
+            rows.append(row)
+    if run.history is not None:
+        smoothed = run.history.smooth(run.filter.motion.is_angle)
+        last_of = {time: i for i, time in enumerate(instants)}  # the smoothed state after the last event of an instant
+        rows = [run.finished(row.time_s, *smoothed[last_of[row.time_s]]) for row in rows]
+    return run.track(rows)
 
 
-def warm_up(names: Iterable[FilterName]) -> None:
+def batches(log: Log) -> Iterator[tuple[int, int]]:
+    """The first and last + 1 index of each set of events that are one measurement: ranges of one instant."""
+    i = 0
+    while i < len(log):
+        j = i + 1
+        while j < len(log) and log[i].kind == log[j].kind == "range" and log[j].time_s == log[i].time_s:
+            j += 1
+        yield i, j
+        i = j
+
+
+def warm_up(names: Iterable[Method]) -> None:
     """Compiles the filters, or loads them compiled."""
     at_one_place: Log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(0.1, "pose", (0.0, 0.0, 0.0))]
     for name in names:
         localize(at_one_place, name, Settings())
 
 
-class _Run:
-    """One pass of a log through a filter."""
+class Localizer:
+    """One pass of a log through a filter, measurement by measurement.
 
-    def __init__(self, log: Log, name: FilterName, settings: Settings, grid: GridMap, beacons: Beacons) -> None:
-        self.log, self.settings, self.beacons = log, settings, beacons
-        vehicle = _vehicle(_kinds(log))
-        motion = vehicle.extended(tuple(CONSTANTS[word][0] for word in settings.estimate))
-        self.prior = _first_pose(log) if settings.start is None else None
-        state, std = _start(log, settings, motion, self.prior)
+    `head` is the log or its beginning, from which the motion model and the start follow.
+    """
+
+    def __init__(self, head: Log, name: Method, settings: Settings, grid: GridMap | None, beacons: Beacons) -> None:
+        self.settings = settings
+        kinds = kinds_of(head)
+        self.vehicle = vehicle_of(kinds)
+        if self.vehicle is CONSTANT_VELOCITY:
+            beacons = at_their_height(beacons)
+        self.control_kind = CONTROLS.get(self.vehicle.model, "")
+        motion = self.vehicle.extended(constant_states(settings.estimate, list(beacons)))
+        self.prior = first_pose(head) if settings.start is None else None
+        start = settings.start if self.prior is None else _pose_of(self.prior)
+        if start is None and self.vehicle is CONSTANT_VELOCITY:
+            start = place_from_ranges(head, beacons)
+        depth = next((event.values[0] for event in head if isinstance(event, Event) and event.kind == "depth"), 0.0)
+        state, std = start_state(start or (0.0, 0.0, 0.0), depth, settings, motion)
+        kalman: FilterName = "ukf" if name == "ukf" else "ekf"
         self.filter = KalmanFilter(
-            name,
+            kalman,
             motion,
             state,
             np.diag(std**2),
-            _noise_root(settings, vehicle),
+            noise_root(settings, self.vehicle),
             settings.gate,
             settings.transform,
-            grid,
+            grid or no_map(),
         )
-        self.control = np.zeros(motion.controls)
-        self.hold = np.ones(motion.noises)
-        self.control_kind = CONTROLS[vehicle.model]
-        self.holds = _holds([event.time_s for event in log if event.kind == self.control_kind])
-        self.now = log[0].time_s
-        self.last_range: dict[str, float] = {}
-        self.lately_refused: dict[str, deque[bool]] = {}
-        self.applied = self.rejected = self.widened = 0
+        self.sensors = Sensors(settings, motion, beacons)
+        self.control, self.hold = np.zeros(motion.controls), np.ones(motion.noises)
+        self.now = head[0].time_s
+        self.last_control_s: float | None = None
+        self.lately_rejected: dict[str, deque[bool]] = {}
+        self.applied = self.rejected = self.widened = self.relocated = 0
         self.rejected_ranges: set[tuple[float, str]] = set()
+        self.consistency = Consistency()
+        self.known = start is not None
+        self.history = History() if settings.smooth else None
+        self.laser = None
+        if name == "scan-match" and "scan" in kinds and grid is not None:
+            from linkpose.localization.scan_tracking import ScanTracker
 
-    def track(self) -> Track:
-        n = len(self.filter.state)
-        rows = len({event.time_s for event in self.log})
-        time, state, covariance = np.empty(rows), np.empty((rows, n)), np.empty((rows, n, n))
-        row, i = -1, 0
-        while i < len(self.log):
-            j = i + 1
-            while j < len(self.log) and _one_measurement(self.log[i], self.log[j]):
-                j += 1
-            if i == 0 or self.log[i].time_s > time[row]:
-                row += 1
-            self._take(self.log[i:j])
-            time[row], state[row], covariance[row] = self.now, self.filter.state, self.filter.covariance
-            i = j
-        lost = np.flatnonzero(~np.isfinite(state).all(axis=1))
+            self.laser = ScanTracker(grid)
+
+    def feed(self, events: Sequence[Event | Scan], hold_s: float | None = None) -> Row:
+        """Moves on to the events' time and applies them; all are one measurement. `hold_s` is how long a control holds,
+        by default as long as the one before.
+        """
+        event = events[0]
+        interval = event.time_s - self.now
+        measurement = None
+        if event is not self.prior and not (isinstance(event, Scan) and self.laser):
+            measurement = self.sensors.measurement(events)
+        if self.laser and self.laser.contest:
+            self.laser.predict(interval, self.control, self.hold)
+        if self.history is not None:
+            self.history.predict(self.filter, interval, self.control, self.hold)
+            interval = 0.0
+        passed = self.filter.step(interval, self.control, self.hold, measurement if self.known else None)
+        self.now = event.time_s
+        if isinstance(event, Scan) and self.laser:
+            self._match(event)
+        elif measurement is not None and self.known:
+            self._count(events, passed)
+        if isinstance(event, Event):
+            self._steer(event, hold_s)
+        if self.history is not None:
+            self.history.correct(self.filter, self.known)
+        return self._row()
+
+    def track(self, rows: Sequence[Row]) -> Track:
+        """The path of all rows, with the counts so far. Raises LinkposeError for an estimate that is infinite."""
+        state = np.array([row.state for row in rows])
+        time = np.array([row.time_s for row in rows])
+        lost = np.flatnonzero(np.isinf(state).any(axis=1))
         if len(lost):
             raise LinkposeError(
                 f"the estimate left all numbers at {time[lost[0]]:.6g} s of the log; "
@@ -172,85 +188,68 @@ class _Run:
             self.filter.motion.states,
             time,
             state,
-            covariance,
+            np.array([row.covariance for row in rows]),
             self.applied,
             self.rejected,
             frozenset(self.rejected_ranges),
             self.widened,
+            self.relocated,
+            self.consistency,
         )
 
-    def _take(self, events: Sequence[Event | Scan]) -> None:
-        event = events[0]
-        measurement = self._measurement(events)
-        passed = self.filter.step(event.time_s - self.now, self.control, self.hold, measurement)
-        self.now = event.time_s
-        if measurement is not None:
-            self._count(events, passed)
-        if isinstance(event, Event):
-            self._steer(event)
+    def _row(self) -> Row:
+        state, covariance = self.filter.state.copy(), self.filter.covariance.copy()
+        if not self.known:
+            state[:], covariance[:] = np.nan, np.nan
+        return self.finished(self.now, state, covariance)
 
-    def _steer(self, event: Event) -> None:
+    def finished(self, time_s: float, state: Floats, covariance: Floats) -> Row:
+        """The row with the errors of the map, which no measurement reduces."""
+        if np.isnan(state).any():
+            return Row(time_s, np.full_like(state, np.nan), np.full_like(covariance, np.nan))
+        if not np.isfinite(state).all():
+            state[:] = np.inf
+        elif self.laser:
+            self.laser.add_map_error(self.filter, covariance)
+        return Row(time_s, state, covariance)
+
+    def _steer(self, event: Event, hold_s: float | None) -> None:
         """A control holds from its own time on."""
         if event.kind == self.control_kind:
             self.control[: len(event.values)] = event.values
-            self.hold[: len(event.values)] = next(self.holds)
+            if hold_s is None and self.last_control_s is not None and event.time_s > self.last_control_s:
+                hold_s = event.time_s - self.last_control_s
+            self.last_control_s = event.time_s
+            if hold_s is not None:
+                self.hold[: len(event.values)] = hold_s
         elif event.kind == "attitude":
             self.control[3:5] = event.values[:2]
 
-    def _measurement(self, events: Sequence[Event | Scan]) -> Measurement | None:
-        event, settings = events[0], self.settings
-        if isinstance(event, Scan):
-            return self._beams(event)
-        if event.kind == "range":
-            return self._ranges([event for event in events if isinstance(event, Event)])
-        if event.kind == "bearing_range":
-            distance = np.array(event.values[:1])
-            variance = settings.ranges.variances(distance, self._mean_range(event))[0]
-            place = np.array([self.beacons[event.beacon][:2]])
-            covariance = np.diag([variance, settings.bearing_std_rad**2])
-            return Measurement(models.LANDMARK, np.array(event.values), covariance, place, 2, (False, True))
-        if event.kind == "depth":
-            return _direct(event.values, (settings.depth_std_m,), ((2, -1.0),), (False,))
-        if event.kind == "attitude":
-            return _direct(event.values[2:], (settings.attitude_std_rad,), ((3, 1.0),), (True,))
-        if event.kind == "pose" and event is not self.prior:
-            heading = self.filter.motion.states.index("heading_rad")
-            far, turned = settings.start_std
-            return _direct(event.values, (far, far, turned), ((0, 1.0), (1, 1.0), (heading, 1.0)), (False, False, True))
-        return None
+    def _match(self, scan: Scan) -> None:
+        """Corrects with a whole scan, and follows what the tracker found of the pose."""
+        assert self.laser is not None
+        result = self.laser.correct(self.filter, scan, self.known)
+        self.applied += result.hits
+        self.rejected += result.beams - result.hits
+        self.relocated += result.relocated
+        if result.fit is not None:
+            self.consistency.add("scan", 3, result.fit.d2)
+        self.filter, self.known = result.filter, result.known
 
-    def _beams(self, scan: Scan) -> Measurement | None:
-        echo = np.isfinite(scan.ranges_m)
-        ranges = scan.ranges_m[echo]
-        if not len(ranges):
-            return None
-        table = np.empty((len(ranges), 5))
-        table[:, 0], table[:, 1:4], table[:, 4] = scan.angles_rad[echo], scan.mount, scan.max_range_m
-        return Measurement(models.BEAMS, ranges, self.settings.ranges.covariance(ranges, float(ranges.mean())), table)
-
-    def _ranges(self, events: list[Event]) -> Measurement:
-        states = self.filter.motion.states
-        columns = [
-            states.index(name) if name in states else -1 for name in ("z_m", "range_scale_error", "range_bias_m")
-        ]
-        table = np.array([[*self.beacons[event.beacon], *columns] for event in events], dtype=np.float64)
-        ranges = np.array([event.values[0] for event in events])
-        means = [self._mean_range(event) for event in events]
-        return Measurement(models.BEACON_RANGE, ranges, self.settings.ranges.covariance(ranges, means[-1]), table)
-
-    def _mean_range(self, event: Event) -> float:
-        """r̄ of (14) for sensors that do not measure at one instant: the mean of each beacon's last range."""
-        self.last_range[event.beacon] = event.values[0]
-        return sum(self.last_range.values()) / len(self.last_range)
-
-    def _count(self, events: Sequence[Event | Scan], passed: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> None:
+    def _count(self, events: Sequence[Event | Scan], passed: NDArray[np.bool_]) -> None:
         kind, good = events[0].kind, int(passed.sum())
         self.applied += good
         self.rejected += len(passed) - good
+        block = {"bearing_range": 2, "pose": 3}.get(kind, 1)
+        for i, d2 in enumerate(self.filter.d2):
+            self.consistency.add(kind, block, float(d2))
+            event = events[min(i, len(events) - 1)]
+            if isinstance(event, Event) and event.beacon:
+                self.consistency.add(f"{kind}:{event.beacon}", block, float(d2))
         if kind == "range":
-            refused = [event for event, fits in zip(events, passed, strict=True) if not fits]
-            self.rejected_ranges.update((event.time_s, event.beacon) for event in refused if isinstance(event, Event))
-        lately = self.lately_refused.setdefault(kind, deque(maxlen=PATIENCE))
+            rejected = [event for event, fits in zip(events, passed, strict=True) if not fits]
+            self.rejected_ranges.update((event.time_s, event.beacon) for event in rejected if isinstance(event, Event))
+        lately = self.lately_rejected.setdefault(kind, deque(maxlen=PATIENCE))
         lately.append(2 * good <= len(passed))
         if len(lately) == PATIENCE and 2 * sum(lately) > PATIENCE:
             self.filter.widen(WIDENING)
@@ -258,38 +257,16 @@ class _Run:
             lately.clear()
 
 
-def _kinds(log: Log) -> set[str]:
-    return {event.kind for event in log}
+def _pose_of(event: Event) -> Pose:
+    x, y, heading = event.values
+    return x, y, heading
 
 
-def _vehicle(kinds: set[str]) -> Motion:
-    """The motion model that a log's kinds of measurement call for."""
-    return SUBMERSIBLE if kinds & DIVING else HOLONOMIC if "twist" in kinds else UNICYCLE
-
-
-def _one_measurement(first: Event | Scan, other: Event | Scan) -> bool:
-    """Ranges of one instant belong together: their errors may correlate."""
-    return first.kind == other.kind == "range" and other.time_s == first.time_s
-
-
-def _direct(
-    values: tuple[float, ...], std: tuple[float, ...], table: tuple[tuple[int, float], ...], angles: tuple[bool, ...]
-) -> Measurement:
-    return Measurement(models.DIRECT, np.array(values), np.diag(np.square(std)), np.array(table), len(values), angles)
-
-
-def _holds(times: list[float]) -> Iterator[float]:
-    """How long each control sample holds: until the next; the last as long as the one before."""
-    steps = np.diff(times)
-    steps = steps[steps > 0]
-    usual = float(np.median(steps)) if len(steps) else 1.0
-    for before, after in itertools.pairwise(times):
-        yield after - before if after > before else usual
-    yield usual
-
-
-def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons, origin: str) -> None:
-    kinds = _kinds(log)
+def check(
+    log: Log, name: Method, settings: Settings, grid: GridMap | None, beacons: Beacons, origin: str = "the log"
+) -> None:
+    """Raises LinkposeError where map, beacons, start or settings do not fit the log."""
+    kinds = kinds_of(log)
     if not log:
         raise LinkposeError(f"{origin} holds no measurements; record some first")
     if "scan" in kinds and grid is None:
@@ -301,8 +278,12 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
             f"{origin} mixes a robot's odometry with a vehicle's {' and '.join(sorted(kinds & DIVING))}; "
             "delete the rows of the one or of the other"
         )
-    if settings.estimate and "range" not in kinds:
+    if settings.estimate and not kinds & set(NAMED):
         raise LinkposeError(f"{origin} holds no range rows from which a scale or bias follows; leave out --estimate")
+    if name == "mcl" and "scan" not in kinds:
+        raise LinkposeError(f"{origin} holds no laser scans, which --filter mcl needs; use --filter ekf")
+    if not _has_start(log, name, settings, beacons, kinds):
+        raise LinkposeError("the log does not state where the robot starts; add --start X,Y,HEADING (m, m, rad)")
     for event in log:
         if isinstance(event, Event) and event.kind in NAMED and event.beacon not in beacons:
             raise LinkposeError(
@@ -311,52 +292,25 @@ def _check(log: Log, settings: Settings, grid: GridMap | None, beacons: Beacons,
             )
     check_correlation(settings.ranges.correlation, most_at_once(log), "the correlation of the ranges")
     check_correlation(
-        settings.motion_correlation, 2 if _vehicle(kinds) is UNICYCLE else 3, "the correlation of the motion's noises"
+        settings.motion_correlation,
+        2 if vehicle_of(kinds) is UNICYCLE else 3,
+        "the correlation of the motion's noises",
     )
+
+
+def _has_start(log: Log, name: Method, settings: Settings, beacons: Beacons, kinds: set[str]) -> bool:
+    """Whether the start is given, or can be found."""
+    if settings.start is not None or first_pose(log) is not None or (name == "scan-match" and "scan" in kinds):
+        return True
+    known = all(event.beacon in beacons for event in log if isinstance(event, Event) and event.kind == "range")
+    return vehicle_of(kinds) is CONSTANT_VELOCITY and known and place_from_ranges(log, beacons) is not None
 
 
 def most_at_once(log: Log) -> int:
     """The most ranges that one measurement has."""
-    beams = max((len(event.ranges_m) for event in log if isinstance(event, Scan)), default=1)
+    beams = max((len(thesis_beams(event)) for event in log if isinstance(event, Scan)), default=1)
     counts: dict[float, int] = {}
     for event in log:
         if event.kind == "range":
             counts[event.time_s] = counts.get(event.time_s, 0) + 1
     return max(beams, *counts.values()) if counts else beams
-
-
-def _first_pose(log: Log) -> Event | None:
-    """The pose that the log gives for its own first instant."""
-    first = (event for event in log if isinstance(event, Event) and event.time_s == log[0].time_s)
-    return next((event for event in first if event.kind == "pose"), None)
-
-
-def _start(log: Log, settings: Settings, motion: Motion, prior_event: Event | None) -> tuple[Floats, Floats]:
-    """State and standard deviations at the log's start."""
-    pose = settings.start if prior_event is None else prior_event.values
-    if pose is None:
-        raise LinkposeError("the log does not say where the robot starts; add --start X,Y,HEADING (m, m, rad)")
-    state, std = np.zeros(len(motion.states)), np.zeros(len(motion.states))
-    far, turned = settings.start_std
-    prior = {"x_m": (pose[0], far), "y_m": (pose[1], far), "heading_rad": (pose[2], turned)}
-    depth = next((event.values[0] for event in log if isinstance(event, Event) and event.kind == "depth"), 0.0)
-    prior |= {"z_m": (-depth, max(far, settings.depth_std_m)), "wz_rad_s": (0.0, 0.5)}
-    prior |= {name: (0.0, spread) for name, spread in CONSTANTS.values()}
-    for i, name in enumerate(motion.states):
-        state[i], std[i] = prior[name]
-    return state, std
-
-
-def _noise_root(settings: Settings, vehicle: Motion) -> Floats:
-    """The lower Cholesky factor of Q, (16): off-diagonal between the errors of speed and turn rate, or of a velocity's
-    axes.
-    """
-    speed, turn, velocity = settings.speed_std_m_s, settings.turn_std_rad_s, settings.velocity_std_m_s
-    std = {UNICYCLE: (speed, turn), HOLONOMIC: (speed, speed, turn), SUBMERSIBLE: (velocity, velocity, velocity)}[
-        vehicle
-    ]
-    q = np.zeros((vehicle.noises, vehicle.noises))
-    q[: len(std), : len(std)] = equicorrelated(np.array(std), settings.motion_correlation)
-    if vehicle is SUBMERSIBLE:
-        q[3, 3] = settings.yaw_acceleration_std_rad_s2**2
-    return covariance_root(q, "Q, the covariance of the motion's noises,")

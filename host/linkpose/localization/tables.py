@@ -11,6 +11,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.localization.events import beacon_name, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
+from linkpose.localization.track import Track
 from linkpose.recording.table import Table, read_table
 
 Beacons = dict[str, tuple[float, float, float]]
@@ -41,10 +42,12 @@ def read_beacons(path: Path) -> Beacons:
             raise LinkposeError(
                 f"{path} line {line}: {len(cells)} of {len(header)} columns; complete or delete the row"
             )
-        number, *place = (read_number(cell, path, line) for cell in cells)
-        name = beacon_name(number)
+        place = [read_number(cell, path, line) for cell in cells[1:]]
+        name = beacon_name(cells[0])
+        if not name:
+            raise LinkposeError(f"{path} line {line}: the row has no id; complete or delete it")
         if name in beacons:
-            raise LinkposeError(f"{path} line {line}: beacon {name} stands there twice; give each its own id")
+            raise LinkposeError(f"{path} line {line}: beacon {name} is listed twice; give each its own id")
         beacons[name] = (place[0], place[1], place[2] if len(place) == 3 else 0.0)
     if not beacons:
         raise LinkposeError(f"{path} names no beacons; give one row a beacon: id,x_m,y_m")
@@ -97,28 +100,65 @@ def _read_whole(path: Path, *required: str) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Errors of an estimated path against the truth. The heading's is None where the truth has no heading."""
+    """Errors of an estimated path against the truth. The heading's is None where either path has no heading.
+
+    `rows` of `possible` were compared; `within_2_sigma` is the share of the errors in x and y within two standard
+    deviations.
+    """
 
     position_rmse_m: float
     position_max_m: float
     heading_rmse_rad: float | None
+    rows: int = 0
+    possible: int = 0
+    within_2_sigma: float | None = None
 
 
-def score(time_s: Floats, position_m: Floats, heading_rad: Floats, truth: Truth) -> Score:
-    """Compares estimates at their own times (N,), positions (N, 2 or 3), headings (N,). Raises LinkposeError when the
-    times do not meet.
+def score_track(track: Track, truth: Truth) -> Score:
+    """Compares a track with the truth; rows before the pose is known are left out."""
+    known = track.known
+    heading = None if track.heading_rad is None else track.heading_rad[known]
+    std = track.std[known][:, [track.names.index("x_m"), track.names.index("y_m")]]
+    return score(track.time_s[known], track.position_m[known], heading, truth, std)
+
+
+def score(
+    time_s: Floats, position_m: Floats, heading_rad: Floats | None, truth: Truth, std_m: Floats | None = None
+) -> Score:
+    """Compares estimates at times (N,), positions (N, 2 or 3), headings (N,) and deviations of x and y (N, 2).
+
+    Estimates between two true poses at most LONGEST_TRUTH_GAP_S apart are compared at their own times. Where the truth
+    is sparser than that, the estimate is interpolated at the true poses' times instead. Raises LinkposeError when the
+    times do not meet, or when less than half of the possible rows can be compared.
     """
-    rows = truth.covers(time_s)
+    if not len(time_s):
+        raise LinkposeError("the pose was never known, so there is nothing to compare with the truth")
+    sparse = len(truth.time_s) > 1 and float(np.median(np.diff(truth.time_s))) > LONGEST_TRUTH_GAP_S
+    at = truth.time_s if sparse else time_s
+    inside = (at >= max(time_s[0], truth.time_s[0])) & (at <= min(time_s[-1], truth.time_s[-1]))
+    rows = inside if sparse else truth.covers(time_s)
     if not rows.any():
         raise LinkposeError(
             f"the true path ({truth.time_s[0]:.6g} to {truth.time_s[-1]:.6g} s) has no pose at the log's times "
             f"({time_s[0]:.6g} to {time_s[-1]:.6g} s); give the truth of this log"
         )
+    used, possible = int(rows.sum()), int(inside.sum())
+    if 2 * used < possible:
+        raise LinkposeError(
+            f"only {used} of {possible} estimates lie between true poses at most {LONGEST_TRUTH_GAP_S:g} s apart, "
+            "too few for a score; give a truth with fewer gaps"
+        )
     axes = min(position_m.shape[1], truth.position_m.shape[1])
-    error = position_m[rows, :axes] - truth.position_at(time_s[rows])[:, :axes]
+    there = np.column_stack([np.interp(at[rows], time_s, axis) for axis in position_m.T[:axes]])
+    error = there - truth.position_at(at[rows])[:, :axes]
     distance2 = np.sum(error * error, axis=1)
+    within = None
+    if std_m is not None:
+        spread = np.column_stack([np.interp(at[rows], time_s, axis) for axis in std_m.T])
+        within = float(np.mean(np.abs(error[:, :2]) <= 2.0 * spread))
     heading = None
-    if truth.heading_rad is not None:
-        off = heading_rad[rows] - np.interp(time_s[rows], truth.time_s, truth.heading_rad)
+    if truth.heading_rad is not None and heading_rad is not None:
+        off = np.interp(at[rows], time_s, np.unwrap(heading_rad)) - np.interp(at[rows], truth.time_s, truth.heading_rad)
         heading = math.sqrt(float(np.mean([wrap_angle(value) ** 2 for value in off])))
-    return Score(math.sqrt(float(np.mean(distance2))), math.sqrt(float(np.max(distance2))), heading)
+    worst = math.sqrt(float(np.max(distance2)))
+    return Score(math.sqrt(float(np.mean(distance2))), worst, heading, used, possible, within)

@@ -108,8 +108,8 @@ class Page:
         """Ends the server."""
         self._closing.set()
         self._thread.join()
-        self._server.stop()
-        _rich_console(is_quiet=False)
+        # viser waits up to 6 s for the farewell of browsers; the end of a measurement does not.
+        threading.Thread(target=self._server.stop, name="linkpose page stop", daemon=True).start()
 
     def __enter__(self) -> Page:
         return self
@@ -301,6 +301,7 @@ def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
             _try_to_bind(host, port)
         except OSError as reason:
             raise LinkposeError(f"the page cannot be served at {host}:{port}: {reason.strerror or reason}") from None
+    import rich
     import viser
 
     class Server(viser.ViserServer):
@@ -309,12 +310,5 @@ def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    _rich_console(is_quiet=True)
+    rich.reconfigure(quiet=True)  # the global console, with which viser prints; linkpose has its own
     return Server(host, port, label="linkpose", verbose=False)
-
-
-def _rich_console(is_quiet: bool) -> None:
-    """Silences viser, which prints with rich's global console; nothing else here uses this one."""
-    import rich
-
-    rich.reconfigure(quiet=is_quiet)

@@ -5,6 +5,8 @@
 time_s,...
 0.000000,...
 # {"...": "closing metadata, JSON"}
+
+A plain file has the header and the rows only. Its metadata are beside it: run.meta.json beside run.csv.
 """
 
 from __future__ import annotations
@@ -25,17 +27,35 @@ def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
     return f"# linkpose {kind} 1\n# {json.dumps(metadata)}\n{','.join(columns)}\n"
 
 
+def metadata_path(path: Path) -> Path:
+    """Where the metadata of a plain file are: run.meta.json for run.csv."""
+    return path.with_suffix(".meta.json")
+
+
 class CsvFile:
     """Writes such a file. Also a context manager: leaving it without `close` leaves out the closing line.
 
     Raises LinkposeError where the file cannot be made or written; what was written before stays whole and readable.
     """
 
-    def __init__(self, path: Path, kind: str, metadata: Mapping[str, Any], columns: Sequence[str], force: bool) -> None:
+    def __init__(
+        self,
+        path: Path,
+        kind: str,
+        metadata: Mapping[str, Any],
+        columns: Sequence[str],
+        force: bool,
+        plain: bool = False,
+    ) -> None:
+        """`plain` writes no comment lines and the metadata beside the file."""
         self.path = path
+        self._beside: dict[str, Any] | None = {"kind": kind, "metadata": metadata, "closing": None} if plain else None
+        if plain:
+            os.close(create(metadata_path(path), force))
         self._fd = create(path, force)
         self._has_name = os.fstat(self._fd).st_nlink > 0  # what is behind /dev/stdout may have none
-        self.write(head(kind, metadata, columns))
+        self._write_beside()
+        self.write(",".join(columns) + "\n" if plain else head(kind, metadata, columns))
 
     def write(self, text: str) -> None:
         """Adds whole lines. They are with the operating system at once: killing this process does not lose them.
@@ -48,7 +68,11 @@ class CsvFile:
 
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""
-        self.write(f"# {json.dumps(closing)}\n")
+        if self._beside is None:
+            self.write(f"# {json.dumps(closing)}\n")
+        else:
+            self._beside["closing"] = closing
+            self._write_beside()
         with contextlib.suppress(OSError):  # a pipe cannot be synced
             os.fsync(self._fd)
         self._release()
@@ -59,6 +83,15 @@ class CsvFile:
     def __exit__(self, *_: object) -> None:
         if self._fd >= 0:
             self._release()
+
+    def _write_beside(self) -> None:
+        """Writes the metadata of a plain file."""
+        if self._beside is not None:
+            path = metadata_path(self.path)
+            try:
+                path.write_text(json.dumps(self._beside) + "\n", encoding="utf-8")
+            except OSError as error:
+                raise CannotWrite(path, error.strerror) from error
 
     def _release(self) -> None:
         os.close(self._fd)

@@ -124,10 +124,22 @@ def _from_csv(path: Path) -> Recording:
         _flags(table),
         **_other_sensors(table),
     )
-    remarks = [] if table.closing else [f"{path} has no closing line: it was cut; its {len(table)} whole rows are used"]
+    remarks = [*table.remarks, *_origin(table)]
     remarks += suspicions(path, measurements, _stated_rate(table))
     rig = Rig.from_dict(_metadata_object(table, "rig"), f"{path}, line 2") if "rig" in table.metadata else None
     return Recording(path, measurements, rig, _rate(table), table.metadata, remarks)
+
+
+def _origin(table: Table) -> list[str]:
+    """A remark on a recording without metadata or closing line."""
+    if not table.kind:
+        return [
+            f"{table.path} has no metadata: another program has written or saved it; "
+            "its rate is taken from time_s, and it contains no rig"
+        ]
+    if not table.closing:
+        return [f"{table.path} has no closing line: it was cut; its {len(table)} whole rows are used"]
+    return []
 
 
 def _check_columns(table: Table) -> int:

@@ -75,8 +75,10 @@ MOST_GAPS = 1000  # listed in the closing line; the rows mark every one
 class RecordingWriter(CsvFile):
     """A recording under way. Raises LinkposeError as `CsvFile` does."""
 
-    def __init__(self, path: Path, head: dict[str, Any], layout: columns.Layout, force: bool) -> None:
-        super().__init__(path, "recording", head, columns.names(layout), force)
+    def __init__(
+        self, path: Path, head: dict[str, Any], layout: columns.Layout, force: bool, plain: bool = False
+    ) -> None:
+        super().__init__(path, "recording", head, columns.names(layout), force, plain)
         self._layout = layout
 
     def write_block(self, block: Block) -> None:

@@ -37,4 +37,5 @@ class FrozenDetector:
         last_change = np.maximum.accumulate(np.where(repeats, 0, np.arange(n)))
         since = began[last_change]
         self._last, self._since_s = readings[-1].copy(), float(since[-1])
-        return np.asarray(repeats & (time_s - since >= FROZEN_S), dtype=np.bool_)
+        with np.errstate(invalid="ignore"):  # a stamp may be infinite
+            return np.asarray(repeats & (time_s - since >= FROZEN_S), dtype=np.bool_)

@@ -14,7 +14,7 @@ import numpy as np
 from linkpose.errors import CannotWrite, FileError, FileExists, LinkposeError
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
-from linkpose.localization.grid import save_map
+from linkpose.localization.maps import save_map
 from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats

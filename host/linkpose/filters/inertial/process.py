@@ -24,7 +24,7 @@ from linkpose.filters._imu import (
     unknown_accel,
 )
 from linkpose.filters._vector import Vec
-from linkpose.filters.inertial.free_velocity import follow_speed, update_free_velocity
+from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
 from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
 from linkpose.filters.inertial.joint_velocity import update_joint_velocity
 from linkpose.filters.inertial.propagate import (
@@ -242,7 +242,7 @@ def _integrate(s: Record, h: float, force: Vec, change: Vec, imu: ImuCalibration
 def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> bool:
     """Bring the covariance up to the mean and apply the measurements. False where the reading is rejected."""
     h, impulse, taken = s.span, vec.load(s.impulse), True
-    lasting = max(2.0 * q.correlation_s / h, 1.0)
+    lasting = max(2.0 * correlation_time(s, q) / h, 1.0)
     rotation = lasting * q.gyro_misfit**2 * vec.dot(vec.load(s.turned), vec.load(s.turned))
     velocity = lasting * q.accel_misfit**2 * vec.dot(impulse, impulse)
     force = _steady_force(s, vec.scale(1.0 / h, impulse), imu)

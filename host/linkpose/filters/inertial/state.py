@@ -81,6 +81,7 @@ _FIELDS = np.dtype(
         ("spread", "f8", (3, 3)),  # mean of ω ωᵀ (rad²/s²)
         ("swing", *_VECTOR),  # velocity that the acceleration of the last second adds up to (m/s)
         ("speed_square", "f8"),  # variance of the sensor's own velocity (m²/s²)
+        ("accel_square", "f8"),  # mean square of its acceleration on each axis (m²/s⁴)
         ("mean_force", *_VECTOR),  # over the last tenth of a second (m/s²)
         ("mean_rate", *_VECTOR),  # rad/s
         ("unsteadiness", "f8"),  # mean square change of rate and tilt (rad²/s²)

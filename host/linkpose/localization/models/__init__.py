@@ -15,6 +15,7 @@ from linkpose.localization.linalg import Floats
 from linkpose.localization.models import (
     beacon_range,
     beams,
+    constant_velocity,
     direct,
     holonomic,
     landmark,
@@ -26,6 +27,7 @@ from linkpose.localization.models import (
 )
 
 UNICYCLE, HOLONOMIC, SUBMERSIBLE, PLANAR_TWIST = unicycle.ID, holonomic.ID, submersible.ID, planar_twist.ID
+CONSTANT_VELOCITY = constant_velocity.ID
 BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
 MOUSE_VELOCITY, RATE_GYRO = mouse_velocity.ID, rate_gyro.ID
 
@@ -39,6 +41,8 @@ def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interv
         holonomic.propagate(state, control, noise, interval, out)
     elif motion == SUBMERSIBLE:
         submersible.propagate(state, control, noise, interval, out)
+    elif motion == CONSTANT_VELOCITY:
+        constant_velocity.propagate(state, control, noise, interval, out)
     else:
         planar_twist.propagate(state, control, noise, interval, out)
 
@@ -54,6 +58,8 @@ def motion_jacobians(
         holonomic.jacobians(state, control, interval, by_state, by_noise)
     elif motion == SUBMERSIBLE:
         submersible.jacobians(state, control, interval, by_state, by_noise)
+    elif motion == CONSTANT_VELOCITY:
+        constant_velocity.jacobians(state, control, interval, by_state, by_noise)
     else:
         planar_twist.jacobians(state, control, interval, by_state, by_noise)
 

@@ -1,0 +1,81 @@
+"""Converts estimates and recordings into the formats of other programs.
+
+| ending | read by | content |
+|---|---|---|
+| `.sto` | OpenSim (OpenSense) | orientation of the sensor, quaternions w, x, y, z, Z up |
+| `.mot` | OpenSim | all columns |
+| `.trc` | OpenSim, motion-capture programs | three markers on the sensor, mm, Y up |
+| `.c3d` | motion-capture programs | three markers on the sensor, mm, Z up |
+| `.tum` | evo | positions (m) and quaternions x, y, z, w, Z up |
+| `.mcap` | Foxglove, ROS 2 tools | pose (`foxglove.PoseInFrame`) and all columns, as JSON |
+| `.parquet` | pandas, polars, linkpose | all columns with the metadata |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from linkpose.convert import c3d, mcap, parquet, text
+from linkpose.convert.motion import Motion, motion_of, only_filter
+from linkpose.errors import CannotWrite, InvalidValue
+from linkpose.recording.csvfile import create
+from linkpose.recording.table import Table, read_table
+
+_OF_MOTION: dict[str, Callable[[Path, Motion], None]] = {
+    ".sto": text.write_sto,
+    ".trc": text.write_trc,
+    ".c3d": c3d.write,
+    ".tum": text.write_tum,
+}
+_OF_TABLE: dict[str, Callable[[Path, Table], None]] = {
+    ".mot": text.write_mot,
+    ".mcap": mcap.write,
+    ".parquet": parquet.write,
+}
+ENDINGS = (*_OF_MOTION, *_OF_TABLE)
+
+
+def convert(
+    source: Path, output: Path, wanted: str | None = None, label: str = "sensor_imu", force: bool = False
+) -> list[str]:
+    """Writes `source`, a table that linkpose reads, in the format of the ending of `output`; gives remarks.
+
+    `wanted` names the filter; without it, formats of one motion hold the first filter that fits, and formats of columns
+    hold all. `label` names the sensor in formats with names. An existing output is kept unless `force`. Raises
+    FileError, MissingLibrary, UnknownFilter, or LinkposeError where the source has no motion.
+    """
+    ending = output.suffix.lower()
+    if ending not in ENDINGS:
+        raise InvalidValue("output", f"ends in {ending or 'nothing'}; the formats are {', '.join(ENDINGS)}")
+    table = read_table(source)
+    remarks = list(table.remarks)
+    if ending in _OF_MOTION:
+        motion = motion_of(table, wanted, label)
+        remarks += motion.remarks
+        _write(output, force, lambda: _OF_MOTION[ending](output, motion))
+    else:
+        part = only_filter(table, wanted) if wanted else table
+        _write(output, force, lambda: _OF_TABLE[ending](output, part))
+    return remarks
+
+
+def _write(output: Path, force: bool, action: Callable[[], None]) -> None:
+    """Runs `action`, which fills the new file; removes the file where that fails."""
+    os.close(create(output, force))
+    try:
+        action()
+    except OSError as error:
+        _remove(output)
+        raise CannotWrite(output, error.strerror) from error
+    except BaseException:
+        _remove(output)
+        raise
+
+
+def _remove(output: Path) -> None:
+    with contextlib.suppress(OSError):
+        if output.is_file():
+            output.unlink()

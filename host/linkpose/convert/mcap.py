@@ -1,0 +1,76 @@
+"""MCAP, the container of Foxglove and ROS 2 tools, by `mcap`: messages as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from linkpose import __version__
+from linkpose.convert import libraries
+from linkpose.convert.motion import Motion, motion_of
+from linkpose.errors import LinkposeError
+from linkpose.recording.table import Table
+
+_NUMBER = {"type": "number"}
+
+
+def write(path: Path, table: Table) -> None:
+    """A topic /linkpose/values with all columns, and /linkpose/pose where the table has a motion. World: Z up."""
+    table.require("time_s")
+    writer_module = libraries.load("mcap.writer", path)
+    with path.open("wb") as file:
+        writer = writer_module.Writer(file)
+        writer.start(profile="", library=f"linkpose {__version__}")
+        values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(table.columns))
+        names = list(table.columns)
+        for row in zip(*(column.tolist() for column in table.columns.values()), strict=True):
+            content = {name: value for name, value in zip(names, row, strict=True) if math.isfinite(value)}
+            _add(writer, values, content.get("time_s", 0.0), content)
+        if (motion := _motion(table)) is not None:
+            _add_poses(writer, motion)
+        writer.finish()
+
+
+def _motion(table: Table) -> Motion | None:
+    try:
+        return motion_of(table, None, "sensor")
+    except LinkposeError:  # a recording, or a filter that estimates the height alone
+        return None
+
+
+def _add_poses(writer: Any, motion: Motion) -> None:
+    parts = {name: _schema(name_parts) for name, name_parts in (("position", "xyz"), ("orientation", "xyzw"))}
+    time = _schema(("sec", "nsec"))
+    pose = {"type": "object", "properties": parts}
+    schema = {"type": "object", "properties": {"timestamp": time, "frame_id": {"type": "string"}, "pose": pose}}
+    channel = _channel(writer, "/linkpose/pose", "foxglove.PoseInFrame", schema)
+    rows = zip(motion.time_s.tolist(), motion.position_m.tolist(), motion.quaternion.tolist(), strict=True)
+    for t, (x, y, z), (qw, qx, qy, qz) in rows:
+        seconds, nanoseconds = divmod(_nanoseconds(t), 1_000_000_000)
+        orientation = {"x": qx, "y": qy, "z": qz, "w": qw}
+        content = {
+            "timestamp": {"sec": seconds, "nsec": nanoseconds},
+            "frame_id": "world",
+            "pose": {"position": {"x": x, "y": y, "z": z}, "orientation": orientation},
+        }
+        _add(writer, channel, t, content)
+
+
+def _schema(names: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": dict.fromkeys(names, _NUMBER)}
+
+
+def _channel(writer: Any, topic: str, name: str, schema: dict[str, Any]) -> int:
+    schema_id = writer.register_schema(name=name, encoding="jsonschema", data=json.dumps(schema).encode())
+    return int(writer.register_channel(topic=topic, message_encoding="json", schema_id=schema_id))
+
+
+def _nanoseconds(t: float) -> int:
+    return max(0, round(t * 1e9))
+
+
+def _add(writer: Any, channel: int, t: float, content: dict[str, Any]) -> None:
+    stamp = _nanoseconds(t)
+    writer.add_message(channel, log_time=stamp, publish_time=stamp, data=json.dumps(content).encode())

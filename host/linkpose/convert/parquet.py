@@ -1,0 +1,19 @@
+"""Parquet, the columnar format of pandas and polars, by `pyarrow`. linkpose's metadata travel in the file's schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from linkpose.convert import libraries
+from linkpose.recording.table import PARQUET_KEY, Table
+
+
+def write(path: Path, table: Table) -> None:
+    """All columns as float64; missing values are null."""
+    pa = libraries.load("pyarrow", path)
+    pq = libraries.load("pyarrow.parquet", path)
+    arrays = {name: pa.array(values, from_pandas=True) for name, values in table.columns.items()}
+    content = {"kind": table.kind, "metadata": table.metadata, "closing": table.closing}
+    found = pa.table(arrays).replace_schema_metadata({PARQUET_KEY: json.dumps(content).encode()})
+    pq.write_table(found, path, compression="zstd")

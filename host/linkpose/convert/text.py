@@ -1,0 +1,74 @@
+"""The text formats of OpenSim and the trajectories of the TUM benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from linkpose.convert.motion import Motion
+from linkpose.recording.table import Table
+from linkpose.sensors.measurements import Floats
+
+
+def write_sto(path: Path, motion: Motion) -> None:
+    """OpenSense's orientations: one column of quaternions w,x,y,z, which turn the sensor's axes into a world with Z up.
+
+    OpenSim's own world has Y up: pass `sensor_to_opensim_rotations` = (-π/2, 0, 0) to its tools.
+    """
+    head = [f"DataRate={motion.rate_hz:.6f}", "DataType=Quaternion", "version=3", "OpenSimVersion=4.5", "endheader"]
+    rows = (
+        f"{t:.6f}\t" + ",".join(f"{part:.9f}" for part in quaternion)
+        for t, quaternion in zip(motion.time_s.tolist(), motion.quaternion.tolist(), strict=True)
+    )
+    _write(path, [*head, f"time\t{motion.label}"], rows)
+
+
+def write_mot(path: Path, table: Table) -> None:
+    """OpenSim's motion file: all columns; angles as their names state."""
+    table.require("time_s")
+    names = [name for name in table.columns if name != "time_s"]
+    angles = "yes" if any(name.endswith("_deg") for name in names) else "no"
+    head = [path.stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names) + 1}", f"inDegrees={angles}"]
+    values = np.column_stack([table.columns[name] for name in ("time_s", *names)])
+    rows = ("\t".join(f"{value:.9g}" for value in row) for row in values.tolist())
+    _write(path, [*head, "endheader", "\t".join(["time", *names])], rows)
+
+
+def write_trc(path: Path, motion: Motion) -> None:
+    """Three markers in mm at equal intervals, in OpenSim's world with Y up. An empty field is a missing marker."""
+    start, rate, markers = motion.on_grid()
+    names = motion.marker_names()
+    count = len(markers)
+    head = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+        f"{rate:g}\t{rate:g}\t{count}\t{len(names)}\tmm\t{rate:g}\t1\t{count}",
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        "\t\t" + "\t".join(f"{axis}{i}" for i in range(1, len(names) + 1) for axis in "XYZ"),
+        "",
+    ]
+    # Each row ends with a tab: OpenSim drops a last field that is empty.
+    y_up = 1000 * markers[:, :, [0, 2, 1]] * [1, 1, -1]
+    rows = (
+        f"{i + 1}\t{start + i / rate:.6f}\t" + "\t".join(_cells(row)) + "\t"
+        for i, row in enumerate(y_up.reshape(count, -1))
+    )
+    _write(path, head, rows)
+
+
+def write_tum(path: Path, motion: Motion) -> None:
+    """Time (s), position (m) and quaternion x, y, z, w of each pose; the world has Z up."""
+    values = np.column_stack([motion.time_s, motion.position_m, motion.quaternion[:, [1, 2, 3, 0]]])
+    _write(path, [], (" ".join(f"{value:.9f}" for value in row) for row in values.tolist()))
+
+
+def _cells(row: Floats) -> list[str]:
+    return ["" if value != value else f"{value:.4f}" for value in row.tolist()]
+
+
+def _write(path: Path, head: list[str], rows: Iterable[str]) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in head)
+        file.writelines(f"{row}\n" for row in rows)

@@ -1,0 +1,145 @@
+"""The distance from every point of a grid map to the nearest wall, as a field that a laser scan is fitted to.
+
+The exact Euclidean distance transform takes two passes over the grid: Felzenszwalb and Huttenlocher, "Distance
+Transforms of Sampled Functions", Theory of Computing 8 (2012), pages 415-428. Between the cells' centres the distance
+is interpolated bilinearly.
+
+Two kinds of map need two zeros. In a map that was made of scans, the echoes of a wall scatter about the centre of its
+cells. In a map that was drawn, walls are thick and beams end at their faces; there the field is signed, with the zero
+at the face and negative distances inside. A map counts as drawn where nearly all wall cells have another one behind.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.compiling import compiled
+from linkpose.localization.grid import FREE, OCCUPIED, GridMap
+from linkpose.localization.linalg import Floats
+
+Field = NDArray[np.int16]
+# Distances are cut off here (m). A beam that ends farther from any wall than this meets something that the map does not
+# have; where it ends no longer matters. Doubling it lets a global search start from twice as far, on a coarser field.
+FARTHEST_M = 3.0
+# One count of the field (m): 3 m in 16 bits. A map of 2 km x 2 km then takes 0.8 GB.
+COUNT_M = FARTHEST_M / 32767
+# Share of the wall cells beside free ones that have a wall cell behind, from which on a map counts as drawn: 1.0 in the
+# simulated office, 0.58 and 0.62 in two buildings mapped by GMapping, 0.90 in an old map with smeared walls.
+DRAWN_SHARE = 0.97
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceField:
+    """The field of one map: `counts[row, column]` times COUNT_M is the distance (m) of a cell's centre from a wall.
+
+    `geometry` is the map's: cell size m, x and y of the lower left corner m, rotation rad.
+    """
+
+    counts: Field
+    geometry: Floats
+
+    @staticmethod
+    def of(grid: GridMap) -> DistanceField:
+        """Builds the field of a map's walls. Unknown cells are no walls: nobody has measured an echo there."""
+        counts = np.empty(grid.blocked.shape, np.int16)
+        cell = float(grid.geometry[0])
+        fill_distances(grid.blocked, cell, False, counts)
+        if thick_share(grid.blocked) > DRAWN_SHARE:
+            inside = np.empty(grid.blocked.shape, np.int16)
+            fill_distances(grid.blocked, cell, True, inside)
+            half = round(0.5 * cell / COUNT_M)
+            counts = np.where(grid.blocked == OCCUPIED, half - inside, counts - half).astype(np.int16)
+        return DistanceField(counts, grid.geometry)
+
+
+@compiled
+def thick_share(blocked: NDArray[np.uint8]) -> float:
+    """The share of the wall cells beside a free cell, in either axis, that have another wall cell behind them."""
+    beside, thick = 0, 0
+    for row in range(1, blocked.shape[0] - 1):
+        for column in range(1, blocked.shape[1] - 1):
+            if blocked[row, column] == OCCUPIED:
+                for down, along in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+                    if blocked[row + down, column + along] == FREE:
+                        beside += 1
+                        thick += blocked[row - down, column - along] == OCCUPIED
+    return thick / beside if beside else 0.0
+
+
+@compiled
+def fill_distances(blocked: NDArray[np.uint8], cell: float, inside: bool, counts: Field) -> None:
+    """Fills `counts` with the distance to the nearest occupied cell, in units of COUNT_M, at most FARTHEST_M.
+
+    With `inside`, it is the distance to the nearest cell that is not occupied.
+    """
+    rows, columns = blocked.shape
+    limit = int(FARTHEST_M / cell) + 2  # in cells; farther ones are cut off anyway
+    for column in range(columns):
+        since = limit
+        for row in range(rows):
+            since = 0 if (blocked[row, column] == OCCUPIED) != inside else min(since + 1, limit)
+            counts[row, column] = min(since, 32767)
+        since = limit
+        for row in range(rows - 1, -1, -1):
+            since = 0 if (blocked[row, column] == OCCUPIED) != inside else min(since + 1, limit)
+            counts[row, column] = min(counts[row, column], since)
+    height, vertex, border = np.empty(columns), np.empty(columns, np.int64), np.empty(columns + 1)
+    for row in range(rows):
+        for column in range(columns):
+            height[column] = float(counts[row, column]) ** 2
+        _lower_envelope(height, vertex, border)
+        k = 0
+        for column in range(columns):
+            while border[k + 1] < column:
+                k += 1
+            off = float(column - vertex[k])
+            distance = cell * math.sqrt(off * off + height[vertex[k]])
+            counts[row, column] = int(min(distance, FARTHEST_M) / COUNT_M + 0.5)
+
+
+@compiled
+def _lower_envelope(height: Floats, vertex: NDArray[np.int64], border: Floats) -> None:
+    """The parabolas (q − vertex)² + height[vertex] that are lowest, each from its border to the next one's."""
+    k = 0
+    vertex[0], border[0], border[1] = 0, -np.inf, np.inf
+    for q in range(1, height.shape[0]):
+        while True:
+            v = vertex[k]
+            crossing = ((height[q] + q * q) - (height[v] + v * v)) / (2.0 * (q - v))
+            if crossing > border[k]:
+                break
+            k -= 1
+        k += 1
+        vertex[k], border[k], border[k + 1] = q, crossing, np.inf
+
+
+@compiled
+def distance_at(counts: Field, geometry: Floats, x: float, y: float, out: Floats) -> None:
+    """Fills `out` (3,) with the signed distance (m) at (x, y) in the map's frame and its slopes along x and y (m/m).
+
+    Outside of the map the distance is FARTHEST_M and the slopes are 0.
+    """
+    cell: float = geometry[0]
+    c, s = math.cos(geometry[3]), math.sin(geometry[3])
+    along_x, along_y = x - geometry[1], y - geometry[2]
+    u = (c * along_x + s * along_y) / cell - 0.5
+    v = (c * along_y - s * along_x) / cell - 0.5
+    rows, columns = counts.shape
+    # Compared as floats: an estimate that has diverged may be beyond all integers.
+    if not (u >= 0.0 and v >= 0.0 and u < columns - 1.0 and v < rows - 1.0):
+        out[0], out[1], out[2] = FARTHEST_M, 0.0, 0.0
+        return
+    column, row = int(u), int(v)
+    p, q = u - column, v - row
+    d00, d01 = float(counts[row, column]), float(counts[row, column + 1])
+    d10, d11 = float(counts[row + 1, column]), float(counts[row + 1, column + 1])
+    below, above = d00 + p * (d01 - d00), d10 + p * (d11 - d10)
+    along_u = ((1.0 - q) * (d01 - d00) + q * (d11 - d10)) * COUNT_M / cell
+    along_v = (above - below) * COUNT_M / cell
+    out[0] = (below + q * (above - below)) * COUNT_M
+    out[1] = c * along_u - s * along_v
+    out[2] = s * along_u + c * along_v

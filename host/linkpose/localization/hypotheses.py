@@ -1,0 +1,72 @@
+"""Several poses that explain the log so far, until one of them wins clearly.
+
+Each hypothesis is a Kalman filter of its own. All of them receive every measurement; the log-likelihoods of the laser
+scans add up to a score. Hypotheses that meet become one, hopeless ones are dropped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from linkpose.localization.kalman import KalmanFilter
+from linkpose.localization.linalg import wrap_angle
+
+# Hypotheses nearer than this (m, rad) are one. It is wider than the spread of one fit, and below a door's width.
+SAME_M, SAME_RAD = 0.5, 0.35
+# A lead in log-likelihood that decides, with scans that count as ten independent beams each: odds of 10^5 to 1.
+# Doubling it doubles the time to the first pose.
+LEAD = 12.0
+INCUMBENT = (
+    10.0  # head start of the pose that was tracked so far: people around a robot are more frequent than kidnappers
+)
+HOPELESS = 25.0  # a hypothesis so far behind is dropped
+# Scans from one place repeat each other: a scan counts when the robot has moved this far (m) or turned (rad) since the
+# last one that counted. So many must count before one decides, as a single scan may fit two corridors that look alike.
+COUNTS_AFTER_M, COUNTS_AFTER_RAD = 0.2, 0.2
+SCANS = 4
+
+
+@dataclass(slots=True)
+class Hypothesis:
+    """A filter and the log-likelihood of the scans that it has explained."""
+
+    filter: KalmanFilter
+    score: float = 0.0
+
+    def is_near(self, other: Hypothesis) -> bool:
+        """Whether both are one pose."""
+        at = self.filter.pose_indices
+        off = self.filter.state[at] - other.filter.state[at]
+        return bool(np.hypot(off[0], off[1]) < SAME_M and abs(wrap_angle(float(off[2]))) < SAME_RAD)
+
+
+class Contest:
+    """Hypotheses until one wins."""
+
+    def __init__(self, hypotheses: list[Hypothesis]) -> None:
+        self.hypotheses = hypotheses
+        self.scans = 0
+        self.moved_m = self.turned_rad = 0.0
+
+    def moved(self, distance_m: float, turn_rad: float) -> None:
+        """Adds a motion of the robot."""
+        self.moved_m += abs(distance_m)
+        self.turned_rad += abs(turn_rad)
+
+    def judge(self, log_likelihoods: list[float]) -> KalmanFilter | None:
+        """Scores, drops and merges hypotheses after a scan; returns the winner's filter, if there is one."""
+        if self.scans == 0 or self.moved_m > COUNTS_AFTER_M or self.turned_rad > COUNTS_AFTER_RAD:
+            self.scans, self.moved_m, self.turned_rad = self.scans + 1, 0.0, 0.0
+            for hypothesis, log_likelihood in zip(self.hypotheses, log_likelihoods, strict=True):
+                hypothesis.score += log_likelihood
+        ranked = sorted(self.hypotheses, key=lambda hypothesis: -hypothesis.score)
+        kept: list[Hypothesis] = []
+        for hypothesis in ranked:
+            if hypothesis.score > ranked[0].score - HOPELESS and not any(map(hypothesis.is_near, kept)):
+                kept.append(hypothesis)
+        self.hypotheses = kept
+        if self.scans >= SCANS and (len(kept) == 1 or kept[0].score > kept[1].score + LEAD):
+            return kept[0].filter
+        return None

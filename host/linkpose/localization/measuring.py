@@ -1,0 +1,119 @@
+"""Turns the events of a log into measurements of a Kalman filter: values, covariance, and the model's table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.localization import models
+from linkpose.localization.carmen import BEAM_ANGLES_RAD
+from linkpose.localization.events import Event, Scan
+from linkpose.localization.kalman import Measurement, Motion
+from linkpose.localization.settings import CONSTANTS, Settings
+from linkpose.localization.tables import Beacons
+
+
+def constant_states(estimate: Sequence[str], beacons: Sequence[str]) -> tuple[str, ...]:
+    """Names of the states that `--estimate` adds: one for all beacons, or one for each."""
+    names: list[str] = []
+    for word in estimate:
+        quantity, _, each = word.partition(":")
+        stem, unit, _ = CONSTANTS[quantity]
+        names += [f"{stem}_{_safe(beacon)}{unit}" for beacon in beacons] if each else [f"{stem}{unit}"]
+    return tuple(names)
+
+
+def _safe(beacon: str) -> str:
+    """A beacon's name as a part of a column's name."""
+    return re.sub(r"\W", "_", beacon)
+
+
+class Sensors:
+    """Builds measurements for one motion model, with the constants that are estimated."""
+
+    def __init__(self, settings: Settings, motion: Motion, beacons: Beacons) -> None:
+        self.settings, self.beacons = settings, beacons
+        self.states = motion.states
+        self.height = self.states.index("z_m") if "z_m" in self.states else -1
+        self.last_range: dict[str, float] = {}
+        self._columns = {
+            beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
+        }
+
+    def _constant(self, quantity: str, beacon: str) -> int:
+        """Index of the state with this beacon's constant, or −1."""
+        stem, unit, _ = CONSTANTS[quantity]
+        for name in (f"{stem}_{_safe(beacon)}{unit}", f"{stem}{unit}"):
+            if name in self.states:
+                return self.states.index(name)
+        return -1
+
+    def measurement(self, events: Sequence[Event | Scan]) -> Measurement | None:
+        """The measurement of events of one kind and instant; None for what is no measurement."""
+        event, settings = events[0], self.settings
+        if isinstance(event, Scan):
+            return self._beams(event)
+        if event.kind == "range":
+            return self._ranges([event for event in events if isinstance(event, Event)])
+        if event.kind == "bearing_range":
+            distance = np.array(event.values[:1])
+            variance = settings.ranges.variances(distance, self._mean_range(event))[0]
+            table = np.array([[*self.beacons[event.beacon][:2], *self._columns[event.beacon]]])
+            covariance = np.diag([variance, settings.bearing_std_rad**2])
+            return Measurement(models.LANDMARK, np.array(event.values), covariance, table, 2, (False, True))
+        if event.kind == "depth":
+            return _direct(event.values, (settings.depth_std_m,), ((2, -1.0),), (False,))
+        if event.kind == "attitude":
+            return _direct(event.values[2:], (settings.attitude_std_rad,), ((3, 1.0),), (True,))
+        if event.kind == "pose":
+            return self._pose(event)
+        return None
+
+    def _pose(self, event: Event) -> Measurement:
+        far, turned = self.settings.start_std
+        if "heading_rad" not in self.states:
+            return _direct(event.values[:2], (far, far), ((0, 1.0), (1, 1.0)), (False, False))
+        heading = self.states.index("heading_rad")
+        return _direct(event.values, (far, far, turned), ((0, 1.0), (1, 1.0), (heading, 1.0)), (False, False, True))
+
+    def _beams(self, scan: Scan) -> Measurement | None:
+        """The thesis's 19 beams of a scan."""
+        chosen = thesis_beams(scan)
+        ranges = scan.ranges_m[chosen]
+        chosen, ranges = chosen[np.isfinite(ranges)], ranges[np.isfinite(ranges)]
+        if not len(ranges):
+            return None
+        table = np.empty((len(ranges), 5))
+        table[:, 0], table[:, 1:4], table[:, 4] = scan.angles_rad[chosen], scan.mount, scan.max_range_m
+        return Measurement(models.BEAMS, ranges, self.settings.ranges.covariance(ranges, float(ranges.mean())), table)
+
+    def _ranges(self, events: list[Event]) -> Measurement:
+        rows = [[*self.beacons[event.beacon], self.height, *self._columns[event.beacon]] for event in events]
+        table = np.array(rows, dtype=np.float64)
+        ranges = np.array([event.values[0] for event in events])
+        means = [self._mean_range(event) for event in events]
+        return Measurement(models.BEACON_RANGE, ranges, self.settings.ranges.covariance(ranges, means[-1]), table)
+
+    def _mean_range(self, event: Event) -> float:
+        """r̄ of (14) for sensors that do not measure at one instant: the mean of each beacon's last range."""
+        self.last_range[event.beacon] = event.values[0]
+        return sum(self.last_range.values()) / len(self.last_range)
+
+
+def thesis_beams(scan: Scan) -> NDArray[np.intp]:
+    """Indices of the readings nearest to the 19 beams of the thesis that lie within the scanner's field of view."""
+    angles = scan.angles_rad
+    if not len(angles):
+        return np.empty(0, np.intp)
+    step = abs(float(angles[1] - angles[0])) if len(angles) > 1 else 0.0
+    inside = (angles.min() - 1.5 * step < BEAM_ANGLES_RAD) & (angles.max() + 1.5 * step > BEAM_ANGLES_RAD)
+    return np.array(sorted({int(np.argmin(np.abs(angles - angle))) for angle in BEAM_ANGLES_RAD[inside]}), np.intp)
+
+
+def _direct(
+    values: tuple[float, ...], std: tuple[float, ...], table: tuple[tuple[int, float], ...], angles: tuple[bool, ...]
+) -> Measurement:
+    return Measurement(models.DIRECT, np.array(values), np.diag(np.square(std)), np.array(table), len(values), angles)

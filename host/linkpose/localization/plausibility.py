@@ -1,0 +1,77 @@
+"""Recognises units that are wrong by a thousand, or degrees for radians, by the size of the values in a log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from linkpose.errors import LinkposeError
+from linkpose.localization.events import NAMED, Event, Log
+from linkpose.localization.tables import Beacons
+
+# The median range in units of the beacons' largest distance from each other, beyond which it cannot be metres: a robot
+# among or near its beacons has 0.1 to 3; a log in centimetres has 10 to 300, one in millimetres 100 to 3000.
+MILLIMETRES, CENTIMETRES = 100.0, 20.0
+MILLISECONDS_S = 10.0  # the median step of a log whose times are whole numbers
+FASTEST_TURN_RAD_S = 10.0  # 95 % of a robot's turn rates are below
+
+
+def check_units(log: Log, beacons: Beacons, origin: str) -> None:
+    """Raises LinkposeError that names the unit and the cure."""
+    events = [event for event in log if isinstance(event, Event)]
+    _check_ranges(events, beacons, origin)
+    _check_times(log, origin)
+    _check_angles(events, origin)
+
+
+def _check_ranges(events: list[Event], beacons: Beacons, origin: str) -> None:
+    ranges = [event.values[0] for event in events if event.kind in NAMED]
+    places = np.array(list(beacons.values()))
+    if len(ranges) < 3 or len(places) < 2:
+        return
+    extent = float(np.linalg.norm(places.max(axis=0) - places.min(axis=0)))
+    ratio = float(np.median(ranges)) / extent if extent > 0.0 else 0.0
+    for limit, unit, factor in ((MILLIMETRES, "millimetres", 1000), (CENTIMETRES, "centimetres", 100)):
+        if ratio > limit:
+            raise LinkposeError(
+                f"{origin}: the ranges look like {unit} (median {np.median(ranges):.4g} among beacons "
+                f"{extent:.3g} m apart); divide them by {factor} to give metres"
+            )
+
+
+def _check_times(log: Log, origin: str) -> None:
+    times = np.unique([event.time_s for event in log])
+    if len(times) < 20 or not (times == np.floor(times)).all():
+        return
+    step = float(np.median(np.diff(times)))
+    if step >= MILLISECONDS_S:
+        raise LinkposeError(
+            f"{origin}: the times look like milliseconds (whole numbers, {step:g} apart); "
+            "divide them by 1000 to give seconds"
+        )
+
+
+def _check_angles(events: Iterable[Event], origin: str) -> None:
+    rates = []
+    for event in events:
+        angle = {"bearing_range": 1, "pose": 2}.get(event.kind)
+        if angle is not None and abs(event.values[angle]) > 2.0 * math.pi:
+            what = "bearing" if event.kind == "bearing_range" else "heading"
+            raise LinkposeError(
+                f"{origin} line {event.line}: the {what} {event.values[angle]:g} looks like degrees; "
+                "multiply angles by 0.0174533 to give radians"
+            )
+        if event.kind == "attitude" and max(map(abs, event.values[:2])) > math.pi:
+            raise LinkposeError(
+                f"{origin} line {event.line}: roll and pitch look like degrees; "
+                "multiply angles by 0.0174533 to give radians"
+            )
+        if event.kind in ("odometry", "twist"):
+            rates.append(abs(event.values[-1]))
+    if len(rates) >= 20 and float(np.percentile(rates, 95)) > FASTEST_TURN_RAD_S:
+        raise LinkposeError(
+            f"{origin}: the turn rates look like degrees per second (5 % are above {FASTEST_TURN_RAD_S:g}); "
+            "multiply them by 0.0174533 to give rad/s"
+        )

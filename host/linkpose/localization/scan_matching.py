@@ -1,0 +1,187 @@
+"""Corrects a Kalman filter with a whole laser scan: the default laser update of `localize --map`.
+
+The scan is fitted to the map's distance field (`scan_fit`) from a few poses around the prediction. The fit's Hessian,
+with the errors of the map in it, is the information that the scan adds to the filter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.compiling import compiled
+from linkpose.localization.distance_field import DistanceField, Field, distance_at
+from linkpose.localization.events import Scan
+from linkpose.localization.global_search import likely_poses, nearby_poses
+from linkpose.localization.grid import GridMap
+from linkpose.localization.kalman import KalmanFilter
+from linkpose.localization.linalg import Floats, wrap_angle
+from linkpose.localization.scan_fit import fit_scan
+
+# Deviation of a beam's end from the wall that the map shows (m): half a cell of 5 cm, and a scanner's 3 cm. The
+# residuals of both buildings in tests/bench have a median of 0.03 to 0.04 m. Doubling it makes the filter follow its
+# odometry more; the error grows by a fifth.
+BEAM_STD_M = 0.05
+# Scale of the Cauchy loss (m). Beams that end farther than this from a wall count less than half. Results are the same
+# within 10 % from 0.07 to 0.3 m.
+LOSS_SCALE_M = 0.15
+# Scale of the first fit of each start (m), which draws a scan in from farther.
+WIDE_SCALE_M = 0.5
+# Information of one beam (1/m²). The beams count as independent here: what their ends share is the error of the map,
+# which does not average out over scans, either (scan_tracking.MAP_ERROR). Half of it makes the error a tenth larger.
+INFORMATION = 1.0 / BEAM_STD_M**2
+MOST_BEAMS = 180  # of one scan that are fitted; the rest is left out evenly
+FEWEST_BEAMS = 5  # fewer ends do not determine a pose
+# A beam that ends nearer than this (m) to a wall has hit it.
+HIT_M = 0.2
+# A prediction that is uncertain by more than this (m, rad) has local minima around it: the fit starts at several poses.
+CERTAIN_M, CERTAIN_RAD = 0.15, 0.1
+# A slip of the wheels since the last scan (m, m, rad), added to the prediction where the fit has failed, and how much
+# better (log-likelihood) the scan must then fit, the length of the slip counted against it. Twice the slip lets people
+# in a corridor of an old map pull the pose to a place that looks alike.
+SLIP, SLIP_LEAD = (0.3, 0.3, 0.3), 1.0
+NEARBY = 12  # starts of that fit
+# Weight of one scan when hypotheses are compared: its beams count as so many independent ones. Too many, and two
+# corridors that look alike are told apart by the map's errors.
+COMPARED_BEAMS = 10.0
+NO_WALL = 0.1  # probability that a beam meets what the map does not have
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a scan fitted: `share` of its beams that hit a wall, log-likelihood, and the test statistic of the shift.
+
+    `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom.
+    """
+
+    share: float
+    log_likelihood: float
+    d2: float
+    beams: int
+
+
+def beam_ends(scan: Scan) -> Floats:
+    """Ends (n, 2) of the beams with an echo, in the robot's axes (m)."""
+    echo = np.flatnonzero(np.isfinite(scan.ranges_m))
+    echo = echo[:: max(1, math.ceil(len(echo) / MOST_BEAMS))]
+    angles = scan.angles_rad[echo] + scan.mount[2]
+    ranges = scan.ranges_m[echo]
+    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles)))
+
+
+class ScanMatcher:
+    """Laser scans against one map. The state of the filters that it corrects starts with x, y, heading."""
+
+    def __init__(self, grid: GridMap) -> None:
+        self.grid = grid
+        self.field = DistanceField.of(grid)
+
+    def correct(self, run: KalmanFilter, points: Floats, expected: float = -math.inf) -> Fit:
+        """Corrects the filter, in place, with beam ends (n, 2).
+
+        A fit whose log-likelihood is below `expected` is not trusted: the wheels may have slipped. Then the fit also
+        starts from the poses nearby that explain the scan best, with a prediction that is SLIP times as uncertain.
+        """
+        at = run.pose_indices
+        mean, covariance = run.state[at], run.covariance[np.ix_(at, at)]
+        prior: Floats = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+        std = np.sqrt(np.diag(covariance))
+        best, hessian, cost = self._fit(points, mean, prior, mean)
+        if max(std[0], std[1]) > CERTAIN_M or std[2] > CERTAIN_RAD:
+            for start in _around(mean, std):
+                other = self._fit(points, mean, prior, start)
+                if other[2] < cost:
+                    best, hessian, cost = other
+        share, log_likelihood = self.compare(points, best)
+        if log_likelihood < expected:
+            loose: Floats = np.asarray(np.linalg.inv(covariance + np.diag(np.square(SLIP))), dtype=np.float64)
+            lead = log_likelihood + SLIP_LEAD
+            for start in nearby_poses(self.field.geometry, self.field.counts, points, mean, NEARBY):
+                pose, other_hessian, _ = self._fit(points, mean, loose, start)
+                other_share, other_likelihood = self.compare(points, pose)
+                slipped = other_likelihood - _half_square(pose - mean, loose)
+                if slipped > lead:
+                    best, hessian, prior, lead = pose, other_hessian, loose, slipped
+                    share, log_likelihood = other_share, other_likelihood
+            covariance = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+        d2 = _condition(run, at, best, covariance, prior + INFORMATION * hessian)
+        return Fit(share, log_likelihood, d2, len(points))
+
+    def compare(self, points: Floats, pose: Floats) -> tuple[float, float]:
+        """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""
+        return hits(self.field.counts, self.field.geometry, points, pose)
+
+    def search(self, points: Floats, most: int) -> list[Floats]:
+        """Poses (3,) of the whole map from which the scan fits, refined, best first."""
+        wide = np.diag([1e-3, 1e-3, 1e-2])  # next to no information: only the scan decides
+        found: list[tuple[float, Floats]] = []
+        for start in likely_poses(self.grid, self.field.counts, points, 4 * most):
+            pose, _, _ = self._fit(points, start, wide, start)
+            found.append((-self.compare(points, pose)[1], pose))
+        found.sort(key=lambda item: item[0])
+        return [pose for _, pose in found[:most]]
+
+    def _fit(self, points: Floats, mean: Floats, prior: Floats, start: Floats) -> tuple[Floats, Floats, float]:
+        pose, hessian = start.copy(), np.empty((3, 3))
+        field = self.field
+        for scale in (WIDE_SCALE_M, LOSS_SCALE_M):
+            cost = fit_scan(field.counts, field.geometry, points, scale, INFORMATION, mean, prior, pose, hessian)
+        return pose, hessian, cost
+
+
+@compiled
+def hits(counts: Field, geometry: Floats, points: Floats, pose: Floats) -> tuple[float, float]:
+    """Share of beam ends within HIT_M of a wall, and COMPARED_BEAMS times the mean of ln((1 − ε) exp(−d²/2s²) + ε)."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    at = np.empty(3)
+    count, total = 0, 0.0
+    for i in range(points.shape[0]):
+        px, py = points[i, 0], points[i, 1]
+        distance_at(counts, geometry, pose[0] + c * px - s * py, pose[1] + s * px + c * py, at)
+        count += abs(at[0]) < HIT_M
+        ratio = at[0] / HIT_M
+        total += math.log((1.0 - NO_WALL) * math.exp(-0.5 * ratio * ratio) + NO_WALL)
+    n = max(points.shape[0], 1)
+    return count / n, COMPARED_BEAMS * total / n
+
+
+def _half_square(off: Floats, information: Floats) -> float:
+    """½ δᵀ P⁻¹ δ of a difference of poses."""
+    off = np.array([off[0], off[1], wrap_angle(float(off[2]))])
+    return 0.5 * float(off @ information @ off)
+
+
+def _around(mean: Floats, std: Floats) -> list[Floats]:
+    """Starts 1.5 σ from the prediction along each axis, and at least a door's width and 10 degrees."""
+    reach = np.maximum(1.5 * std, (0.3, 0.3, 0.17))
+    starts = []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            start = mean.copy()
+            start[axis] += side * reach[axis]
+            starts.append(start)
+    return starts
+
+
+def _condition(run: KalmanFilter, at: NDArray[np.intp], pose: Floats, before: Floats, information: Floats) -> float:
+    """Moves the filter's pose to `pose` with the given information; returns d² of the shift.
+
+    The states that are correlated with the pose follow: x ← x + P_a P_aa⁻¹ δ, and P ← P − P_a P_aa⁻¹ (P_aa − P'_aa)
+    P_aa⁻¹ P_aᵀ, where a are the states of the pose. This is the update by an equivalent measurement of the pose.
+    `before` is the covariance of the prediction that the pose was fitted with, P_aa or a wider one.
+    """
+    after = np.linalg.inv(information)
+    after = 0.5 * (after + after.T)
+    own = run.covariance[np.ix_(at, at)]
+    shift = pose - run.state[at]
+    shift[2] = wrap_angle(float(shift[2]))
+    gain = run.covariance[:, at] @ np.linalg.inv(own)
+    run.state += gain @ shift
+    run.state[at] = pose
+    covariance = run.covariance - gain @ (own - after) @ gain.T
+    covariance[np.ix_(at, at)] = after
+    run.covariance[:] = 0.5 * (covariance + covariance.T)
+    return float(shift @ np.linalg.pinv(before - after) @ shift)

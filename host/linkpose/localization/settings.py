@@ -1,0 +1,46 @@
+"""Settings of a localisation: how good the sensors are, and how the filter treats them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from linkpose.localization.kalman import Transform
+from linkpose.localization.noise import RangeNoise
+
+Pose = tuple[float, float, float]
+# What can be estimated beside the pose -> unit in the state's name, and its standard deviation at the start. Radio
+# ranges are long by some centimetres to decimetres (antenna delay), and by some percent (clock, propagation): Plaza
+# 6.6 %. Doubling either widens the first seconds only.
+CONSTANTS = {"scale": ("range_scale_error", "", 0.1), "bias": ("range_bias", "_m", 0.3)}
+ESTIMATED = ("scale", "bias", "scale:each", "bias:each")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Standard deviations of the sensors, and what the filter does with them.
+
+    `speed_std_m_s` and `turn_std_rad_s` are the errors of one odometry sample, `velocity_std_m_s` those of one velocity
+    sample on each axis; each holds until the next sample. `acceleration_std_m_s2` drives the constant-velocity model of
+    a log without odometry, on each axis. `start` is the pose at the log's start, with `start_std` (m, rad); without it
+    the filter searches for the pose. `estimate` names constants of the range sensor, for all beacons together or, with
+    `:each`, for each beacon.
+    """
+
+    ranges: RangeNoise = field(default_factory=RangeNoise)
+    bearing_std_rad: float = 0.05
+    depth_std_m: float = 0.05
+    attitude_std_rad: float = 0.01
+    speed_std_m_s: float = 0.1
+    turn_std_rad_s: float = 0.1
+    motion_correlation: float = 0.0
+    velocity_std_m_s: float = 0.1
+    acceleration_std_m_s2: float = 1.0
+    yaw_acceleration_std_rad_s2: float = 0.1
+    gate: float | None = 0.997
+    transform: Transform = field(default_factory=Transform)
+    estimate: tuple[str, ...] = ()
+    start: Pose | None = None
+    start_std: tuple[float, float] = (0.5, 0.1)
+    smooth: bool = False
+    particles: int = 2000
+    seed: int = 0

@@ -1,0 +1,54 @@
+"""The result of a localisation: the estimated path, and how well the measurements fitted it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.localization.consistency import Consistency
+from linkpose.localization.linalg import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A row for each instant with a measurement.
+
+    `state` (N, n) in the order of `names`, `covariance` (N, n, n); NaN while the pose is not known yet. `applied` and
+    `rejected` count measurements: a range, a beam, a landmark, a depth, an attitude. `rejected_ranges` holds time and
+    beacon of each range outside the gate. `widened` counts how often the standard deviations of the pose were raised
+    because most measurements were rejected, `relocated` how often the pose was found anew. `consistency` holds the
+    normalised innovations squared by sensor.
+    """
+
+    names: tuple[str, ...]
+    time_s: Floats
+    state: Floats
+    covariance: Floats
+    applied: int
+    rejected: int
+    rejected_ranges: frozenset[tuple[float, str]]
+    widened: int
+    relocated: int = 0
+    consistency: Consistency = field(default_factory=Consistency)
+
+    @property
+    def position_m(self) -> Floats:
+        """(N, 2), or (N, 3) where the height is a state."""
+        return self.state[:, [self.names.index(name) for name in ("x_m", "y_m", "z_m") if name in self.names]]
+
+    @property
+    def heading_rad(self) -> Floats | None:
+        """(N,), or None for a model without a heading."""
+        return self.state[:, self.names.index("heading_rad")] if "heading_rad" in self.names else None
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(N,) where the pose is known."""
+        return np.asarray(np.isfinite(self.state).all(axis=1))
+
+    @property
+    def std(self) -> Floats:
+        """(N, n) standard deviations."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))

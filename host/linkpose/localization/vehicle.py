@@ -1,0 +1,134 @@
+"""What a log's measurements call for: the motion model, its noise, and the state at the start."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from linkpose.localization.events import Event, Log, Scan
+from linkpose.localization.kalman import (
+    CONSTANT_VELOCITY,
+    HOLONOMIC,
+    SUBMERSIBLE,
+    UNICYCLE,
+    Motion,
+    covariance_root,
+)
+from linkpose.localization.linalg import Floats
+from linkpose.localization.noise import equicorrelated
+from linkpose.localization.settings import CONSTANTS, Pose, Settings
+from linkpose.localization.tables import Beacons
+
+DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
+CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
+FIRST_S = 5.0  # of ranges from which a tag's first place is fitted; a walk of a few metres at the most
+FIT_STEPS = 20
+FASTEST_M_S = 2.0  # standard deviation of a tag's velocity at the start, on each axis: a walk
+
+
+def kinds_of(log: Iterable[Event | Scan]) -> set[str]:
+    """The kinds of measurement in a log."""
+    return {event.kind for event in log}
+
+
+def vehicle_of(kinds: set[str]) -> Motion:
+    """The motion model for these kinds of measurement."""
+    if kinds & DIVING:
+        return SUBMERSIBLE
+    if "twist" in kinds:
+        return HOLONOMIC
+    return UNICYCLE if "odometry" in kinds or "scan" in kinds or "bearing_range" in kinds else CONSTANT_VELOCITY
+
+
+def control_holds(log: Log, kind: str) -> dict[int, float]:
+    """How long (s) the control at each index of the log holds: until the next; the last as long as usual."""
+    at = [i for i, event in enumerate(log) if event.kind == kind]
+    times = [log[i].time_s for i in at]
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    usual = float(np.median(steps)) if len(steps) else 1.0
+    return dict(zip(at, _holds(times, usual), strict=True))
+
+
+def _holds(times: list[float], usual: float) -> Iterator[float]:
+    for before, after in itertools.pairwise(times):
+        yield after - before if after > before else usual
+    if times:
+        yield usual
+
+
+def first_pose(log: Log) -> Event | None:
+    """The pose that the log states for its own first instant."""
+    first = (event for event in log if isinstance(event, Event) and event.time_s == log[0].time_s)
+    return next((event for event in first if event.kind == "pose"), None)
+
+
+def at_their_height(beacons: Beacons) -> Beacons:
+    """The beacons with heights relative to their mean: a tag without a known height is taken to be there."""
+    mean = sum(place[2] for place in beacons.values()) / max(len(beacons), 1)
+    return {name: (x, y, z - mean) for name, (x, y, z) in beacons.items()}
+
+
+def place_from_ranges(log: Log, beacons: Beacons) -> Pose | None:
+    """Where a tag is at the log's start, from the first ranges to at least three beacons; None where there are fewer.
+
+    The ranges of FIRST_S are fitted by Gauss-Newton from each beacon and from their centre; the best fit counts.
+    """
+    first = [e for e in log if isinstance(e, Event) and e.kind == "range" and e.time_s <= log[0].time_s + FIRST_S]
+    latest = {event.beacon: event.values[0] for event in reversed(first)}
+    if len(latest) < 3:
+        return None
+    places = np.array([beacons[name] for name in latest])
+    ranges = np.array(list(latest.values()))
+    fits = []
+    for start in (places.mean(axis=0), *places):
+        place = np.array([start[0] + 0.1, start[1] - 0.1])
+        for _ in range(FIT_STEPS):
+            off = place - places[:, :2]
+            distance = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
+            slopes = off / distance[:, np.newaxis]
+            place = place + np.linalg.lstsq(slopes, ranges - distance, rcond=None)[0]
+        fits.append((float(np.sum((ranges - distance) ** 2)), float(place[0]), float(place[1])))
+    _, x, y = min(fits)
+    return (x, y, 0.0) if np.isfinite([x, y]).all() else None
+
+
+def start_state(pose: Pose, depth_m: float, settings: Settings, motion: Motion) -> tuple[Floats, Floats]:
+    """State and standard deviations at the log's start."""
+    state, std = np.zeros(len(motion.states)), np.zeros(len(motion.states))
+    far, turned = settings.start_std
+    prior = {
+        "x_m": (pose[0], far),
+        "y_m": (pose[1], far),
+        "heading_rad": (pose[2], turned),
+        "z_m": (-depth_m, max(far, settings.depth_std_m)),
+        "wz_rad_s": (0.0, 0.5),
+        "x_rate_m_s": (0.0, FASTEST_M_S),
+        "y_rate_m_s": (0.0, FASTEST_M_S),
+    }
+    for i, name in enumerate(motion.states):
+        state[i], std[i] = prior[name] if name in prior else (0.0, _constant_std(name))
+    return state, std
+
+
+def _constant_std(name: str) -> float:
+    return next(std for stem, _, std in CONSTANTS.values() if name.startswith(stem))
+
+
+def noise_root(settings: Settings, vehicle: Motion) -> Floats:
+    """The lower Cholesky factor of Q, (16): off-diagonal between the errors of speed and turn rate, or of a velocity's
+    axes.
+    """
+    speed, turn, velocity = settings.speed_std_m_s, settings.turn_std_rad_s, settings.velocity_std_m_s
+    if vehicle is CONSTANT_VELOCITY:
+        return settings.acceleration_std_m_s2 * np.eye(2)
+    std = {UNICYCLE: (speed, turn), HOLONOMIC: (speed, speed, turn), SUBMERSIBLE: (velocity, velocity, velocity)}[
+        vehicle
+    ]
+    q = np.zeros((vehicle.noises, vehicle.noises))
+    q[: len(std), : len(std)] = equicorrelated(np.array(std), settings.motion_correlation)
+    if vehicle is SUBMERSIBLE:
+        q[3, 3] = settings.yaw_acceleration_std_rad_s2**2
+    return covariance_root(q, "Q, the covariance of the motion's noises,")

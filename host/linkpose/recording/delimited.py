@@ -1,0 +1,231 @@
+"""Splits the text of a table into cells, as linkpose, spreadsheets, pandas and R write it.
+
+The reader accepts commas, semicolons, tabs or spaces between cells, decimal commas, quotes, UTF-8 and UTF-16 with or
+without a byte order mark, all three line ends, empty trailing columns and rows, row names without a header, and comment
+lines (`# ...`) which a spreadsheet split into cells, quoted or padded with separators.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from linkpose.errors import FileFormatError
+from linkpose.sensors.measurements import Floats
+
+_SEPARATORS = ("\t", ";", ",", " ")  # in order of preference: decimal commas occur beside the first two
+_PADDING = ',;\t "'
+_MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
+_DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d*(e[+-]?\d+)?\s*", re.IGNORECASE)
+_INDEX_NAME = re.compile(r"Unnamed: \d+(_level_\d+)?")  # what pandas names a header cell that is empty
+_LONGEST_EXCERPT = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Comment:
+    """A comment line without its `#`. `is_intact`: no spreadsheet quoted it or split it into cells."""
+
+    text: str
+    line: int
+    is_intact: bool
+
+    def as_object(self) -> dict[str, Any] | None:
+        """The JSON object in the comment; None where there is none."""
+        try:
+            content = json.loads(self.text)
+        except (ValueError, RecursionError):
+            return None
+        return content if isinstance(content, dict) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """The cells of a table: column names, rows of as many texts, the line number of each row, and the comments."""
+
+    path: Path
+    names: list[str]
+    rows: list[list[str]]
+    lines: list[int]
+    head: list[Comment]  # before the names
+    tail: list[Comment]  # after the last row
+
+    def number_columns(self) -> dict[str, Floats]:
+        """The columns as numbers, NaN for a missing one; raises FileFormatError for a cell that is no number."""
+        has_decimal_comma = self._has_decimal_comma()
+        return {name: self._numbers(column, has_decimal_comma) for column, name in enumerate(self.names)}
+
+    def _numbers(self, column: int, has_decimal_comma: bool) -> Floats:
+        values = np.empty(len(self.rows))
+        for i, row in enumerate(self.rows):
+            text = row[column]
+            try:
+                if "_" in text:  # Python's own notation of numbers
+                    raise ValueError(text)
+                values[i] = float(text.replace(",", ".") if has_decimal_comma else text)
+            except ValueError:
+                if text.strip().lower() not in _MISSING:
+                    raise FileFormatError(
+                        self.path,
+                        f"{self.path}, line {self.lines[i]}: {text.strip()[:30]!r} is not a number; "
+                        "correct or remove that row",
+                        self.lines[i],
+                    ) from None
+                values[i] = np.nan
+        return values
+
+    def _has_decimal_comma(self) -> bool:
+        """Whether numbers have decimal commas; raises FileFormatError when some have commas and others points."""
+        comma = next(((i, cell) for i, row in enumerate(self.rows) for cell in row if "," in cell), None)
+        if comma is None:
+            return False
+        line, text = self.lines[comma[0]], comma[1].strip()
+        point = next((cell.strip() for row in self.rows for cell in row if "." in cell), None)
+        if point is not None or not _DECIMAL_COMMA.fullmatch(text):
+            both = f"{text[:30]!r} and {point[:30]!r}" if point is not None else repr(text[:30])
+            raise FileFormatError(
+                self.path,
+                f"{self.path}, line {line}: {both} can be read in two ways: "
+                "save the table with one decimal mark and without separators of thousands",
+                line,
+            )
+        return True
+
+
+def to_utf8(data: bytes) -> bytes:
+    """The same text in UTF-8 without a byte order mark."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", "replace").encode("utf-8", "replace")
+    for nul_at, codec in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if data[nul_at : nul_at + 4 : 2] == b"\0\0":
+            return data.decode(codec, "replace").encode("utf-8", "replace")
+    return data.removeprefix(b"\xef\xbb\xbf")
+
+
+def split_cells(path: Path, data: bytes) -> Cells:
+    """Splits `data`, in UTF-8, into cells. Raises FileFormatError naming the line where rows and names do not match.
+
+    An unterminated last line of a file which linkpose wrote is left out: a killed program leaves one.
+    """
+    try:
+        text = data.decode()
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", "replace")
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if lines[0].startswith("# linkpose ") and lines[0][-1] not in _PADDING:
+        lines.pop()
+    numbered = [(i, line) for i, line in enumerate(lines, 1) if line.strip(_PADDING)]
+    if numbered and numbered[0][1].lower().startswith("sep="):  # Excel's own first line
+        del numbered[0]
+    table = [(i, line) for i, line in numbered if not _is_comment(line)]
+    if not table:
+        raise FileFormatError(path, f"{path} ends before its first row; it holds no data")
+    separator = _separator(table[0][1])
+    comments = [_comment(i, line, separator) for i, line in numbered if _is_comment(line)]
+    numbers, rows = _parse(path, table, separator)
+    if len(rows[0]) == 1 and len(table[0][1]) > 2 and (inner := _separator(rows[0][0])) in rows[0][0]:
+        separator = inner  # a spreadsheet kept each line as one quoted cell
+        numbers, rows = _parse(path, [(i, row[0]) for i, row in zip(numbers, rows, strict=True)], separator)
+    names, body = _match(path, rows, numbers, separator)
+    head = [comment for comment in comments if comment.line < numbers[0]]
+    tail = [comment for comment in comments if comment.line > numbers[-1]]
+    return Cells(path, names, body, numbers[1:], head, tail)
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip(' "').startswith("#")
+
+
+def _comment(number: int, line: str, separator: str) -> Comment:
+    """A comment line, put together again where a spreadsheet split it at its commas."""
+    if line.startswith("#"):
+        text = line[1:].strip(_PADDING if number == 1 else ",;\t ")
+        return Comment(text, number, line[1:].strip() == text)
+    cells = next(csv.reader([line], delimiter=separator))
+    while cells and not cells[-1].strip():
+        cells.pop()
+    cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+    cells = [cell.lower() if cell.strip() in ("TRUE", "FALSE") else cell for cell in cells]
+    return Comment(",".join(cells).lstrip()[1:].strip(), number, False)
+
+
+def _separator(line: str) -> str:
+    """The separator outside quotes; a comma where there is none."""
+    bare = re.sub(r'"[^"]*"', "x", line).strip(" ")
+    return next((separator for separator in _SEPARATORS if separator in bare), ",")
+
+
+def _parse(path: Path, table: list[tuple[int, str]], separator: str) -> tuple[list[int], list[list[str]]]:
+    """Line numbers and cells of the rows."""
+    reader = csv.reader((line for _, line in table), delimiter=separator, skipinitialspace=separator == " ")
+    numbers, rows = [], []
+    before = 0
+    try:
+        for row in reader:
+            if reader.line_num - before > 1:
+                raise csv.Error("a quote is not closed")
+            numbers.append(table[before][0])
+            rows.append(row)
+            before = reader.line_num
+    except csv.Error as error:
+        line = table[min(before, len(table) - 1)][0]
+        raise FileFormatError(path, f"{path}, line {line}: {error}; correct or remove that row", line) from error
+    return numbers, rows
+
+
+def _match(path: Path, rows: list[list[str]], numbers: list[int], separator: str) -> tuple[list[str], list[list[str]]]:
+    """Names and rows of one width, without row names and empty columns."""
+    names, body = [name.strip() for name in rows[0]], rows[1:]
+    if not body:
+        _check_names(path, names, numbers[0])
+        raise FileFormatError(path, f"{path} has a header but no row; nothing was recorded")
+    if names and all(len(row) == len(names) + 1 for row in body) and any(row[-1].strip() for row in body):
+        if separator == "," or len({row[0] for row in body}) < len(body):
+            raise _width_error(path, numbers[1], len(body[0]), len(names))
+        names = ["", *names]  # R's write.table gives no name to its row names
+    width = len(names)
+    for number, row in zip(numbers[1:], body, strict=True):
+        if len(row) < width or any(cell.strip() for cell in row[width:]):
+            raise _width_error(path, number, len(row), width)
+    keep = [i for i, name in enumerate(names) if name or any(row[i].strip() for row in body)]
+    if keep and keep[0] == 0 and width > 1 and (not names[0] or _INDEX_NAME.fullmatch(names[0])):
+        del keep[0]
+    if keep != list(range(len(body[0]))):
+        body = [[row[i] for i in keep] for row in body]
+    names = [names[i] for i in keep]
+    _check_names(path, names, numbers[0])
+    return names, body
+
+
+def _width_error(path: Path, line: int, found: int, expected: int) -> FileFormatError:
+    hint = ""
+    if found >= 2 * expected - 1 > 1:
+        hint = " (numbers with decimal commas need semicolons or tabs between them)"
+    return FileFormatError(
+        path,
+        f"{path}, line {line}: {found} fields where the header has {expected}{hint}; "
+        "the file was cut or edited: remove that row",
+        line,
+    )
+
+
+def _check_names(path: Path, names: list[str], line: int) -> None:
+    twice = {name for name in names if names.count(name) > 1 and name}
+    if twice:
+        raise FileFormatError(path, f"{path}, line {line}: column {', '.join(sorted(twice))} stands twice", line)
+    if not names or "" in names or all(_is_number(name) for name in names):
+        shown = ",".join(names)[:_LONGEST_EXCERPT]
+        raise FileFormatError(path, f"{path}, line {line}: expected the names of the columns, found {shown!r}", line)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,116 @@
+"""Whole laser scans against a map: distance field, fit, global search, recovery, and the particle filter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from linkpose.errors import LinkposeError
+from linkpose.localization.carmen import as_log
+from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at
+from linkpose.localization.events import Event, Scan
+from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
+from linkpose.localization.localizer import localize
+from linkpose.localization.settings import Settings
+from linkpose.localization.tables import score_track
+from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
+
+
+def test_the_field_is_the_distance_to_the_nearest_wall():
+    """Against brute force, on random walls; unknown cells are no walls."""
+    rng = np.random.default_rng(4)
+    blocked = np.where(rng.random((40, 55)) < 0.01, OCCUPIED, 0).astype(np.uint8)
+    blocked[rng.random((40, 55)) < 0.2] = UNKNOWN
+    field = DistanceField.of(GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0])))
+    walls = np.argwhere(blocked == OCCUPIED)
+    rows, columns = np.mgrid[:40, :55]
+    squares = (rows[..., None] - walls[:, 0]) ** 2 + (columns[..., None] - walls[:, 1]) ** 2
+    expected = np.minimum(0.1 * np.sqrt(squares.min(axis=-1)), FARTHEST_M)
+    assert np.allclose(field.counts * COUNT_M, expected, atol=COUNT_M)
+
+
+def test_the_field_of_a_moved_and_turned_map_is_moved_and_turned():
+    blocked = np.zeros((60, 60), np.uint8)
+    blocked[:, 40] = OCCUPIED  # one cell thick, so the zero is its centre: the centre of the wall is at 4.05 m
+    yaw = 0.6
+    field = DistanceField.of(GridMap(blocked, np.array([0.1, -3.0, 7.0, yaw])))
+    c, s = math.cos(yaw), math.sin(yaw)
+    at = np.empty(3)
+    distance_at(field.counts, field.geometry, -3.0 + c * 2.5 - s * 3.0, 7.0 + s * 2.5 + c * 3.0, at)
+    assert at == pytest.approx([1.55, -c, -s], abs=1e-3)
+    distance_at(field.counts, field.geometry, 100.0, 100.0, at)
+    assert at.tolist() == [FARTHEST_M, 0.0, 0.0]
+
+
+def test_the_zero_of_a_drawn_wall_is_its_face():
+    """A wall from 4.0 to 4.4 m: beams end at 4.0 m."""
+    blocked = np.zeros((60, 60), np.uint8)
+    blocked[:, 40:44] = OCCUPIED
+    field = DistanceField.of(GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0])))
+    at = np.empty(3)
+    for x, expected in ((3.0, 1.0), (4.0, 0.0), (4.1, -0.1), (4.4, 0.0), (5.0, 0.6)):
+        distance_at(field.counts, field.geometry, x, 3.0, at)
+        assert at[0] == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Half a minute through the office floor, with its map and a laser scanner's constant noise."""
+    return simulate_indoor(3, IndoorErrors(range_growth=0.0, outlier_fraction=0.0), 30.0), office_map()
+
+
+def test_a_scan_match_is_accurate_and_honest(drive):
+    run, grid = drive
+    start = tuple(run.pose[0] + (0.3, -0.3, 0.08))
+    track = localize(as_log(run.readings), "scan-match", Settings(start=start), grid)
+    result = score_track(track, run.truth)
+    assert result.position_rmse_m < 0.06
+    assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
+    assert track.known.all()
+
+
+def test_without_a_start_the_pose_is_unknown_and_then_right(drive):
+    run, grid = drive
+    track = localize(as_log(run.readings), "scan-match", Settings(), grid)
+    assert not track.known[0]
+    assert np.isnan(track.state[0]).all()
+    assert track.known.mean() > 0.6
+    assert score_track(track, run.truth).position_max_m < 0.3
+
+
+def test_a_robot_that_was_carried_is_found_again(drive):
+    """Its odometry sees nothing of 60 m."""
+    run, grid = drive
+    other = simulate_indoor(5, IndoorErrors(), 110.0, grid)
+    shift = run.time_s[-1] + 0.2 - other.time_s[900]
+    log = as_log(run.readings)
+    for event in as_log([replace(reading, time_s=reading.time_s + shift) for reading in other.readings[900:]]):
+        log.append(event)
+    track = localize(log, "scan-match", Settings(start=tuple(run.pose[0])), grid)
+    assert track.relocated >= 1
+    true = np.interp(track.time_s[-1] - shift, other.time_s, other.pose[:, 0])
+    assert track.known[-1] and abs(track.state[-1, 0] - true) < 0.2
+
+
+def test_monte_carlo_localisation_is_seeded(drive):
+    run, grid = drive
+    log = as_log(run.readings)
+    settings = Settings(start=tuple(run.pose[0]), start_std=(0.2, 0.05), particles=300, seed=2)
+    tracks = [localize(log, "mcl", chosen, grid) for chosen in (settings, settings, replace(settings, seed=3))]
+    assert (tracks[0].state == tracks[1].state).all()
+    assert (tracks[0].state != tracks[2].state).any()
+    assert score_track(tracks[0], run.truth).position_rmse_m < 0.3
+    with pytest.raises(LinkposeError, match="--start X,Y,HEADING"):
+        localize(log, "mcl", Settings(), grid)
+
+
+def test_scans_without_echo_change_nothing():
+    grid = office_map()
+    silent = Scan(1.0, np.full(181, np.nan), np.linspace(-1.5, 1.5, 181), (0.0, 0.0, 0.0), 80.0)
+    log = [Event(0.0, "pose", (12.0, 12.0, 0.0)), Event(0.0, "odometry", (0.0, 0.0)), silent]
+    track = localize(log, "scan-match", Settings(), grid)
+    assert track.applied == 0
+    assert track.state[-1] == pytest.approx([12.0, 12.0, 0.0])
