@@ -40,6 +40,7 @@ class Request:
     json_lines: bool
     force: bool
     plain: bool
+    targets: tuple[str, ...]
     page: PageOptions
 
 
@@ -65,6 +66,13 @@ class Request:
 @board_settings
 @options.force
 @options.plain
+@click.option(
+    "--to",
+    "targets",
+    multiple=True,
+    metavar="URL",
+    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT or lsl:NAME; may be repeated.",
+)
 @options.as_json
 @options.verbosity
 def command(
@@ -86,6 +94,7 @@ def command(
     board: dict[str, int],
     force: bool,
     plain: bool,
+    targets: tuple[str, ...],
     json_lines: bool,
     verbose: bool,
     quiet: bool,
@@ -100,8 +109,8 @@ def command(
     if is_live == (recording is not None):
         both = f"--live estimates from the board: leave out {recording}, or leave out --live"
         raise click.UsageError(both if is_live else "name a RECORDING, or add --live to estimate from the board")
-    if recording is not None and (port or duration or record or raw or board):
-        raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
+    if recording is not None and (port or duration or record or raw or board or targets):
+        raise click.UsageError("--port, --duration, --record, --raw, --to and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
     if recording is not None and has_page:
@@ -112,7 +121,7 @@ def command(
     page.check()
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, page)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -227,6 +236,8 @@ def _live(
         write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
+        for remark in sink.dropped:
+            console.say(remark)
         if console.shows_progress:
             for line in final_table(extremes.summary()):
                 console.say(line)
@@ -304,9 +315,11 @@ class _Sink:
 
     def __init__(self, estimator: Estimator, request: Request, head: dict[str, Any]) -> None:
         from linkpose.estimation import EstimateWriter
+        from linkpose.live_outputs import open_output
         from linkpose.recording.csvfile import head as csv_head
 
         self._estimator = estimator
+        self._outputs = [open_output(target, estimator.columns) for target in request.targets]
         self._json = request.json_lines
         self._file: EstimateWriter | None = None
         if request.output is not None:
@@ -321,8 +334,20 @@ class _Sink:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
             _print(self._estimator.text(estimates))
-        if self._json:
-            _print("".join(json.dumps(row) + "\n" for row in self._estimator.objects(estimates)))
+        if self._json or self._outputs:
+            rows = self._estimator.objects(estimates)
+            for output in self._outputs:
+                for row in rows:
+                    output.send(row)
+            if self._json:
+                _print("".join(json.dumps(row) + "\n" for row in rows))
+
+    @property
+    def dropped(self) -> list[str]:
+        """What live outputs did not accept, in sentences."""
+        return [
+            f"{output.name}: {output.dropped} estimates were not sent" for output in self._outputs if output.dropped
+        ]
 
     def close(self, closing: dict[str, Any]) -> None:
         if self._file is not None:
@@ -332,6 +357,8 @@ class _Sink:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for output in self._outputs:
+            output.close()
         if self._file is not None:
             self._file.__exit__()
 

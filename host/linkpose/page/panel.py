@@ -34,7 +34,9 @@ class Panel:
         self._of_filter = quantities.by_filter(columns)
         self._health = gui.add_html("")
         self._headline = gui.add_html("")
-        shown = [q for q in (HEIGHT, ROLL, PITCH, X, Y, HEADING) if any(q in of for of in self._of_filter.values())]
+        able = {quantity for of in self._of_filter.values() for quantity in of}
+        wanted = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
+        shown = [quantity for quantity in wanted if quantity in able]
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
             self._choice.on_update(lambda _: on_choice())
