@@ -315,8 +315,8 @@ class _Sink:
 
     def __init__(self, estimator: Estimator, request: Request, head: dict[str, Any]) -> None:
         from linkpose.estimation import EstimateWriter
-        from linkpose.live_outputs import open_output
         from linkpose.recording.csvfile import head as csv_head
+        from linkpose.streams import open_output
 
         self._estimator = estimator
         self._outputs = [open_output(target, estimator.columns) for target in request.targets]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from linkpose.errors import InvalidValue, MissingLibrary
-from linkpose.live_outputs import open_output
+from linkpose.streams import open_output
 
 HOST = Path(__file__).parents[2] / "host"
 COLUMNS = ["time_s", "tilt_height_m", "tilt_height_std_m", "tilt_roll_deg"]
