@@ -15,6 +15,7 @@ import click
 from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
+from linkpose.cli.page import PageOptions
 from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
@@ -40,6 +41,7 @@ class Request:
     force: bool
     plain: bool
     targets: tuple[str, ...]
+    page: PageOptions
 
 
 @click.command(name="estimate")
@@ -60,6 +62,7 @@ class Request:
 )
 @click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
+@options.page
 @board_settings
 @options.force
 @options.plain
@@ -85,6 +88,9 @@ def command(
     rig_file: Path | None,
     joint: Joint | None,
     j2s_std: float | None,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     board: dict[str, int],
     force: bool,
     plain: bool,
@@ -107,9 +113,15 @@ def command(
         raise click.UsageError("--port, --duration, --record, --raw, --to and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
+    if recording is not None and has_page:
+        raise click.UsageError(
+            "--view goes with --live; estimate with -o OUT.csv, then type: linkpose plot --view OUT.csv"
+        )
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -177,6 +189,7 @@ def _live(
             )
         )  # fmt: skip
         from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.page.status import Status
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board(request.filter_names, connected)
@@ -185,6 +198,9 @@ def _live(
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force, plain=request.plain)
+        page = stack.enter_context(
+            request.page.open(estimator.columns, estimator.rig, connected.port, console.say, on_mark=connected.mark)
+        )
         head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
@@ -205,6 +221,12 @@ def _live(
                 view.show(newest, lambda: connected.health, compiling.progress)
             else:
                 view.redraw(lambda: connected.health, compiling.progress)
+            if page is not None:
+                page.show(
+                    newest if len(block) else newest[:0],
+                    lambda: Status(connected.health, estimator.found_j2s, compiling.progress),
+                )
+                page.raise_if_stopped()
 
         ended = live.run_board(connected, duration, handle)
         view.close()
