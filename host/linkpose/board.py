@@ -122,6 +122,10 @@ class Board:
 
         self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force, plain))
 
+    def mark(self, time_s: float) -> None:
+        """Notes an instant: the closing line of the recording, if there is one, lists it under `marks`."""
+        self._recorder.marks.append(time_s)
+
     def stream(
         self, duration_s: float | None = None, *, yield_idle: bool = False
     ) -> Generator[Measurements, None, None]:

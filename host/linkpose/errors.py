@@ -56,10 +56,10 @@ class CannotWrite(FileError):
 
 
 class MissingLibrary(LinkposeError):
-    """A file format needs a library that is not installed. `library` is its name."""
+    """A file format or a live output needs a library that is not installed. `library` is its name."""
 
-    def __init__(self, library: str, path: object) -> None:
-        super().__init__(f'{path} needs the library {library}. Install it: pip install "linkpose[files]"')
+    def __init__(self, library: str, path: object, extra: str = "files") -> None:
+        super().__init__(f'{path} needs the library {library}. Install it: pip install "linkpose[{extra}]"')
         self.library, self.path = library, str(path)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from linkpose.device.session import Placement, Session
 from linkpose.errors import InvalidValue, LinkposeError
@@ -36,6 +36,7 @@ class Recorder:
         mouse_ports = max(settings.mouse_ports, len(rig.mouse))
         self._converter = Converter(settings, mouse_ports)
         self.monitor = HealthMonitor(settings.sample_rate_hz, expected_sensors(session.hello, mouse_ports))
+        self.marks: list[float] = []  # instants (s) that the user marked; they go into the closing line
         self._writer: RecordingWriter | None = None
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
@@ -64,7 +65,9 @@ class Recorder:
             board = {"frames_dropped": status.frames_dropped, "ticks_missed": status.ticks_missed} if status else None
             timeline = self._session.timeline
             with writer:
-                more = {"board": board, "sensors": self.monitor.as_dict(), "ended": ended}
+                more: dict[str, Any] = {"board": board, "sensors": self.monitor.as_dict(), "ended": ended}
+                if self.marks:
+                    more["marks"] = [round(time_s, 6) for time_s in sorted(self.marks)]
                 writer.close(closing(timeline, health.corrupt, health.drift_ppm, **more))
 
     def __enter__(self) -> Recorder:

@@ -18,8 +18,9 @@ import pytest
 import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
-from linkpose.cli.view import Extremes, Screen, with_std
+from linkpose.cli.view import Extremes, Screen
 from linkpose.estimation import Estimator, LiveEstimator
+from linkpose.presentation import with_std
 from linkpose.sensors.devices import Sensors
 
 HOST = Path(__file__).parents[2] / "host"

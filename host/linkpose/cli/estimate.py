@@ -15,6 +15,7 @@ import click
 from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
+from linkpose.cli.page import PageOptions
 from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
@@ -39,6 +40,8 @@ class Request:
     json_lines: bool
     force: bool
     plain: bool
+    targets: tuple[str, ...]
+    page: PageOptions
 
 
 @click.command(name="estimate")
@@ -59,9 +62,17 @@ class Request:
 )
 @click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
+@options.page
 @board_settings
 @options.force
 @options.plain
+@click.option(
+    "--to",
+    "targets",
+    multiple=True,
+    metavar="URL",
+    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT or lsl:NAME; may be repeated.",
+)
 @options.as_json
 @options.verbosity
 def command(
@@ -77,9 +88,13 @@ def command(
     rig_file: Path | None,
     joint: Joint | None,
     j2s_std: float | None,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     board: dict[str, int],
     force: bool,
     plain: bool,
+    targets: tuple[str, ...],
     json_lines: bool,
     verbose: bool,
     quiet: bool,
@@ -94,13 +109,19 @@ def command(
     if is_live == (recording is not None):
         both = f"--live estimates from the board: leave out {recording}, or leave out --live"
         raise click.UsageError(both if is_live else "name a RECORDING, or add --live to estimate from the board")
-    if recording is not None and (port or duration or record or raw or board):
-        raise click.UsageError("--port, --duration, --record, --raw and the board's settings go with --live")
+    if recording is not None and (port or duration or record or raw or board or targets):
+        raise click.UsageError("--port, --duration, --record, --raw, --to and the board's settings go with --live")
     if smooth and is_live:
         raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
+    if recording is not None and has_page:
+        raise click.UsageError(
+            "--view goes with --live; estimate with -o OUT.csv, then type: linkpose plot --view OUT.csv"
+        )
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain)
+    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -168,6 +189,7 @@ def _live(
             )
         )  # fmt: skip
         from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.page.status import Status
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board(request.filter_names, connected)
@@ -176,6 +198,9 @@ def _live(
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force, plain=request.plain)
+        page = stack.enter_context(
+            request.page.open(estimator.columns, estimator.rig, connected.port, console.say, on_mark=connected.mark)
+        )
         head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
         view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
@@ -196,6 +221,12 @@ def _live(
                 view.show(newest, lambda: connected.health, compiling.progress)
             else:
                 view.redraw(lambda: connected.health, compiling.progress)
+            if page is not None:
+                page.show(
+                    newest if len(block) else newest[:0],
+                    lambda: Status(connected.health, estimator.found_j2s, compiling.progress),
+                )
+                page.raise_if_stopped()
 
         ended = live.run_board(connected, duration, handle)
         view.close()
@@ -205,6 +236,8 @@ def _live(
         write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
+        for remark in sink.dropped:
+            console.say(remark)
         if console.shows_progress:
             for line in final_table(extremes.summary()):
                 console.say(line)
@@ -283,8 +316,10 @@ class _Sink:
     def __init__(self, estimator: Estimator, request: Request, head: dict[str, Any]) -> None:
         from linkpose.estimation import EstimateWriter
         from linkpose.recording.csvfile import head as csv_head
+        from linkpose.streams import open_output
 
         self._estimator = estimator
+        self._outputs = [open_output(target, estimator.columns) for target in request.targets]
         self._json = request.json_lines
         self._file: EstimateWriter | None = None
         if request.output is not None:
@@ -299,8 +334,20 @@ class _Sink:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
             _print(self._estimator.text(estimates))
-        if self._json:
-            _print("".join(json.dumps(row) + "\n" for row in self._estimator.objects(estimates)))
+        if self._json or self._outputs:
+            rows = self._estimator.objects(estimates)
+            for output in self._outputs:
+                for row in rows:
+                    output.send(row)
+            if self._json:
+                _print("".join(json.dumps(row) + "\n" for row in rows))
+
+    @property
+    def dropped(self) -> list[str]:
+        """What live outputs did not accept, in sentences."""
+        return [
+            f"{output.name}: {output.dropped} estimates were not sent" for output in self._outputs if output.dropped
+        ]
 
     def close(self, closing: dict[str, Any]) -> None:
         if self._file is not None:
@@ -310,6 +357,8 @@ class _Sink:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for output in self._outputs:
+            output.close()
         if self._file is not None:
             self._file.__exit__()
 

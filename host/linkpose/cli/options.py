@@ -111,6 +111,22 @@ def duration(function: Function) -> Function:
     )
 
 
+def page(function: Function) -> Function:
+    """--view, --view-host and --view-port of a command that can serve a page."""
+    function = click.option(
+        "--view-port",
+        type=click.IntRange(1, 65535),
+        metavar="PORT",
+        help="TCP port of the page. Default: from 8080 on.",
+    )(function)
+    function = click.option(
+        "--view-host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Serve the page at this address."
+    )(function)
+    return click.option(
+        "--view", "has_page", is_flag=True, help="Show it in the browser: link or robot in 3-D, charts."
+    )(function)
+
+
 def rig_and_j2s(function: Function) -> Function:
     function = click.option(
         "--j2s-std",

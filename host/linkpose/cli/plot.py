@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
+from linkpose.cli.page import PageOptions
 from linkpose.errors import printable
 
 if TYPE_CHECKING:
     from linkpose.plotting import Scene
+    from linkpose.recording.table import Table
 
 
 @click.command("plot")
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
 @click.option("--map", "map_file", type=options.FILE, metavar="MAP.yaml", help="Draw this map under a robot's path.")
 @click.option("--beacons", type=options.FILE, metavar="BEACONS.csv", help="Draw these beacons with a robot's path.")
 @options.up
+@options.page
 @options.force
 @click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
 def command(
@@ -32,17 +36,28 @@ def command(
     map_file: Path | None,
     beacons: Path | None,
     up: str,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     force: bool,
     quiet: bool,
 ) -> None:
     """Draw recordings, estimates and references.
 
     An estimate together with its reference (a truth or a motion-capture export) shows the errors with ±2σ. Filters that
-    measure height by air pressure are drawn only when --filter names them.
+    measure height by air pressure are drawn only when --filter names them. With --view, an estimate is played in the
+    browser until Ctrl-C, and no picture is written.
     """
     from linkpose import plotting
     from linkpose.evaluation.motive import read_any
 
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
+    if has_page:
+        if output or map_file or beacons:
+            raise click.UsageError("--view shows a page; leave out --output, --map and --beacons")
+        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, quiet)
+        return
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force)
     tables = [read_any(path, up) for path in files]
@@ -66,3 +81,23 @@ def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
     grid = load_map(map_file) if map_file else None
     places = read_beacons(beacons) if beacons else {}
     return Scene(grid, {str(name): place for name, place in places.items()})
+
+
+def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, quiet: bool) -> None:
+    """Plays the first estimate, with the reference if there is one, until Ctrl-C or "stop"."""
+    from linkpose.cli.live import Console, ending_well
+    from linkpose.page.history import Replay
+    from linkpose.page.tables import rig_of, rows_of
+
+    console = Console(quiet, verbose=False)
+    columns, values = rows_of(tables, wanted)
+    rig = rig_of(tables)
+    title = "  ".join(table.path.name for table in tables)
+    with (
+        ending_well(),
+        page_options.open(columns, rig, title, lambda text: click.echo(text, err=True), replay=Replay(values)) as page,
+    ):
+        console.say("Ctrl-C ends")
+        with contextlib.suppress(KeyboardInterrupt):
+            while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
+                pass

@@ -13,7 +13,18 @@ import click
 from linkpose import quantities
 from linkpose.cli.curve import curve, path_map
 from linkpose.device.session import Health
-from linkpose.quantities import Quantity
+from linkpose.presentation import (
+    Exclusions,
+    Row,
+    RowReader,
+    best_filter,
+    fault_lines,
+    number_text,
+    pose_text,
+    signed_angle,
+    std_text,
+    with_std,
+)
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -27,18 +38,14 @@ PATH_POINTS = 4000  # of the map; older ones are thinned out
 WIDEST = 78
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 
-# A row of estimates taken apart: filter -> quantity -> (value, σ); NaN where there is none.
-_Row = dict[str, dict[Quantity, tuple[float, float]]]
-
 
 class View:
     """The live view on stderr. If stderr is not a terminal it shows nothing, and imports nothing to show it with."""
 
     def __init__(self, columns: Sequence[str], is_shown: bool, title: str) -> None:
         """`title` names the port and the settings worth a glance, such as J2S."""
-        self._of_filter = quantities.by_filter(columns)
-        self._columns = {column: at for at, column in enumerate(columns)}
-        self._screen = Screen(title, list(self._of_filter))
+        self._rows = RowReader(columns)
+        self._screen = Screen(title, self._rows.filters)
         self._live: Any = None
         self._drawn_at = -math.inf
         if is_shown:
@@ -71,7 +78,7 @@ class View:
         """
         if self._live is None:
             return
-        self._screen.add(float(estimates[0]), self._taken_apart(estimates))
+        self._screen.add(float(estimates[0]), self._rows.read(estimates.tolist()))
         self.redraw(health, status)
 
     def redraw(self, health: Callable[[], Health], status: str = "") -> None:
@@ -82,18 +89,6 @@ class View:
         self._drawn_at = now
         console = self._live.console
         self._live.update(self._screen.render(health(), console.width, console.height, status), refresh=True)
-
-    def _taken_apart(self, estimates: Floats) -> _Row:
-        values = estimates.tolist()
-
-        def of(column: str) -> tuple[float, float]:
-            std = self._columns.get(quantities.std_column(column) or "")
-            return values[self._columns[column]], math.nan if std is None else values[std]
-
-        return {
-            name: {quantity: of(column) for quantity, column in found.items()}
-            for name, found in self._of_filter.items()
-        }
 
     def close(self) -> None:
         """Takes the view off the screen."""
@@ -114,36 +109,23 @@ class Screen:
     def __init__(self, title: str, filters: Sequence[str]) -> None:
         self._title, self._filters = title, list(filters)
         self._time_s = 0.0
-        self._row: _Row = {}
+        self._row: Row = {}
         self._heights: deque[tuple[float, float]] = deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1)
         self._path: list[tuple[float, float]] = []
-        self._excluded_since: dict[int, float] = {}  # mouse -> when it was left out
+        self._exclusions = Exclusions()
 
-    def add(self, time_s: float, row: _Row) -> None:
+    def add(self, time_s: float, row: Row) -> None:
         """Takes a row of estimates."""
         self._time_s, self._row = time_s, row
-        link, robot = self._best(quantities.HEIGHT), self._best(quantities.X)
+        link = best_filter(self._row, self._filters, quantities.HEIGHT)
+        robot = best_filter(self._row, self._filters, quantities.X)
         if link is not None and (not self._heights or time_s - self._heights[-1][0] >= POINT_INTERVAL_S):
             self._heights.append((time_s, row[link][quantities.HEIGHT][0]))
         if robot is not None and quantities.HEADING in row[robot]:
             self._path.append((row[robot][quantities.X][0], row[robot][quantities.Y][0]))
             if len(self._path) > PATH_POINTS:
                 self._path = self._path[::2]
-        self._follow_exclusions()
-
-    def _best(self, quantity: Quantity) -> str | None:
-        """The first filter that estimates this quantity and knows it now; else the first that estimates it at all."""
-        able = [name for name in self._filters if quantity in self._row.get(name, {})]
-        known = [name for name in able if math.isfinite(self._row[name][quantity][0])]
-        return next(iter(known or able), None)
-
-    def _follow_exclusions(self) -> None:
-        now = set()
-        for values in self._row.values():
-            mask = values.get(quantities.EXCLUDED, (math.nan, 0.0))[0]
-            if math.isfinite(mask):
-                now |= {mouse for mouse in range(1, 9) if int(mask) >> (mouse - 1) & 1}
-        self._excluded_since = {mouse: self._excluded_since.get(mouse, self._time_s) for mouse in now}
+        self._exclusions.follow(time_s, row)
 
     def render(self, health: Health, width: int, height: int, status: str = "") -> Text:
         """The screen in at most `width` × `height` characters. Faults and exclusions are never cut."""
@@ -166,10 +148,11 @@ class Screen:
 
     def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
         """(priority, [(line, style), …]) from top to bottom."""
-        faults = [(line, "bold red") for line in fault_lines(health, width)]
-        faults += [(line, "bold red") for line in self._exclusion_lines()]
+        faults = [(line[:width], "bold red") for line in fault_lines(health)]
+        faults += [(line, "bold red") for line in self._exclusions.lines()]
         sections = [(9, [(self._head(health, width), "bold")]), (10, faults)]
-        link, robot = self._best(quantities.HEIGHT), self._best(quantities.HEADING)
+        link = best_filter(self._row, self._filters, quantities.HEIGHT)
+        robot = best_filter(self._row, self._filters, quantities.HEADING)
         if link is not None:
             times, values = [time for time, _ in self._heights], [value for _, value in self._heights]
             lines = curve(times, values, CURVE_S, width, CURVE_ROWS, LEAST_HEIGHT_M)
@@ -181,7 +164,7 @@ class Screen:
         if robot is not None:
             xs, ys = [x for x, _ in self._path], [y for _, y in self._path]
             lines = path_map(xs, ys, min(width, 60), MAP_ROWS)
-            sections += [(8, [(self._robot_line(robot), "")]), (6, [(line, "cyan") for line in lines])]
+            sections += [(8, [("   ".join(pose_text(self._row[robot])), "")]), (6, [(line, "cyan") for line in lines])]
             sections += [(4, self._pose_table())]
         if status:
             sections.append((9, [(status, "yellow")]))
@@ -200,19 +183,12 @@ class Screen:
             line = "  ".join(filter(None, parts[1:]))
         return line
 
-    def _exclusion_lines(self) -> list[str]:
-        return [
-            f"mouse {mouse} LEFT OUT since {since:.1f} s (disagrees)"
-            for mouse, since in sorted(self._excluded_since.items())
-        ]
-
     def _headline(self, name: str) -> str:
         values = self._row[name]
         parts = [f"HEIGHT over joint   {with_std(*values[quantities.HEIGHT], 'm', 4)}"]
         for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
             if quantity in values:
-                value = values[quantity][0]
-                parts.append(f"{quantity.name} " + (f"{value:+.1f}°" if math.isfinite(value) else "not known yet"))
+                parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
         return "   ".join(parts)
 
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
@@ -224,21 +200,11 @@ class Screen:
             if quantities.HEIGHT not in self._row.get(name, {}):
                 continue
             value, std = self._row[name][quantities.HEIGHT]
-            line = f"{'▸' if name == best else ' '} {name:<16} {_number(value, 'm', 4):>10} {_std(std):>9}"
+            line = f"{'▸' if name == best else ' '} {name:<16} {number_text(value, 'm', 4):>10} {std_text(std):>9}"
             if name != best and width >= 60 and math.isfinite(value - reference):
                 line += f"   {_signed_length(value - reference)}"
             lines.append((line, "bold" if name == best else ""))
         return lines
-
-    def _robot_line(self, name: str) -> str:
-        values = self._row[name]
-        speeds = [values[q][0] for q in (quantities.VX, quantities.VY) if q in values]
-        parts = [f"{q.name} {with_std(*values[q], 'm', 3)}" for q in (quantities.X, quantities.Y) if q in values]
-        heading = math.degrees(values[quantities.HEADING][0])
-        parts.append(f"heading {heading:+.1f}°" if math.isfinite(heading) else "heading not known yet")
-        if speeds and math.isfinite(sum(speeds)):
-            parts.append(f"{math.hypot(*speeds):.2f} m/s")
-        return "   ".join(parts)
 
     def _pose_table(self) -> list[tuple[str, str]]:
         rows = [(name, self._row[name]) for name in self._filters if quantities.HEADING in self._row.get(name, {})]
@@ -248,30 +214,15 @@ class Screen:
         for name, values in rows:
             x, y, heading = (values[q][0] for q in (quantities.X, quantities.Y, quantities.HEADING))
             angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
-            lines.append((f"  {name:<16} {_number(x, 'm', 3):>9} {_number(y, 'm', 3):>9} {angle:>9}", ""))
+            lines.append((f"  {name:<16} {number_text(x, 'm', 3):>9} {number_text(y, 'm', 3):>9} {angle:>9}", ""))
         return lines
-
-
-def fault_lines(health: Health, width: int) -> list[str]:
-    """One line for each sensor that does not work, with what to check."""
-    lines = []
-    for name, of in health.sensors.items():
-        state = of.get("state")
-        if state in ("ok", "absent", None):
-            continue
-        cure = "check VCC, SDA=A4, SCL=A5" if not name.startswith("mouse") else "check its cable and pull-ups"
-        if state == "being set up":
-            lines.append(f"{name.upper()} is being set up"[:width])
-        else:
-            lines.append(f"{name.upper()} {state.upper()}: {cure}"[:width])
-    return lines
 
 
 def final_table(summary: Mapping[str, tuple[float, float, float]]) -> list[str]:
     """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m."""
     lines = [f"  {'filter':<16} {'lowest':>10} {'highest':>10} {'rms σ':>9}"]
     for name, (low, high, std) in summary.items():
-        lines.append(f"  {name:<16} {_number(low, 'm', 4):>10} {_number(high, 'm', 4):>10} {_std(std):>9}")
+        lines.append(f"  {name:<16} {number_text(low, 'm', 4):>10} {number_text(high, 'm', 4):>10} {std_text(std):>9}")
     return lines if summary else []
 
 
@@ -315,26 +266,6 @@ class Extremes:
             for name, low in self._low.items()
             if math.isfinite(low)
         }
-
-
-def with_std(value: float, std: float, unit: str, decimals: int) -> str:
-    """A value with its standard deviation: 1.5906 m ±0.4 mm."""
-    if not math.isfinite(value):
-        return "not known yet"
-    return _number(value, unit, decimals) + (f" ±{_std(std)}" if math.isfinite(std) else "")
-
-
-def _number(value: float, unit: str, decimals: int) -> str:
-    return f"{value:.{decimals}f} {unit}" if math.isfinite(value) else "–"
-
-
-def _std(std: float) -> str:
-    """A standard deviation in metres as a person reads it, with two significant digits."""
-    if not math.isfinite(std):
-        return "–"
-    if std < 0.00995:
-        return f"{1e3 * std:.1f} mm"
-    return f"{1e2 * std:.1f} cm" if std < 0.995 else f"{std:.1f} m"
 
 
 def _signed_length(metres: float) -> str:

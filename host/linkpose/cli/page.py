@@ -1,0 +1,63 @@
+"""The page of `estimate --live`, `record` and `plot` with `--view`."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from linkpose.page import Page
+    from linkpose.page.history import Replay
+    from linkpose.sensors.rig import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class PageOptions:
+    """What --view, --view-host and --view-port ask for."""
+
+    is_wanted: bool
+    host: str
+    port: int | None
+
+    def check(self) -> None:
+        """Raises UsageError for an address or a port without --view."""
+        if not self.is_wanted and (self.port is not None or self.host != "127.0.0.1"):
+            raise click.UsageError("--view-host and --view-port go with --view")
+
+    @contextlib.contextmanager
+    def open(
+        self,
+        columns: Sequence[str],
+        rig: Rig,
+        title: str,
+        say: Callable[[str], None],
+        *,
+        on_mark: Callable[[float], None] | None = None,
+        replay: Replay | None = None,
+    ) -> Iterator[Page | None]:
+        """The page if it is wanted; `say` prints its address, and a warning where it is open to the network."""
+        if not self.is_wanted:
+            yield None
+            return
+        from linkpose.page import Page
+
+        with Page(
+            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay
+        ) as page:  # fmt: skip
+            if not is_loopback(self.host):
+                say(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
+            say(f"page: {page.url}")
+            yield page
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only programs on this machine reach this address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

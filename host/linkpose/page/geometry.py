@@ -1,0 +1,68 @@
+"""Rotations and shapes of the page's scene. Vectors are columns in metres, quaternions are (w, x, y, z)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors.measurements import Floats
+
+_SEGMENTS = 48  # of a circle
+_WIDEST_RAD = math.radians(80.0)  # half the opening of a cone: wider ones cannot be drawn
+
+
+def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
+    """The quaternion (4,) that turns the sensor's axes into n (z upwards): Rz(yaw)·Ry(pitch)·Rx(roll).
+
+    NaN where roll or pitch is NaN; an unknown yaw is drawn as 0.
+    """
+    yaw = yaw_deg if math.isfinite(yaw_deg) else 0.0
+    (cr, sr), (cp, sp), (cy, sy) = (
+        (math.cos(half), math.sin(half)) for half in (math.radians(angle) / 2 for angle in (roll_deg, pitch_deg, yaw))
+    )
+    return np.array([
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ])  # fmt: skip
+
+
+def turn_z_to(direction: Floats) -> Floats:
+    """The quaternion (4,) of the shortest turn from the z axis to `direction` (3,), which is not 0."""
+    x, y, z = direction / np.linalg.norm(direction)
+    if z < -1.0 + 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    turn: Floats = np.array([1.0 + z, -y, x, 0.0]) / math.sqrt(2.0 + 2.0 * z)
+    return turn
+
+
+def cone_radius(length_m: float, std_deg: float) -> float:
+    """Radius (m) of a cone of ±2σ about an axis of this length; 0 where σ is not known."""
+    if not math.isfinite(std_deg):
+        return 0.0
+    return length_m * math.tan(min(math.radians(2 * std_deg), _WIDEST_RAD))
+
+
+def cone() -> tuple[Floats, NDArray[np.uint32]]:
+    """Vertices (N, 3) and faces of an open cone with its tip at the origin, up to a circle of radius 1 at z = 1."""
+    angles = np.linspace(0.0, 2 * np.pi, _SEGMENTS, endpoint=False)
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.ones(_SEGMENTS)])
+    at = np.arange(_SEGMENTS)
+    faces = np.column_stack([np.zeros(_SEGMENTS), 1 + at, 1 + (at + 1) % _SEGMENTS])
+    return np.vstack([np.zeros(3), circle]), faces.astype(np.uint32)
+
+
+def polyline(points: Floats) -> Floats:
+    """Points (N, 3) of a path as segments (N − 1, 2, 3); segments with an unknown end are left out."""
+    segments = np.stack([points[:-1], points[1:]], axis=1)
+    return segments[np.isfinite(segments).all(axis=(1, 2))]
+
+
+def ellipse(x: float, y: float, std_x: float, std_y: float, z: float) -> Floats:
+    """±2σ in x and in y about a place (m), as segments (N, 2, 3) at height z."""
+    angles = np.linspace(0.0, 2 * np.pi, _SEGMENTS + 1)
+    points = [x + 2 * std_x * np.cos(angles), y + 2 * std_y * np.sin(angles), np.full(_SEGMENTS + 1, z)]
+    return polyline(np.column_stack(points))

@@ -1,0 +1,90 @@
+"""The rows that the page draws: those of the last seconds, and the path so far."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from linkpose.sensors.measurements import Floats
+
+SPAN_S = 20.0  # of the past that the charts show
+POINT_INTERVAL_S = 0.05  # between two rows of a chart: closer ones share a pixel
+PATH_POINTS = 2000  # of a path; when there are more, every second one is dropped
+
+
+class History:
+    """Rows as they arrive, thinned out in time, and all of the path (thinned out in number)."""
+
+    def __init__(self, columns: Sequence[str]) -> None:
+        self._width = len(columns)
+        self._rows: deque[Floats] = deque(maxlen=round(SPAN_S / POINT_INTERVAL_S) + 1)
+        self._path: list[Floats] = []
+        self._step = 1  # rows between two of the path
+        self._count = 0
+
+    def add(self, row: Floats) -> None:
+        """Takes the next row (columns,). The newest row replaces the one before when they are close in time."""
+        if len(self._rows) > 1 and row[0] - self._rows[-2][0] < POINT_INTERVAL_S:
+            self._rows[-1] = row
+            return
+        self._rows.append(row)
+        if self._count % self._step == 0:
+            self._path.append(row)
+        self._count += 1
+        if len(self._path) > PATH_POINTS:
+            self._path, self._step = self._path[::2], 2 * self._step
+
+    @property
+    def newest(self) -> Floats | None:
+        """The newest row (columns,)."""
+        return self._rows[-1] if self._rows else None
+
+    def window(self) -> Floats:
+        """The rows (N, columns) of the last SPAN_S seconds."""
+        rows = np.array(self._rows).reshape(-1, self._width)
+        return rows[rows[:, 0] >= rows[-1, 0] - SPAN_S] if len(rows) else rows
+
+    def path(self) -> Floats:
+        """Rows (N, columns) along the whole path, with the newest as the last."""
+        return np.array([*self._path, *list(self._rows)[-1:]]).reshape(-1, self._width)
+
+
+class Replay:
+    """A table of rows with a place in it: the rows up to this place are drawn."""
+
+    def __init__(self, values: Floats) -> None:
+        """`values` (N ≥ 1, columns), the first column is the time (s)."""
+        self._values = values
+        self._end = len(values)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Time of the first and of the last row."""
+        return float(self._values[0, 0]), float(self._values[-1, 0])
+
+    def seek(self, time_s: float) -> None:
+        """Goes to the last row that is not later than `time_s`."""
+        self._end = max(1, int(np.searchsorted(self._values[:, 0], time_s, side="right")))
+
+    @property
+    def newest(self) -> Floats | None:
+        """The row (columns,) at this place."""
+        row: Floats = self._values[self._end - 1]
+        return row
+
+    def window(self) -> Floats:
+        """The rows (N, columns) of the last SPAN_S seconds, thinned out, with the newest as the last."""
+        times = self._values[: self._end, 0]
+        first = int(np.searchsorted(times, times[-1] - SPAN_S))
+        return _thinned(self._values[first : self._end], round(SPAN_S / POINT_INTERVAL_S))
+
+    def path(self) -> Floats:
+        """Rows (N, columns) along the path up to here, thinned out, with the newest as the last."""
+        return _thinned(self._values[: self._end], PATH_POINTS)
+
+
+def _thinned(rows: Floats, most: int) -> Floats:
+    every = -(-len(rows) // most)
+    return rows[::-1][:: max(every, 1)][::-1]

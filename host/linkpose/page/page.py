@@ -1,0 +1,314 @@
+"""`Page`: estimates in a browser, while they are made or from a file."""
+
+from __future__ import annotations
+
+import errno
+import math
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from linkpose import quantities
+from linkpose.errors import LinkposeError
+from linkpose.page.history import History, Replay
+from linkpose.page.status import Status
+from linkpose.presentation import Exclusions, RowReader, best_filter, fault_lines, working_sensors
+from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, X, Y
+from linkpose.sensors.measurements import Floats
+from linkpose.sensors.rig import Rig
+
+if TYPE_CHECKING:
+    import viser
+
+    from linkpose.estimation import FoundJ2s
+
+LOOPBACK = "127.0.0.1"
+FIRST_PORT = 8080
+UPDATE_INTERVAL_S = 0.05  # between two updates of the page: motion looks smooth at 20 Hz
+CHART_INTERVAL = 5  # updates between two of the charts, which are the largest messages
+STATUS_INTERVAL = 10  # blocks between two looks at the health, which counts over all sensors
+QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
+_PORTS_TRIED = 100
+
+
+class Page:
+    """Serves a page that shows estimates. A context manager: leaving it ends the server.
+
+    `show` only puts a block into a queue: another thread sends it, and drops old blocks rather than let anything wait
+    for a slow browser. The server sends the files of its own client program and no other file of the machine.
+    """
+
+    def __init__(
+        self,
+        columns: Sequence[str],
+        rig: Rig,
+        title: str,
+        *,
+        host: str = LOOPBACK,
+        port: int | None = None,
+        on_mark: Callable[[float], None] | None = None,
+        replay: Replay | None = None,
+    ) -> None:
+        """Starts the server.
+
+        Args:
+            columns: of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; columns without a filter are a reference.
+            rig: its J2S is the length and direction of the link in the scene.
+            title: a line such as the port or the file.
+            host: address to listen at; any other than a loopback address opens the page to the network.
+            port: TCP port; None: the first free one from 8080.
+            on_mark: called with the time (s) of the newest row when the user presses "mark".
+            replay: rows of a file to play, instead of `show`.
+
+        Raises LinkposeError where the address cannot be used, or the port is taken.
+        """
+        self.stopped = threading.Event()  # set when the user presses "stop"
+        self._title, self._on_mark = title, on_mark
+        self._columns = list(columns)
+        self._at = {column: at for at, column in enumerate(columns)}
+        self._rows = RowReader(columns)
+        self._history: History | Replay = replay or History(columns)
+        self._replay = replay
+        self._exclusions = Exclusions()
+        self._queue: deque[Floats] = deque(maxlen=QUEUE_BLOCKS)
+        self._status, self._blocks = Status(), 0
+        self._marks: list[float] = []
+        self._changed = threading.Event()
+        self._closing = threading.Event()
+        self._server = _serve(host, port or free_port(host), is_named=port is not None)
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        self._build(rig)
+        self._updates = 0
+        self._clients: set[int] = set()
+        self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
+        self._thread.start()
+
+    def show(self, estimates: Floats, status: Callable[[], Status]) -> None:
+        """Takes estimates (N, columns) or the newest row (columns,). Never waits.
+
+        `status` is called now and then, in the thread of the caller.
+        """
+        if estimates.size:
+            self._queue.append(np.atleast_2d(estimates))
+        if self._blocks % STATUS_INTERVAL == 0 or not estimates.size:
+            self._status = status()
+        self._blocks += 1
+        self._changed.set()
+
+    def raise_if_stopped(self) -> None:
+        """Raises KeyboardInterrupt once the user has pressed "stop", which ends a run as Ctrl-C does."""
+        if self.stopped.is_set():
+            raise KeyboardInterrupt
+
+    def close(self) -> None:
+        """Ends the server."""
+        self._closing.set()
+        self._thread.join()
+        # viser waits up to 6 s for the farewell of browsers; the end of a measurement does not.
+        threading.Thread(target=self._server.stop, name="linkpose page stop", daemon=True).start()
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _build(self, rig: Rig) -> None:
+        from linkpose.page.panel import Panel
+        from linkpose.page.scene import LinkScene, RobotScene
+
+        server, filters = self._server, quantities.by_filter(self._columns).values()
+        server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
+        self._panel = Panel(server, self._columns, self._changed.set)
+        self._scene: LinkScene | RobotScene
+        if any(HEADING in of for of in filters) and not any(HEIGHT in of for of in filters):
+            self._scene = RobotScene(server)
+        else:
+            j2s = rig.joint.known_j2s_m
+            self._scene = LinkScene(server, None if j2s is None else np.array(j2s))
+        if self._replay is not None:
+            self._build_player(self._replay)
+        elif self._on_mark is not None:
+            self._mark_button = server.gui.add_button("mark", hint="note this instant in the recording")
+            self._mark_button.on_click(lambda _: self._mark())
+        if self._replay is None:
+            stop = server.gui.add_button("stop", color="red", hint="end the measurement")
+            stop.on_click(lambda _: self.stopped.set())
+        self._panel.add_charts()
+
+    def _build_player(self, replay: Replay) -> None:
+        """A slider over the time of the file, and "play"."""
+        start, end = replay.span_s
+        replay.seek(start)
+        self._place_s = start
+        self._slider: Any = self._server.gui.add_slider("time (s)", start, max(end, start + 0.01), 0.01, start)
+        self._play: Any = self._server.gui.add_checkbox("play", True)
+
+        def jump(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:  # moved by the user, not by the player
+                self._place_s = float(self._slider.value)
+                self._changed.set()
+
+        self._slider.on_update(jump)
+
+    def _mark(self) -> None:
+        newest = self._history.newest
+        if newest is not None and self._on_mark is not None:
+            self._marks.append(float(newest[0]))
+            self._on_mark(self._marks[-1])
+            self._changed.set()
+
+    def _send(self) -> None:
+        """The sender: everything that arrived since the last update, as one update."""
+        while not self._closing.wait(UPDATE_INTERVAL_S):
+            self._take()
+            clients = set(self._server.get_clients())
+            if clients and self._replay is not None:
+                self._advance(self._replay)
+            if clients - self._clients:
+                self._changed.set()
+            self._clients = clients
+            if clients and self._changed.is_set():
+                self._changed.clear()
+                self._draw()
+            elif clients and self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
+                self._draw()
+
+    def _take(self) -> None:
+        while self._queue and isinstance(self._history, History):
+            for row in self._queue.popleft():
+                self._history.add(row)
+                self._exclusions.follow(float(row[0]), self._rows.read(row.tolist()))
+
+    def _advance(self, replay: Replay) -> None:
+        """Plays on."""
+        _, end = replay.span_s
+        if self._play.value:
+            self._place_s += UPDATE_INTERVAL_S
+            if self._place_s >= end:
+                self._place_s, self._play.value = end, False
+            self._slider.value = round(self._place_s, 2)
+            self._changed.set()
+        replay.seek(self._place_s)
+
+    def _draw(self) -> None:
+        newest, status = self._history.newest, self._status
+        row = self._rows.read(newest.tolist()) if newest is not None else {}
+        if self._replay is not None:
+            self._exclusions.follow(self._place_s, row)
+        name = self._panel.chosen or self._best(row)
+        with self._server.atomic():
+            self._draw_health(newest, status)
+            if newest is not None and name is not None:
+                self._draw_estimates(newest, row, name, status)
+        self._updates += 1
+
+    def _draw_estimates(self, newest: Floats, row: Any, name: str, status: Status) -> None:
+        self._panel.draw_headline(row, name)
+        if status.j2s is not None and hasattr(self._scene, "set_j2s"):
+            self._scene.set_j2s(status.j2s.mean_m)
+        path = self._path(name) if self._scene.is_path_due else None
+        self._scene.draw(row, name, self._reference(newest), path)
+        if self._updates % CHART_INTERVAL == 0:
+            self._panel.draw_charts(self._history.window(), name)
+
+    def _best(self, row: Any) -> str | None:
+        for quantity in (HEIGHT, HEADING, ROLL):
+            name = best_filter(row, self._rows.filters, quantity)
+            if name is not None:
+                return name
+        return None
+
+    def _draw_health(self, newest: Floats | None, status: Status) -> None:
+        health, words = status.health, []
+        if newest is not None:
+            words.append(f"{newest[0]:.1f} s")
+        if health is not None:
+            words.append(f"{health.rate_hz:.0f} Hz   {health.lost} lost")
+        if status.j2s is not None:
+            words.append(_j2s_text(status.j2s))
+        if self._marks:
+            words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")
+        if status.line:
+            words.append(status.line)
+        faults = fault_lines(health) if health is not None else []
+        working = working_sensors(health) if health is not None else []
+        self._panel.draw_health(self._title, "   ".join(words), working, faults + self._exclusions.lines())
+
+    def _reference(self, newest: Floats) -> dict[Quantity, float]:
+        found = ((column, quantities.split(column)) for column in self._columns)
+        return {
+            part.quantity: float(newest[self._at[column]])
+            for column, part in found
+            if part is not None and not part.prefix and not part.is_std
+        }
+
+    def _path(self, name: str) -> Floats | None:
+        """x, y, heading, σ of x and of y (N, 5) along the path of the filter."""
+        of = quantities.by_filter(self._columns).get(name, {})
+        if not {X, Y, HEADING} <= of.keys():
+            return None
+        rows = self._history.path()
+        std = [self._at.get(quantities.std_column(of[q]) or "") for q in (X, Y)]
+        columns = [rows[:, self._at[of[q]]] for q in (X, Y, HEADING)]
+        columns += [rows[:, at] if at is not None else np.full(len(rows), math.nan) for at in std]
+        return np.column_stack(columns)
+
+
+def _j2s_text(found: FoundJ2s) -> str:
+    """J2S as found so far, and in which direction the motion has not shown it yet."""
+    length = float(np.linalg.norm(found.mean_m))
+    text = f"J2S {length:.3f} m ±{1e3 * found.worst_std_m:.0f} mm"
+    if found.worst_std_m > 0.03:
+        text += f": not known along the sensor's {found.worst_axis} axis yet, swing the link in other directions"
+    return text
+
+
+def free_port(host: str) -> int:
+    """The first free TCP port from 8080 at this address. Raises LinkposeError where the address cannot be used."""
+    for port in range(FIRST_PORT, FIRST_PORT + _PORTS_TRIED):
+        try:
+            _try_to_bind(host, port)
+        except PermissionError:
+            continue
+        except OSError as reason:
+            if reason.errno != errno.EADDRINUSE:
+                raise LinkposeError(f"the page cannot be served at {host}: {reason.strerror or reason}") from None
+            continue
+        return port
+    raise LinkposeError(f"ports {FIRST_PORT} to {FIRST_PORT + _PORTS_TRIED - 1} at {host} are taken; name another port")
+
+
+def _try_to_bind(host: str, port: int) -> None:
+    """Raises OSError where a server could not listen there."""
+    family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind, protocol) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind(address)
+
+
+def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
+    """The server. It prints nothing: stdout is for results."""
+    if (
+        is_named
+    ):  # viser itself would take the next free port, and never return for an address that is not this machine's
+        try:
+            _try_to_bind(host, port)
+        except OSError as reason:
+            raise LinkposeError(f"the page cannot be served at {host}:{port}: {reason.strerror or reason}") from None
+    import rich
+    import viser
+
+    class Server(viser.ViserServer):
+        """A server that opens no tunnel to the network, whatever a browser asks for."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    rich.reconfigure(quiet=True)  # the global console, with which viser prints; linkpose has its own
+    return Server(host, port, label="linkpose", verbose=False)

@@ -1,0 +1,158 @@
+"""The panel of the page: headline, health, charts with ±2σ, choice of the filter, and buttons."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose import quantities
+from linkpose.presentation import Row, pose_text, signed_angle, with_std
+from linkpose.quantities import HEADING, HEIGHT, PITCH, ROLL, YAW, Quantity, X, Y
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    import viser
+
+BEST = "best"  # the choice that follows the best filter
+_BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
+_CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
+_OTHER_HEIGHT = 105
+_OK, _FAULT = "#2b8a3e", "#c92a2a"
+
+
+class Panel:
+    """The elements of the panel, and how they are brought up to date."""
+
+    def __init__(self, server: viser.ViserServer, columns: Sequence[str], on_choice: Callable[[], None]) -> None:
+        """`on_choice` is called when another filter is chosen."""
+        gui = self._gui = server.gui
+        self._columns = {column: at for at, column in enumerate(columns)}
+        self._of_filter = quantities.by_filter(columns)
+        self._health = gui.add_html("")
+        self._headline = gui.add_html("")
+        able = {quantity for of in self._of_filter.values() for quantity in of}
+        wanted = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
+        shown = [quantity for quantity in wanted if quantity in able]
+        self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
+        if self._choice is not None:
+            self._choice.on_update(lambda _: on_choice())
+        self._shown = shown
+        self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
+
+    def add_charts(self) -> None:
+        """Adds the charts below what the panel has already."""
+        self._charts = {quantity: self._chart(self._gui, quantity) for quantity in self._shown}
+
+    @property
+    def chosen(self) -> str | None:
+        """The filter that the user has chosen; None: the best one."""
+        return None if self._choice is None or self._choice.value == BEST else self._choice.value
+
+    def _chart(self, gui: viser.GuiApi, quantity: Quantity) -> viser.GuiUplotHandle:
+        from viser import uplot
+
+        series = [
+            uplot.Series(label="time (s)"),
+            uplot.Series(label="−2σ", width=0, points={"show": False}),
+            uplot.Series(label="+2σ", width=0, points={"show": False}),
+            uplot.Series(label=quantity.name, stroke=_LINE, width=2, points={"show": False}),
+        ]
+        if quantity.column in self._columns:
+            series.append(
+                uplot.Series(label="reference", stroke=_REFERENCE, width=1, dash=(5, 4), points={"show": False})
+            )
+        return gui.add_uplot(
+            tuple(np.zeros(1) for _ in series),
+            tuple(series),
+            title=quantity.axis_label,
+            bands=(uplot.Band(series=(2, 1), fill=_BAND),),
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
+            axes=(uplot.Axis(size=26), uplot.Axis(size=48)),
+            legend=uplot.Legend(show=False),
+            height=_CHART_HEIGHT.get(quantity, _OTHER_HEIGHT),
+        )
+
+    def draw_charts(self, window: Floats, name: str) -> None:
+        """Draws the rows (N, columns) of the last seconds as the filter `name` sees them."""
+        for quantity, chart in self._charts.items():
+            column = self._of_filter.get(name, {}).get(quantity)
+            chart.visible = column is not None
+            if column is not None:
+                chart.data = self._chart_data(window, quantity, column)
+
+    def _chart_data(self, window: Floats, quantity: Quantity, column: str) -> tuple[Floats, ...]:
+        scale = quantity.value.scale
+        known = window[np.isfinite(window[:, self._columns[column]])]
+        value = known[:, self._columns[column]] * scale
+        if quantity.period is not None:
+            value = np.unwrap(value, period=quantity.period * scale)
+        std_at = self._columns.get(quantities.std_column(column) or "")
+        std = known[:, std_at] * scale if std_at is not None else np.zeros(len(known))
+        std = np.where(np.isfinite(std), std, 0.0)
+        data = [known[:, 0], value - 2 * std, value + 2 * std, value]
+        if quantity.column in self._columns:
+            data.append(known[:, self._columns[quantity.column]] * scale)
+        return tuple(np.ascontiguousarray(part) for part in data)
+
+    def draw_health(self, title: str, summary: str, working: Sequence[str], faults: Sequence[str]) -> None:
+        """Shows which sensors work, in green, and each fault as a red line."""
+        pills = "".join(_pill(f"{name} ok", _OK) for name in working)
+        alarms = "".join(_alarm(line) for line in faults)
+        self._set(
+            self._health,
+            f"<div style='padding:4px 12px'><div style='font-size:12px;color:#666'>{html.escape(title)}</div>"
+            f"<div style='font-size:12px;color:#666;white-space:pre-wrap'>{html.escape(summary)}</div>"
+            f"<div style='margin-top:4px'>{pills}</div>{alarms}</div>",
+        )
+
+    def draw_headline(self, row: Row, name: str) -> None:
+        """Shows the newest values of the filter `name`."""
+        values = row.get(name, {})
+        if HEIGHT in values:
+            first, lines = with_std(*values[HEIGHT], "m", 4), [_angles(values)]
+            caption = "height over the joint"
+        elif HEADING in values:
+            first, *lines = pose_text(values)
+            caption = "place and heading"
+        else:
+            first, lines, caption = _angles(values), [], "attitude"
+        below = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+        self._set(
+            self._headline,
+            f"<div style='padding:2px 12px'><div style='font-size:12px;color:#666'>{caption}, {html.escape(name)}</div>"
+            f"<div style='font-size:26px;font-weight:600;font-variant-numeric:tabular-nums'>{html.escape(first)}</div>"
+            f"<div style='font-variant-numeric:tabular-nums;white-space:pre-wrap'>{below}</div></div>",
+        )
+
+    @staticmethod
+    def _set(element: viser.GuiHtmlHandle, text: str) -> None:
+        if element.content != text:
+            element.content = text
+
+
+def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
+    parts = []
+    for quantity in (ROLL, PITCH, YAW):
+        if quantity in values:
+            value, std = values[quantity]
+            bound = f" ±{std:.2g}°" if math.isfinite(value + std) else ""
+            parts.append(f"{quantity.name} {signed_angle(value)}{bound}")
+    return "   ".join(parts)
+
+
+def _pill(text: str, colour: str) -> str:
+    return (
+        f"<span style='display:inline-block;margin:2px 4px 2px 0;padding:1px 8px;border-radius:9px;font-size:12px;"
+        f"color:white;background:{colour}'>{html.escape(text)}</span>"
+    )
+
+
+def _alarm(text: str) -> str:
+    return (
+        f"<div role='alert' style='margin-top:4px;padding:4px 8px;border-radius:4px;font-weight:600;color:white;"
+        f"background:{_FAULT}'>{html.escape(text)}</div>"
+    )
