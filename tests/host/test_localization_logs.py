@@ -166,10 +166,10 @@ def test_beacons(tmp_path):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("", "header"),
+        ("", "ends before its first row"),
         ("id,x,y\n1,2,3\n", "header 'id,x,y'"),
-        ("id,x_m,y_m\n", "names no beacons"),
-        ("id,x_m,y_m\n1,2\n", "line 2: 2 of 3 columns"),
+        ("id,x_m,y_m\n", "has a header but no row"),
+        ("id,x_m,y_m\n1,2\n", "line 2: 2 fields where the header has 3"),
         ("id,x_m,y_m\n1,2,nan\n", "line 2: 'nan' is not a number"),
         ("id,x_m,y_m\n1,2,3\n1.0,5,6\n", "line 3: beacon 1 is listed twice"),
     ],

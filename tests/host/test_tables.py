@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from linkpose.errors import FileExists, FileFormatError
+from linkpose.localization.tables import read_beacons
 from linkpose.recording import columns
 from linkpose.recording.csvfile import CsvFile, head
 from linkpose.recording.reader import load_recording
@@ -233,3 +234,16 @@ def test_the_documented_calls_of_numpy_and_pandas_read_linkposes_own_files(tmp_p
     assert all(np.array_equal(frame[name], own[name]) for name in own)
     found = np.genfromtxt(path, names=True, delimiter=",", skip_header=2)
     assert all(np.array_equal(found[name], own[name]) for name in own)
+
+
+def test_beacons_that_spreadsheets_saved(tmp_path):
+    path = tmp_path / "beacons.csv"
+    expected = {"0xDD05": (-3.5, 3.0, 0.0), "5": (0.25, 3.0, 0.0)}
+    for text in (
+        "id,x_m,y_m\n0xDD05,-3.5,3.0\n05,0.25,3\n",
+        "id;x_m;y_m;\r\n0xDD05;-3,5;3,0;\r\n5;0,25;3;\r\n",
+        '"","y_m","x_m","id"\n"1",3,-3.5,"0xDD05"\n"2",3,0.25,"5"\n',
+        "# the room,,\nid,x_m,y_m\n0xDD05,-3.5,3.0\n5.0,0.25,3\n,,\n",
+    ):
+        path.write_text(text, encoding="utf-16" if ";" in text else "utf-8")
+        assert read_beacons(path) == expected

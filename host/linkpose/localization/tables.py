@@ -12,45 +12,33 @@ from linkpose.errors import LinkposeError
 from linkpose.localization.events import beacon_name, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.track import Track
-from linkpose.recording.table import Table, read_table
+from linkpose.recording.delimited import split_cells, to_utf8
+from linkpose.recording.table import Table, read_bytes, read_table
 
 Beacons = dict[str, tuple[float, float, float]]
 LONGEST_TRUTH_GAP_S = 1.0  # between two true poses: an estimate inside a longer gap has nothing to be compared with
 
 
 def read_beacons(path: Path) -> Beacons:
-    """Reads `id,x_m,y_m[,z_m]` into name -> (x, y, z) in m. Raises LinkposeError with file, line and cure."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
+    """Reads `id,x_m,y_m[,z_m]` into name -> (x, y, z) in m, as a spreadsheet saves it too.
+
+    Raises LinkposeError with file, line and cure.
+    """
+    cells = split_cells(path, to_utf8(read_bytes(path)))
+    if sorted(cells.names) not in (["id", "x_m", "y_m"], ["id", "x_m", "y_m", "z_m"]):
         raise LinkposeError(
-            f"{path} is not a CSV file: {error}; give the header id,x_m,y_m and one row a beacon"
-        ) from error
-    except OSError as error:
-        raise LinkposeError(f"cannot read the beacons {path}: {error.strerror}") from error
-    rows = [
-        (number, text.split(",")) for number, text in enumerate(lines, 1) if text.strip() and not text.startswith("#")
-    ]
-    header = [name.strip() for name in rows[0][1]] if rows else []
-    if header not in (["id", "x_m", "y_m"], ["id", "x_m", "y_m", "z_m"]):
-        raise LinkposeError(
-            f"{path} has the header {','.join(header)[:60]!r}; a beacon file has id,x_m,y_m or id,x_m,y_m,z_m"
+            f"{path} has the header {','.join(cells.names)[:60]!r}; a beacon file has id,x_m,y_m or id,x_m,y_m,z_m"
         )
     beacons: Beacons = {}
-    for line, cells in rows[1:]:
-        if len(cells) != len(header):
-            raise LinkposeError(
-                f"{path} line {line}: {len(cells)} of {len(header)} columns; complete or delete the row"
-            )
-        place = [read_number(cell, path, line) for cell in cells[1:]]
-        name = beacon_name(cells[0])
+    for line, row in zip(cells.lines, cells.rows, strict=True):
+        fields = dict(zip(cells.names, row, strict=True))
+        name = beacon_name(fields.pop("id"))
+        place = {axis: read_number(text.replace(",", "."), path, line) for axis, text in fields.items()}
         if not name:
             raise LinkposeError(f"{path} line {line}: the row has no id; complete or delete it")
         if name in beacons:
             raise LinkposeError(f"{path} line {line}: beacon {name} is listed twice; give each its own id")
-        beacons[name] = (place[0], place[1], place[2] if len(place) == 3 else 0.0)
-    if not beacons:
-        raise LinkposeError(f"{path} names no beacons; give one row a beacon: id,x_m,y_m")
+        beacons[name] = (place["x_m"], place["y_m"], place.get("z_m", 0.0))
     return beacons
 
 

@@ -183,7 +183,7 @@ def _match(path: Path, rows: list[list[str]], numbers: list[int], separator: str
     names, body = [name.strip() for name in rows[0]], rows[1:]
     if not body:
         _check_names(path, names, numbers[0])
-        raise FileFormatError(path, f"{path} has a header but no row; nothing was recorded")
+        raise FileFormatError(path, f"{path} has a header but no row")
     if names and all(len(row) == len(names) + 1 for row in body) and any(row[-1].strip() for row in body):
         if separator == "," or len({row[0] for row in body}) < len(body):
             raise _width_error(path, numbers[1], len(body[0]), len(names))
