@@ -231,12 +231,54 @@ class NotPositiveDefinite(LinkposeError):
     """A covariance is no longer positive definite. `matrix` is its name, `where` the filter."""
 
     def __init__(self, matrix: str, where: str) -> None:
-        super().__init__(f"the {matrix} of {where} is no longer positive definite")
+        super().__init__(f"the {matrix} of {where} is no longer positive definite; larger noises may prevent this")
         self.matrix, self.where = matrix, where
 
 
 class NoUsableData(LinkposeError):
     """No inertial sensor and no mouse gave usable data."""
+
+
+# ---- localization ----
+
+
+class MissingMap(LinkposeError):
+    """The log holds laser scans, and there is no map. `log` names it."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__(f"{log} holds laser scans, which need the map they were taken in")
+        self.log = log
+
+
+class MissingBeacons(LinkposeError):
+    """The log holds ranges to beacons, and their positions are not given. `log` names it."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__(f"{log} holds ranges to beacons, whose positions must be known")
+        self.log = log
+
+
+class MissingStart(LinkposeError):
+    """Neither the log nor the settings state the pose at the start."""
+
+    def __init__(self) -> None:
+        super().__init__("the log does not state where the robot starts")
+
+
+class NothingToEstimate(LinkposeError):
+    """Errors of the ranges are to be estimated, and the log holds no ranges. `log` names it."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__(f"{log} holds no ranges from which a scale or bias could be estimated")
+        self.log = log
+
+
+class NeedsScans(LinkposeError):
+    """The filter needs laser scans, and the log holds none. `log` names it, `filter` is the filter."""
+
+    def __init__(self, log: str, name: str) -> None:
+        super().__init__(f"{log} holds no laser scans, which the filter {name} needs")
+        self.log, self.filter = log, name
 
 
 # ---- values ----

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 
@@ -47,7 +48,7 @@ def truth(estimate):
 
 
 def test_opensim_reads_the_orientations(estimate, truth, tmp_path):
-    opensim = pytest.importorskip("opensim")
+    opensim = importlib.import_module("opensim")
     out = tmp_path / "out.sto"
     remarks = convert(estimate, out, "joint-inertial", "tibia_r_imu")
     assert any("3 rows without an estimate" in remark for remark in remarks)
@@ -63,7 +64,7 @@ def test_opensim_reads_the_orientations(estimate, truth, tmp_path):
 
 
 def test_opensim_reads_motion_and_markers(estimate, truth, tmp_path):
-    opensim = pytest.importorskip("opensim")
+    opensim = importlib.import_module("opensim")
     convert(estimate, tmp_path / "out.mot")
     table = opensim.TimeSeriesTable(str(tmp_path / "out.mot"))
     own = read_table(estimate).columns
@@ -79,7 +80,7 @@ def test_opensim_reads_motion_and_markers(estimate, truth, tmp_path):
 
 
 def test_ezc3d_reads_the_markers(estimate, truth, tmp_path):
-    ezc3d = pytest.importorskip("ezc3d")
+    ezc3d = importlib.import_module("ezc3d")
     convert(estimate, tmp_path / "out.c3d", "joint-inertial")
     file = ezc3d.c3d(str(tmp_path / "out.c3d"))
     assert file["parameters"]["POINT"]["RATE"]["value"].tolist() == [RATE]
@@ -95,7 +96,7 @@ def test_ezc3d_reads_the_markers(estimate, truth, tmp_path):
 
 
 def test_evo_reads_the_trajectory(estimate, truth, tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface")
+    file_interface = importlib.import_module("evo.tools.file_interface")
     convert(estimate, tmp_path / "out.tum", "joint-inertial")
     found = file_interface.read_tum_trajectory_file(str(tmp_path / "out.tum"))
     assert np.allclose(found.timestamps, truth[0]) and np.allclose(found.positions_xyz, truth[1])
@@ -104,7 +105,7 @@ def test_evo_reads_the_trajectory(estimate, truth, tmp_path):
 
 
 def test_mcap_holds_poses_and_values(estimate, truth, tmp_path):
-    reader = pytest.importorskip("mcap.reader")
+    reader = importlib.import_module("mcap.reader")
     convert(estimate, tmp_path / "out.mcap", "joint-inertial")
     with (tmp_path / "out.mcap").open("rb") as file:
         messages = [(s.name, m.log_time, json.loads(m.data)) for s, _, m in reader.make_reader(file).iter_messages()]
@@ -118,7 +119,7 @@ def test_mcap_holds_poses_and_values(estimate, truth, tmp_path):
 
 
 def test_parquet_is_the_same_table(estimate, tmp_path):
-    pq = pytest.importorskip("pyarrow.parquet")
+    pq = importlib.import_module("pyarrow.parquet")
     convert(estimate, tmp_path / "out.parquet")
     own, found = read_table(estimate), read_table(tmp_path / "out.parquet", "estimate")
     assert (found.kind, found.metadata, found.closing) == (own.kind, own.metadata, own.closing)

@@ -30,6 +30,11 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     ),
     errors.FilterCannotRun: lambda e: cure(e.reason),
     errors.NoFilterRuns: lambda e: "; ".join(dict.fromkeys(filter(None, map(cure, e.reasons.values())))),
+    errors.MissingMap: lambda e: "add --map MAP.yaml",
+    errors.MissingBeacons: lambda e: "add --beacons BEACONS.csv",
+    errors.MissingStart: lambda e: "add --start X,Y,HEADING (m, m, rad)",
+    errors.NothingToEstimate: lambda e: "leave out --estimate",
+    errors.NeedsScans: lambda e: "use --filter ekf",
     errors.NotPositiveDefinite: lambda e: (
         "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
     ),

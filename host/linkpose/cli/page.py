@@ -1,4 +1,4 @@
-"""The page of `estimate --live`, `record` and `plot` with `--view`."""
+"""The page of `estimate --live` and `plot` with `--view`."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, NotPositiveDefinite
 from linkpose.localization import models
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.gate import chi_square_quantile
@@ -153,10 +153,7 @@ class KalmanFilter:
         else:
             sound = ukf_step(*arguments, self.transform.alpha, self.transform.beta, self.transform.kappa)
         if not sound:
-            raise LinkposeError(
-                f"the {self.name}'s covariance is no longer positive definite; "
-                "give larger noises (--range-std, --speed-std, --turn-std) or a larger --alpha"
-            )
+            raise NotPositiveDefinite("covariance", f"the filter {self.name}")
         self.d2 = d2
         return np.asarray(d2 <= threshold)
 

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, MissingBeacons, MissingMap, MissingStart, NeedsScans, NothingToEstimate
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import GridMap, no_map
@@ -270,20 +270,20 @@ def check(
     if not log:
         raise LinkposeError(f"{origin} holds no measurements; record some first")
     if "scan" in kinds and grid is None:
-        raise LinkposeError(f"{origin} holds laser scans, which need the map they were taken in; add --map MAP.yaml")
+        raise MissingMap(origin)
     if kinds & set(NAMED) and not beacons:
-        raise LinkposeError(f"{origin} holds ranges to beacons, whose places must be known; add --beacons BEACONS.csv")
+        raise MissingBeacons(origin)
     if kinds & {"odometry", "twist"} and kinds & DIVING:
         raise LinkposeError(
             f"{origin} mixes a robot's odometry with a vehicle's {' and '.join(sorted(kinds & DIVING))}; "
             "delete the rows of the one or of the other"
         )
     if settings.estimate and not kinds & set(NAMED):
-        raise LinkposeError(f"{origin} holds no range rows from which a scale or bias follows; leave out --estimate")
+        raise NothingToEstimate(origin)
     if name == "mcl" and "scan" not in kinds:
-        raise LinkposeError(f"{origin} holds no laser scans, which --filter mcl needs; use --filter ekf")
+        raise NeedsScans(origin, name)
     if not _has_start(log, name, settings, beacons, kinds):
-        raise LinkposeError("the log does not state where the robot starts; add --start X,Y,HEADING (m, m, rad)")
+        raise MissingStart
     for event in log:
         if isinstance(event, Event) and event.kind in NAMED and event.beacon not in beacons:
             raise LinkposeError(

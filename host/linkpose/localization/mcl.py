@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from linkpose.compiling import compiled
-from linkpose.errors import LinkposeError
+from linkpose.errors import MissingStart
 from linkpose.localization import models
 from linkpose.localization.distance_field import DistanceField, Field, distance_at
 from linkpose.localization.events import Event, Log, Scan
@@ -33,11 +33,11 @@ UPDATE_M, UPDATE_RAD = 0.2, math.pi / 6
 
 
 def localize_mcl(log: Log, settings: Settings, grid: GridMap) -> Track:
-    """Runs a particle filter over the odometry and the scans of a log. Raises LinkposeError without a start."""
+    """Runs a particle filter over the odometry and the scans of a log. Raises MissingStart."""
     prior = first_pose(log)
     start = settings.start or (prior.values if prior else None)
     if start is None:
-        raise LinkposeError("--filter mcl needs the pose at the start; add --start X,Y,HEADING (m, m, rad)")
+        raise MissingStart
     rng = np.random.default_rng(settings.seed)
     spread = (settings.start_std[0], settings.start_std[0], settings.start_std[1])
     particles = np.asarray(start, dtype=np.float64) + rng.normal(0.0, spread, (settings.particles, 3))

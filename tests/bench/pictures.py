@@ -1,0 +1,66 @@
+"""Makes the pictures of README.md: the page in a browser (page.png) and the terminal view (terminal.svg).
+
+`python tests/bench/pictures.py` writes them into host/docs/img; it needs the Debian package chromium.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from rich.console import Console
+
+import linkpose as lp
+from linkpose.cli.view import Screen
+from linkpose.estimation import Estimates
+from linkpose.page import Page, Status
+from linkpose.presentation import RowReader
+from linkpose.simulation.link import PAPER_J2S_M, simulate
+
+ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "host" / "docs" / "img"
+FILTERS = ["joint-inertial", "joint", "tilt"]
+TITLE = "sim://link  J2S 1.653 m"
+HEALTH: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": "ok"}, "baro": {"state": "ok"}})
+
+
+def draw_terminal(estimates: Estimates) -> None:
+    """The terminal view at 80 × 24 after the last row."""
+    rows = RowReader(estimates.columns)
+    screen = Screen(TITLE, rows.filters)
+    for row in estimates.values.tolist():
+        screen.add(row[0], rows.read(row))
+    with Path("/dev/null").open("w") as nowhere:
+        console = Console(record=True, width=80, file=nowhere)
+        console.print(screen.render(HEALTH, 80, 24))
+    console.save_svg(str(IMAGES / "terminal.svg"), title="linkpose estimate --live")
+
+
+def draw_page(estimates: Estimates) -> None:
+    """The page after the last row, without viser's remark on a computer without a graphics card."""
+    sys.path.insert(0, str(ROOT / "tests" / "host"))
+    from browser import Browser
+
+    with Page(estimates.columns, estimates.rig, "sim://link", on_mark=print) as page, Browser(1120, 720) as browser:
+        page.show(estimates.values[::5], lambda: Status(HEALTH))
+        browser.open(page.url)
+        browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
+        time.sleep(5)  # the scene fades in
+        remark = "document.querySelector('.mantine-Notification-root')"
+        browser.evaluate(f"{remark} && {remark}.remove()")
+        browser.screenshot(IMAGES / "page.png")
+
+
+def main() -> None:
+    """Both pictures, of 25 s of the simulated link."""
+    measurements = simulate(1, 0, 25.0).measurements()
+    estimates = lp.estimate(measurements, FILTERS, j2s_m=PAPER_J2S_M)
+    draw_terminal(estimates)
+    draw_page(estimates)
+
+
+if __name__ == "__main__":
+    main()
