@@ -15,6 +15,7 @@ import pytest
 
 import linkpose as lp
 from linkpose import errors
+from linkpose.filters.joint import JointFilter
 from linkpose.sensors.rig import Mouse, Rig
 
 HOST = Path(__file__).parents[2] / "host"
@@ -46,6 +47,9 @@ def test_estimates_are_reached_by_column_and_by_filter(swing: Path, tmp_path: Pa
         estimates.joint  # noqa: B018
     with pytest.raises(AttributeError, match="there are height_m"):
         estimates.tilt.heigth_m  # noqa: B018
+    frame = estimates.to_pandas()
+    assert tuple(frame.columns) == estimates.columns and len(frame) == 50
+    np.testing.assert_array_equal(frame["tilt_height_m"].to_numpy(), estimates["tilt_height_m"])
     estimates.save(tmp_path / "heights.csv")
     with pytest.raises(errors.FileExists):
         estimates.save(tmp_path / "heights.csv")
@@ -79,6 +83,9 @@ def test_errors_carry_their_facts(swing: Path, tmp_path: Path) -> None:
     with pytest.raises(errors.FilterCannotRun) as absent:
         lp.estimate(still, filters=["baro"])
     assert isinstance(absent.value.reason, errors.SensorMissing)
+    with pytest.raises(errors.MissingJ2S) as direct:  # the class without the registry
+        JointFilter(lp.Rig())
+    assert direct.value.filter == "joint"
     with pytest.raises(errors.UnknownFilter, match="did you mean tilt") as unknown:
         lp.create_filter("tlit", lp.Rig())
     assert unknown.value.name == "tlit" and "tilt" in unknown.value.known

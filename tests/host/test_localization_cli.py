@@ -40,6 +40,12 @@ def dive(folder, linkpose):
     return log, folder / "dive_beacons.csv", truth
 
 
+def test_the_help_shows_ranges_without_an_open_end(linkpose):
+    text = linkpose("localize", "--help").out
+    assert "None" not in text
+    assert "x>0" in text and ">=0" in text
+
+
 def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
     log, grid, truth = indoor
     out = tmp_path / "path.csv"

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 
 # From the bottom up. A part imports parts of lower levels only; those of one level do not import each other, except as
-# listed. A string that names a module for import_module or pyserial counts as an import in the registries that use it.
+# listed. A string that names a module of linkpose, for import_module or for pyserial, counts as an import.
 LEVELS = [
     {"errors", "compiling", "quantities"},
-    {"wire"},
+    {"wire", "presentation"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},
     {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert"},
     {"board"},
     {"estimation"},
-    {"experiments", "plotting", "page", "streams"},
+    {"experiments", "plotting", "streams"},
+    {"page"},
     {"cli"},
 ]
 SAME_LEVEL = {
@@ -32,9 +36,13 @@ def level(part: str) -> int:
     return next((at for at, parts in enumerate(LEVELS) if part in parts), len(LEVELS))
 
 
-def imports(path: Path) -> Iterator[str]:
-    """The parts of linkpose that a module imports at run time, also inside functions."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+# A module name in a string: the whole string, or the constant beginning of an f-string.
+MODULE_NAME = re.compile(r"linkpose\.([a-z_0-9]+)(\.[a-z_0-9]*)*")
+
+
+def imports(source: str) -> Iterator[str]:
+    """The parts of linkpose that a module imports at run time, also inside functions and by name in a string."""
+    tree = ast.parse(source)
     typing_only = {
         id(inner)
         for node in ast.walk(tree)
@@ -52,6 +60,8 @@ def imports(path: Path) -> Iterator[str]:
                 parts = alias.name.split(".")
                 if parts[0] == "linkpose" and len(parts) > 1:
                     yield parts[1]
+        elif isinstance(node, ast.Constant) and (named := MODULE_NAME.fullmatch(str(node.value))):
+            yield named[1]
 
 
 def arrows() -> set[tuple[str, str]]:
@@ -60,8 +70,30 @@ def arrows() -> set[tuple[str, str]]:
         part = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         if part in ("__init__", "__main__"):
             continue
-        found |= {(part, other) for other in imports(path) if other not in (part, "__version__")}
+        found |= {
+            (part, other) for other in imports(path.read_text(encoding="utf-8")) if other not in (part, "__version__")
+        }
     return found
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import linkpose.cli.options",
+        "from linkpose import cli",
+        "from linkpose.cli import options",
+        "def late():\n    from linkpose.cli.options import port",
+        "import importlib\nimportlib.import_module('linkpose.cli.estimate')",
+        "import importlib\nimportlib.import_module(f'linkpose.cli.{name}')",
+        "register_scheme('linkpose.cli')",
+    ],
+)
+def test_every_form_of_import_is_found(source: str) -> None:
+    assert list(imports(source)) == ["cli"]
+
+
+def test_imports_for_types_only_are_left_out() -> None:
+    assert not list(imports("if TYPE_CHECKING:\n    from linkpose.cli import options"))
 
 
 def test_imports_point_downwards() -> None:
@@ -79,6 +111,11 @@ def test_every_part_has_its_level() -> None:
     assert parts <= set().union(*LEVELS)
 
 
-def test_device_names_no_upper_part() -> None:
-    for path in (PACKAGE / "device").glob("*.py"):
-        assert "linkpose.simulation" not in path.read_text(encoding="utf-8")
+def test_gravity_and_the_number_of_mouse_ports_stand_in_one_place() -> None:
+    constant = re.compile(r"9\.80665|\bM(?:OST|AX)_MICE = ")
+    found = sorted(
+        (path.relative_to(PACKAGE).as_posix(), match[0])
+        for path in PACKAGE.rglob("*.py")
+        for match in constant.finditer(path.read_text(encoding="utf-8"))
+    )
+    assert found == [("sensors/devices.py", "MAX_MICE = "), ("sensors/mpu6050.py", "9.80665")]

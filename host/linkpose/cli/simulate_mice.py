@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
+from linkpose.sensors.devices import MAX_MICE
 
 
 @click.command("mice")
@@ -15,7 +16,11 @@ from linkpose.cli import options
 @click.option("--duration", type=options.SecondsType(), default=60.0, show_default=True, help="Length in seconds.")
 @click.option("--rate", type=click.IntRange(50, 500), default=100, show_default=True, help="Samples per second.")
 @click.option(
-    "--mice", type=click.IntRange(1, 4), default=3, show_default=True, help="Number of mice, on a ring of 17 cm radius."
+    "--mice",
+    type=click.IntRange(1, MAX_MICE),
+    default=3,
+    show_default=True,
+    help="Number of mice, on a ring of 17 cm radius.",
 )
 @click.option("--resolution", type=click.IntRange(1, 40), default=8, show_default=True, help="Counts per mm.")
 @click.option(

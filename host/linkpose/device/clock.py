@@ -1,8 +1,8 @@
 """The board's clock, fitted to the host's.
 
-The UNO runs on a ceramic resonator, which may be off by half a per cent, and its clock starts anew at every reset. PING
-and PONG tell both clocks at nearly one instant: the round trip bounds the error. A Kalman filter over (offset, drift)
-weighs each by its round trip and passes over those that a busy host delayed.
+The UNO runs on a ceramic resonator, which may deviate by 0.5 %, and its clock restarts at zero after every reset. PING
+and PONG sample both clocks almost simultaneously, and the round-trip time bounds the error. A Kalman filter over
+(offset, drift) weights each reading by its round-trip time and rejects readings that a busy host delayed.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ DRIFT_LIMIT = 0.01  # no UNO is as far off; a simulated board that runs faster t
 ROUND_TRIP_FLOOR_S = 2e-4  # standard deviation of the middle of even the shortest round trip,
 UNEVEN = 0.1  # and as a share of it: the way there and the way back differ
 GATE = 4.0  # standard deviations
-SLEW_TIME_S = 5.0  # over which the output takes up what the fit has learnt
+SLEW_TIME_S = 5.0  # time constant of the output towards the fit; doubled, a correction takes twice as long
 SLEW_LIMIT = 1e-3
-PATIENCE = 5  # readings out of the gate in a row before the fit is believed to be wrong
+PATIENCE = 5  # consecutive rejected readings after which the fit is reopened
 
 
 class DeviceClock:
@@ -49,12 +49,12 @@ class DeviceClock:
         return float(1e6 * self._var[2] ** 0.5)
 
     def unwrap(self, t_us: int, host_s: float) -> int:
-        """The board's time without its wraps: the one nearest to what the host's clock makes likely."""
+        """The unwrapped board time (µs) that is closest to the prediction from the host's clock."""
         likely = self._epoch_us + (host_s - self._host_s) * 1e6 if self.ready else t_us
         return t_us + round((likely - t_us) / WRAP_US) * WRAP_US
 
     def pong(self, t_us: int, sent_s: float, received_s: float) -> None:
-        """Learns from a PING sent and its PONG received at these host times."""
+        """Updates the fit with a PING sent and its PONG received at these host times (s)."""
         round_trip = received_s - sent_s
         self._shortest_s = min(self._shortest_s, round_trip)
         noise = (ROUND_TRIP_FLOOR_S + UNEVEN * round_trip + (round_trip - self._shortest_s) / 2) ** 2
@@ -82,13 +82,13 @@ class DeviceClock:
         total = offset + noise
         if innovation * innovation > GATE * GATE * total:
             self._refused += 1
-            if self._refused >= PATIENCE:  # the fit, not the readings: open it again
+            if self._refused >= PATIENCE:  # the fit is wrong, not the readings
                 self._var = [offset + innovation * innovation, cross, max(rate, DRIFT_PRIOR**2)]
                 self._refused = 0
             return
         self._refused = 0
         if abs(self._rate + cross / total * innovation) > DRIFT_LIMIT:
-            return  # not a resonator's: keep the board's own seconds
+            return  # implausible for a resonator: keep the board's own seconds
         self._offset_s += offset / total * innovation
         self._rate += cross / total * innovation
         self._var = [offset * noise / total, cross * noise / total, rate - cross * cross / total]

@@ -22,7 +22,7 @@ READ_SIZE = 4096
 
 
 class Disconnected(LinkposeError):
-    """The port has gone: the cable was pulled, or what was behind it has ended."""
+    """The port is gone: the cable was unplugged, or the program behind the port has ended."""
 
     def __init__(self, port: str, reason: Exception) -> None:
         super().__init__(f"{port} is gone ({reason}); check the cable and try again")
@@ -39,10 +39,10 @@ class Arrival:
 
 
 class Connection:
-    """A port that is read all the time, so that nothing is lost while the program is busy elsewhere.
+    """A port read continuously by a thread, so that no data are lost while the program is busy.
 
     The clock is `time.perf_counter` (`time.monotonic` steps by 15.6 ms on Windows before Python 3.13), or the port's
-    own where a simulated port brings one. `capture`, when given, gets every byte as it came.
+    own if a simulated port provides one. `capture` receives every byte unchanged.
     """
 
     def __init__(self, port: str, capture: BinaryIO | None = None) -> None:
@@ -71,7 +71,7 @@ class Connection:
             arrived.put(error)
 
     def send(self, message: Message) -> float:
-        """Sends a message; the time just before. Raises Disconnected."""
+        """Sends a message and returns the time just before (s). Raises Disconnected."""
         sent = self.now()
         try:
             self._port.write(encode(message))
@@ -80,13 +80,13 @@ class Connection:
         return sent
 
     def receive(self, timeout_s: float) -> Arrival | None:
-        """What arrived next, at most `timeout_s` from now; None when nothing did. Raises Disconnected."""
+        """The next arrival; None if there is none within `timeout_s`. Raises Disconnected."""
         try:
             item = self._arrived.get(timeout=timeout_s)
         except queue.Empty:
             return None
         if isinstance(item, Exception):
-            self._arrived.put(item)  # whoever asks again hears it again
+            self._arrived.put(item)  # a later call raises it again
             raise Disconnected(self._name, item) from item
         time_s, data = item
         if self._capture is not None:
@@ -97,7 +97,7 @@ class Connection:
         return Arrival(time_s, self.decoder.feed(data), data)
 
     def close(self) -> None:
-        """Lets the port go. Nothing is raised: the port may have gone already."""
+        """Closes the port. Errors are ignored because the port may be gone already."""
         self._closing = True
         with contextlib.suppress(Exception):
             self._port.cancel_read()

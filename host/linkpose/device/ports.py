@@ -209,7 +209,7 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
 
 
 def _why_not(name: str, error: Exception) -> PortError:
-    """The error that says why a port cannot be opened, from what the system or pyserial raised."""
+    """The PortError for an exception that the system or pyserial raised while opening a port."""
     code = getattr(error, "errno", None)
     text = str(error).lower()
     if code in (errno.ENOENT, errno.ENXIO) or "filenotfound" in text or "could not find" in text:
@@ -238,7 +238,7 @@ def _holder_unknowable() -> bool:
 
 
 def holder(name: str) -> str | None:
-    """The program that has the device open, as "name (process id)"; None if none is known.
+    """The program that has the device open, as "name (process id)"; None if it cannot be determined.
 
     Only Linux reports it, and only for processes that this user may inspect. Opening the port instead would reset the
     board.

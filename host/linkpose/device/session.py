@@ -71,7 +71,7 @@ class NotResumed(Disconnected):
 
 
 class AnotherBoard(BoardError):
-    """Another board answers at the port than the one that the recording began with."""
+    """A different board than at the start of the recording answers at the port."""
 
 
 class Placement(NamedTuple):
@@ -83,7 +83,7 @@ class Placement(NamedTuple):
 
 @dataclass(slots=True)
 class Health:
-    """How the link has fared so far."""
+    """Health of the connection so far."""
 
     samples: int
     lost: int
@@ -98,9 +98,9 @@ class Health:
 
 
 class Session:
-    """Talks to one board. A context manager: leaving it stops the stream and frees the port.
+    """A session with one board. As a context manager it stops the stream and closes the port on exit.
 
-    `notify` gets a line for the user whenever something happens that is no failure (cable pulled, board back).
+    `notify` receives a line for the user for each event that is not a failure (cable unplugged, board back).
     """
 
     def __init__(self, port: str, notify: Notify, capture: BinaryIO | None = None) -> None:
@@ -114,7 +114,7 @@ class Session:
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
-        self._mouse_ports: int | None = None  # of the recording; None: not known yet
+        self._mouse_ports: int | None = None  # ports in the recording; None until wait_for_mice has run
         self._supply_reported = False
         self._started: Arrival | None = None  # what came together with the ACK of START
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
@@ -173,12 +173,12 @@ class Session:
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
-                    connection.decoder.corrupt = Corrupt()  # what was heard until now is no part of the session
+                    connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
         raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
-        """Gives sensors that are being set up the time for it; the latest HELLO."""
+        """Waits for sensors that are being set up and returns the latest HELLO."""
         deadline = time.perf_counter() + SENSORS_TIMEOUT_S
         while any(device.state == DeviceState.STARTING for device in hello.devices):
             if time.perf_counter() > deadline:
@@ -220,14 +220,14 @@ class Session:
     def wait_for_mice(self, count: int) -> None:
         """Wait until no mouse is being set up and `count` ports have mice, for at most MICE_TIMEOUT_S.
 
-        The ports known afterwards are those of the recording; a mouse at another port is reported when it appears.
+        The recording then has the ports found; a mouse that appears later at another port is reported.
         """
         deadline = time.perf_counter() + MICE_TIMEOUT_S
-        told = False
+        notified = False
         while self._mice_missing(count) and time.perf_counter() < deadline:
-            if not told:
+            if not notified:
                 self.notify("Waiting for the mice, which are being set up or have not been found yet")
-                told = True
+                notified = True
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")

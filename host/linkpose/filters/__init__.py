@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import CannotRun, MissingJ2S, SensorMissing, UncertainJ2S, UnknownFilter
-from linkpose.sensors.devices import Sensors
+from linkpose.sensors.devices import MAX_MICE, Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 
 Floats = NDArray[np.float64]
 
 ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180
-MOST_MICE = 4  # the firmware's ports
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +99,7 @@ class FindsJ2s(Protocol):
         """J2S so far, and its covariance: (3,) m, (3, 3) m²."""
 
 
-def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MOST_MICE) -> Filter:
+def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_MICE) -> Filter:
     """A fresh filter for measurements of these sensors and of mice at ports 1 to `mice`.
 
     Raises CannotRun where the rig or the sensors do not allow it, UnknownFilter for no such name.

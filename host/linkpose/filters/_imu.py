@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._vector import Vec
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu
 from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
 
-GRAVITY = 9.80665  # m/s²
+GRAVITY = STANDARD_GRAVITY  # m/s²
 # The slowest sampling is 50 Hz. Over a longer step, or where the gyro is of no use, the rotation is partly a guess.
 LONGEST_STEP_S = 0.025
 LONGEST_GAP_S = 2.0  # beyond this nothing of the attitude is left to remember

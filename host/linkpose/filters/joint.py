@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
+from linkpose.errors import MissingJ2S
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
 from linkpose.filters._vector import Sym, Vec
@@ -71,8 +72,9 @@ class JointFilter:
     columns = ("joint_height_m", "joint_height_std_m", "joint_roll_deg", "joint_pitch_deg")
 
     def __init__(self, rig: Rig, parameters: TiltParameters | None = None) -> None:
-        """The rig must know J2S."""
-        assert rig.joint.j2s_m is not None
+        """Raises MissingJ2S if the rig has no J2S (the vector from the joint centre to the sensor)."""
+        if rig.joint.j2s_m is None:
+            raise MissingJ2S(self.name)
         self.parameters = parameters or TiltParameters()
         self.state = TiltState.fresh()
         self._history = History.fresh()

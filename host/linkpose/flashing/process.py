@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Callable, Sequence
+from typing import IO, cast
 
 
 def follow(command: Sequence[str], environment: dict[str, str] | None, show: Callable[[str], None]) -> tuple[int, str]:
@@ -23,10 +24,9 @@ def follow(command: Sequence[str], environment: dict[str, str] | None, show: Cal
         stderr=subprocess.STDOUT,
         start_new_session=True,  # Ctrl-C reaches linkpose only, and the children can be ended together
     )
-    assert process.stdout is not None
     output = ""
     try:
-        with process.stdout as stdout:
+        with cast(IO[bytes], process.stdout) as stdout:  # Popen opens it for PIPE
             while chunk := os.read(stdout.fileno(), 4096):
                 text = chunk.decode("utf-8", "replace")
                 output += text

@@ -13,6 +13,7 @@ from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
+from linkpose.sensors.devices import MAX_MICE
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from linkpose.localization.grid import GridMap
 
 _MARKS = 12  # heading ticks and ellipses along a path
-_MOST_MICE = 4
 _MOST_CELLS = 3000  # of a map, along a side
 
 TimePanel = tuple[float, Callable[["Axes"], None]]
@@ -174,7 +174,7 @@ def _mice(axes: Axes, track: Track) -> None:
     """A bar for each stretch in which a mouse was left out."""
     bits = np.nan_to_num(track.values[EXCLUDED]).astype(np.int64)
     shown = max(int(bits.max()).bit_length(), 1)
-    for mouse in range(min(shown, _MOST_MICE)):
+    for mouse in range(min(shown, MAX_MICE)):
         out = (bits >> mouse & 1).astype(np.int8)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], out, [0]]))).reshape(-1, 2)
         last = len(out) - 1

@@ -1,4 +1,4 @@
-"""Reads recordings, a CSV or a raw capture, into the measurements that filters take."""
+"""Reads recordings, a CSV or a raw capture, and returns measurements for the filters."""
 
 from __future__ import annotations
 
@@ -20,13 +20,12 @@ from linkpose.sensors import mpu6050
 from linkpose.sensors.conversion import (
     COUNT_FIELDS,
     GAP_BEFORE,
-    MAX_MICE,
     TIME_DECIMALS,
     BoardSettings,
     Converter,
     RawSamples,
 )
-from linkpose.sensors.devices import impossible
+from linkpose.sensors.devices import MAX_MICE, impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap
@@ -47,16 +46,16 @@ class Recording:
 
     path: Path
     measurements: Measurements
-    rig: Rig | None  # the one in force while it was recorded; None of a raw capture
+    rig: Rig | None  # in force during the recording; None for a raw capture
     sample_rate_hz: float
     metadata: dict[str, Any]
-    remarks: list[str]  # what the reader should know: a cut file, corrupt frames, faulty sensors
+    remarks: list[str]  # anomalies, one sentence each: a truncated file, corrupt frames, faulty sensors
     health: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts by sensor (sensors.health)
-    unusable: str = ""  # why nothing can be estimated from it
+    unusable: str = ""  # why no filter can use the recording; "" if one can
 
     @property
     def dlpf(self) -> int | None:
-        """The MPU-6050's low-pass setting (DLPF_CFG, 0 to 6) in force; None where the file does not say."""
+        """The MPU-6050's low-pass setting (DLPF_CFG, 0 to 6) in force; None if the file does not contain it."""
         settings = self.metadata.get("settings")
         value = settings.get("dlpf") if isinstance(settings, dict) else None
         return value if isinstance(value, int) and 0 <= value < len(mpu6050.DLPF_DELAY_S) else None
@@ -72,7 +71,7 @@ def load_recording(path: str | PathLike[str]) -> Recording:
 
 
 def _checked(recording: Recording) -> Recording:
-    """The recording with NaN for readings that are worth nothing, and what is wrong with them."""
+    """The recording with unusable readings replaced by NaN and the faults listed in `remarks`."""
     from linkpose.sensors.health import HealthMonitor
 
     monitor = HealthMonitor(recording.sample_rate_hz, dict.fromkeys(_sensors_in(recording), "ok"))
@@ -92,7 +91,7 @@ def _checked(recording: Recording) -> Recording:
 
 
 def _sensors_in(recording: Recording) -> list[str]:
-    """Sensors that the metadata lists, and those that gave a value."""
+    """Sensors that the metadata lists or that have at least one value."""
     listed, block = recording.metadata.get("sensors"), recording.measurements
     names = listed if isinstance(listed, list) else []
     sensors = ["imu"] if "mpu6050" in names or np.isfinite(block.accel_m_s2).any() else []
@@ -158,7 +157,7 @@ def _check_columns(table: Table) -> int:
 
 
 def _other_sensors(table: Table) -> dict[str, Any]:
-    """The measurements of a second inertial sensor and a magnetometer, where the file has their columns."""
+    """Measurements of a second inertial sensor and a magnetometer, if the file has their columns."""
     fields: dict[str, Any] = {}
     if columns.GYRO2[0] in table.columns:
         table.require(*columns.ACCEL2, *columns.GYRO2)
@@ -182,7 +181,7 @@ def _vectors(table: Table, names: tuple[str, ...]) -> Floats:
 
 
 def _fresh(table: Table) -> NDArray[np.bool_]:
-    """As the file says, or where the pressure changes in a file that does not say."""
+    """Column `baro_fresh`; without this column, the samples at which the pressure changes."""
     if "baro_fresh" in table.columns:
         fresh = table.columns["baro_fresh"]
         wrong = np.flatnonzero(~np.isin(fresh, (0, 1)) & ~np.isnan(fresh))
@@ -202,7 +201,7 @@ def _mice(table: Table, ports: int) -> Floats:
 
 
 def _flags(table: Table) -> NDArray[np.uint32]:
-    """As the file says; where it does not, what is there is valid."""
+    """Column `flags`; without this column, every value that is present is valid."""
     if "flags" not in table.columns:
         imu = np.isfinite(_vectors(table, columns.ACCEL + columns.GYRO)).all(axis=1)
         return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint32)
@@ -217,7 +216,7 @@ def _flags(table: Table) -> NDArray[np.uint32]:
 
 
 def _metadata_object(table: Table, name: str) -> dict[str, Any]:
-    """This part of the metadata, empty where there is none; raises FileFormatError where it is no object."""
+    """One object of the metadata, empty if absent. Raises FileFormatError if it is not an object."""
     part = table.metadata.get(name, {})
     if not isinstance(part, dict):
         raise FileFormatError(
@@ -295,7 +294,7 @@ def _from_capture(path: Path) -> Recording:
 def _times(raw: NDArray[np.void], restarts: list[int], rate_hz: float) -> tuple[Floats, NDArray[np.int64], list[Gap]]:
     """Board time from 0 over its wraps, the flag of samples after a gap, and the gaps.
 
-    After a restart nobody knows how long the board was away: the next sample follows one interval later, marked.
+    The duration of a restart is unknown. The next sample is placed one interval later and flagged.
     """
     t_us, seq = raw["t_us"].astype(np.int64), raw["seq"].astype(np.int64)
     step_us = np.diff(t_us, prepend=t_us[:1]) % _T_WRAP

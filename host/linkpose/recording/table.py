@@ -32,7 +32,7 @@ class Table:
     metadata: dict[str, Any]
     closing: dict[str, Any] | None  # None: the file was cut, or never closed
     first_line: int  # line number of the first row
-    remarks: tuple[str, ...] = ()  # what the reader should know
+    remarks: tuple[str, ...] = ()  # anomalies, one sentence each
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -184,7 +184,7 @@ def _head_lines(data: bytes) -> tuple[int, int, list[str]]:
 
 
 def _kind(path: Path, comments: list[str]) -> str:
-    """What the first line says that the file is; raises FileFormatError for another version of the format."""
+    """The kind of file in the first line. Raises FileFormatError for another version of the format."""
     words = comments[0].split() if comments else []
     if len(words) != 3 or words[0] != "linkpose":
         return ""

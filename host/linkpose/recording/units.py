@@ -8,10 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
-_GRAVITY_M_S2 = 9.8
 _AIR_PA = 1e5
-_ACCEL_UNITS = (("g", "9.80665"), ("thousandths of g", "0.00980665"), ("mm/s²", "0.001"))
+_ACCEL_UNITS = (
+    ("g", f"{STANDARD_GRAVITY}"),
+    ("thousandths of g", f"{STANDARD_GRAVITY / 1000:.8f}"),
+    ("mm/s²", "0.001"),
+)
 _GRAVITY_TOLERANCE = 0.2  # the MPU-6050's offset and scale error at the worst: 0.08 g, 3 % (data sheet)
 _STILL_RAD_S = 0.3
 _FEWEST_STILL = 50  # samples
@@ -24,12 +28,12 @@ _LONGEST_STEP_S = 0.5
 
 
 def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = None) -> list[str]:
-    """What the values of a recording look like, and the cure; nothing where they can be in SI units.
+    """One sentence, with its cure, for each quantity whose values are implausible in the unit of its column.
 
     `rate_hz` is the sample rate in the file's metadata, if it has one.
     """
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
-    unit = _of_usual_size("accel_*", _median(force_m_s2), _GRAVITY_M_S2, _ACCEL_UNITS)
+    unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     found = [
         unit or _gravity(force_m_s2, measurements.gyro_rad_s),
         _rate(measurements.gyro_rad_s) or _turning(measurements),
@@ -40,21 +44,21 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
 
 
 def _gravity(force_m_s2: Floats, gyro_rad_s: Floats) -> str:
-    """The specific force at rest is gravity's. Twice or half of it: another range was in force than is assumed."""
+    """A remark if the specific force at rest is not gravity. A factor of two means that another range was in force."""
     still = (np.linalg.norm(gyro_rad_s, axis=1) < _STILL_RAD_S) & np.isfinite(force_m_s2)
     if np.count_nonzero(still) < _FEWEST_STILL:
         return ""
     force = float(np.median(force_m_s2[still]))
-    if abs(force / _GRAVITY_M_S2 - 1) < _GRAVITY_TOLERANCE:
+    if abs(force / STANDARD_GRAVITY - 1) < _GRAVITY_TOLERANCE:
         return ""
     return (
-        f"accel_* is {force:.3g} m/s² while the sensor is still, and gravity is {_GRAVITY_M_S2:g}: check the range "
-        "(accel_range_g) and the unit, or the sensor is faulty"
+        f"accel_* is {force:.3g} m/s² while the sensor is still, and gravity is {STANDARD_GRAVITY:.2g}: check the "
+        "range (accel_range_g) and the unit, or the sensor is faulty"
     )
 
 
 def _turning(measurements: Measurements) -> str:
-    """Gravity turns in the sensor's axes as the gyro measures, da/dt = −ω × a: the ratio is the gyro's unit."""
+    """A remark if the rotation of gravity in the sensor's axes, da/dt = −ω × a, contradicts the gyro's unit."""
     steps = np.diff(measurements.time_s)
     step_s = _median(steps[steps > 0])
     size = max(1, round(_BLOCK_S / step_s)) if np.isfinite(step_s) else 1
@@ -94,7 +98,7 @@ def _median(values: Floats) -> float:
 
 def _rate(gyro_rad_s: Floats) -> str:
     rates = np.abs(gyro_rad_s[np.isfinite(gyro_rad_s)])
-    if np.count_nonzero(rates > _FASTEST_RAD_S) <= 0.001 * len(rates):  # a spike is none
+    if np.count_nonzero(rates > _FASTEST_RAD_S) <= 0.001 * len(rates):  # single spikes are not a wrong unit
         return ""
     return (
         f"gyro_* is up to {rates.max():.0f} rad/s, more than the sensor reads: is it in °/s? "

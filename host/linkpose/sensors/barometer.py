@@ -28,7 +28,7 @@ class Barometer(NamedTuple):
 
     @property
     def is_sound(self) -> bool:
-        """Whether a known barometer is fitted and its calibration was read."""
+        """Whether a supported barometer is fitted and its calibration was read."""
         if self.family == DeviceFamily.BMP280:
             return self.words[0] not in (0, 0xFFFF) and self.words[3] not in (0, 0xFFFF)
         return self.family == DeviceFamily.BMP180 and bmp180.is_sound(bmp180.Calibration.of(self.words))

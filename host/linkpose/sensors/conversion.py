@@ -6,7 +6,6 @@ in a replay of the recording, to the last bit.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from linkpose.sensors import magnetometer, mpu6050
 from linkpose.sensors.barometer import Barometer
 from linkpose.sensors.bmp180 import PRESSURE_DECIMALS, TEMPERATURE_DECIMALS
+from linkpose.sensors.devices import MAX_MICE, MOUSE_VALID
 from linkpose.sensors.measurements import Block, Floats, Measurements
 from linkpose.wire.messages import DeviceFamily, DeviceState, Hello, Sample, SampleFlags
 
@@ -28,9 +28,7 @@ IMU_VALID = int(SampleFlags.IMU_VALID)
 BARO_VALID = int(SampleFlags.BARO_VALID)
 IMU2_VALID = int(SampleFlags.IMU2_VALID)
 MAG_VALID = int(SampleFlags.MAG_VALID)
-MOUSE_VALID = tuple(int(flag) for flag in SampleFlags if re.fullmatch(r"MOUSE\d_VALID", flag.name or ""))
 GAP_BEFORE = int(SampleFlags.GAP_BEFORE)
-MAX_MICE = len(MOUSE_VALID)  # mouse ports of the protocol
 
 COUNT_FIELDS = tuple(name for name in Sample._fields if name != "mice")  # columns of RawSamples.counts
 _IMU = slice(

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from enum import IntFlag
 from typing import NamedTuple
 
 from linkpose.errors import LinkposeError
-from linkpose.wire.messages import DeviceFamily, DeviceKind, DeviceState, Hello, HelloDevice, MouseLacks
+from linkpose.wire.messages import (
+    DeviceFamily,
+    DeviceKind,
+    DeviceState,
+    Hello,
+    HelloDevice,
+    MouseLacks,
+    SampleFlags,
+)
 
 
 class Sensors(IntFlag):
@@ -21,9 +30,12 @@ class Sensors(IntFlag):
 
 # Order of HELLO's and STATUS's devices.
 DEVICES = (Sensors.MPU6050, Sensors.IMU2, Sensors.BMP180, Sensors.MAG)
+# The flag of each mouse port, port 1 first. Their number is the largest number of mice that the protocol carries.
+MOUSE_VALID = tuple(int(flag) for flag in SampleFlags if re.fullmatch(r"MOUSE\d_VALID", flag.name or ""))
+MAX_MICE = len(MOUSE_VALID)
 _USABLE = (DeviceState.STARTING, DeviceState.OK, DeviceState.UNVERIFIED)
 
-# Known identification registers: chip, and what a user has to know of it.
+# Identification registers of supported chips.
 _IMUS = {
     0x68: "MPU-6050",
     0x70: "MPU-6500",
@@ -74,7 +86,7 @@ class Description(NamedTuple):
 
     chip: str  # what it is
     state: str  # "ok", "being set up", ...
-    remark: str  # what that means for the user; "" if nothing needs to be said
+    remark: str  # what the state means for the user; "" if no remark is needed
 
 
 _STATES = {

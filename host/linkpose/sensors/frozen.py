@@ -24,7 +24,7 @@ class FrozenDetector:
     def frozen(self, time_s: Floats, readings: Floats) -> NDArray[np.bool_]:
         """(N,) True where the readings (N, K) have repeated for FROZEN_S or more, at times (N,) s. NaN is not a repeat.
 
-        The first FROZEN_S of a freeze cannot be told from a slow logger and are not marked.
+        The first FROZEN_S of a freeze cannot be distinguished from a slow logger and are not marked.
         """
         n = len(time_s)
         if n == 0:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.sensors.devices import MAX_MICE
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.wire.messages import DeviceState, Hello, SampleFlags
 
@@ -230,7 +231,7 @@ def _imu_flags(number: str) -> _ImuFlags:
 
 
 _IMU_FLAGS, _IMU2_FLAGS = _imu_flags(""), _imu_flags("2")
-_MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in (1, 2, 3, 4)}
+_MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in range(1, MAX_MICE + 1)}
 
 
 class _Imu:
@@ -394,7 +395,7 @@ class HealthMonitor:
 
     @property
     def why_unusable(self) -> str:
-        """The sentence for data of which nothing can be used."""
+        """The sentence for data without any usable reading."""
         reasons = [
             f"{_title(name)} {_REASON[max(health.invalid, key=lambda cause: health.invalid[cause])]}"
             for name, health in self.sensors.items()

@@ -16,5 +16,5 @@ SCALES_UT = {
 
 
 def scale(family: int) -> float:
-    """µT per count of a family; NaN if the board has no magnetometer that is known."""
+    """µT per count of a family; NaN if the board has no supported magnetometer."""
     return SCALES_UT.get(DeviceFamily(family), float("nan"))

@@ -1,4 +1,4 @@
-"""Measurements in SI units: what the filters read, whatever they came from (port, recording, simulation)."""
+"""Measurements in SI units: the input of the filters, from a port, a recording or a simulation."""
 
 from __future__ import annotations
 

@@ -29,16 +29,16 @@ _GUESS_M = 0.1
 class Joint:
     """The joint of the link. J2S is the vector from the joint centre to the sensor."""
 
-    j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None: not known
+    j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None if unknown
     j2s_std_m: float = 0.0001  # its standard deviation, each axis (m)
 
     @property
     def known_j2s_m(self) -> Vector | None:
-        """J2S; None if it is not known, or only a first guess from which it is to be estimated."""
+        """J2S; None if it is unknown or only a first guess."""
         return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
 
 
-# A J2S of which nothing is known but that it is at most some metres long: the filter that can estimates it.
+# An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
 UNKNOWN_JOINT = Joint((0.0, 0.0, 0.0), 1.0)
 
 
@@ -58,7 +58,7 @@ class Imu:
 
     @property
     def known_delay_s(self) -> float:
-        """The delay; 0 if it is not known."""
+        """The delay (s); 0 if it is unknown."""
         return self.delay_s or 0.0
 
 

@@ -138,7 +138,7 @@ class Timeline:
     def _ticks(self, seq: int, elapsed: float) -> int:
         """Ticks from the last sample to the one of this seq, which came `elapsed` periods later.
 
-        The count says them up to 65536; the clock says how often it wrapped, and all of them after a restart.
+        seq gives the ticks modulo 65536; the clock gives the number of wraps and, after a restart, all ticks.
         """
         step = (seq - self._wire_seq) % _SEQ_WRAP
         if self._restarted or (step > elapsed + _SEQ_WRAP / 4 and step > 1):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError
 from linkpose.sensors.barometer import Barometer
 from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
-from linkpose.sensors.devices import Sensors
+from linkpose.sensors.devices import MAX_MICE, Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Mouse, Rig
@@ -32,7 +32,6 @@ Integers = NDArray[np.int64]
 PAPER_SIDE_M = 0.3
 PAPER_TWIST = (0.01, 0.01, 0.0)  # m/s, m/s, rad/s
 PAPER_NOISE_M_S = 0.0025
-MOST_MICE = 4  # the firmware's ports
 NOISE_S = 0.01  # for which a mouse's noise keeps its value
 _POLL_S = 0.0075  # that the firmware leaves the mice to answer, before it asks them again at a tick
 _TEMPERATURE_DEGC = 27.0
@@ -150,10 +149,10 @@ class MiceRun:
         self._track = Track(self._drive)
         self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
         self._place = np.array([(mouse.x_m, mouse.y_m) for mouse in mice])
-        off = np.random.default_rng([seed, _MOUNTING]).standard_normal((MOST_MICE, 2))[: len(mice)]
+        off = np.random.default_rng([seed, _MOUNTING]).standard_normal((MAX_MICE, 2))[: len(mice)]
         self.true_counts_per_m = np.array([m.counts_per_m for m in mice]) * (1 + self._mouse_errors.scale * off[:, 0])
         self.true_angle_deg = np.array([m.angle_deg for m in mice]) + self._mouse_errors.angle_deg * off[:, 1]
-        self._phase = np.random.default_rng([seed, _PHASE]).uniform(0, 1, (MOST_MICE, 2))[: len(mice)]
+        self._phase = np.random.default_rng([seed, _PHASE]).uniform(0, 1, (MAX_MICE, 2))[: len(mice)]
         self._noise_ways = [np.zeros((len(mice), 2))]  # what the noise has added up to at the start of each block
 
     @property
@@ -242,8 +241,8 @@ class MiceRun:
         vx, vy = v[:, None, 0] - v[:, None, 2] * self._place[:, 1], v[:, None, 1] + v[:, None, 2] * self._place[:, 0]
         speed = np.hypot(vx, vy)[:, :, None]
         rng = np.random.default_rng([self.seed, _SCATTER, block])
-        velocity = errors.scatter * speed * rng.standard_normal((_BLOCK, MOST_MICE, 2))[:, :mice]
-        velocity += errors.uniform_m_s * rng.uniform(-1, 1, (_BLOCK, MOST_MICE, 2))[:, :mice]
+        velocity = errors.scatter * speed * rng.standard_normal((_BLOCK, MAX_MICE, 2))[:, :mice]
+        velocity += errors.uniform_m_s * rng.uniform(-1, 1, (_BLOCK, MAX_MICE, 2))[:, :mice]
         common = np.random.default_rng([self.seed, _FLOOR, block]).standard_normal((_BLOCK, 1, 2))
         velocity += errors.floor * np.hypot(v[:, 0], v[:, 1])[:, None, None] * common
         return np.concatenate([np.zeros((1, mice, 2)), np.cumsum(velocity * NOISE_S, axis=0)])
@@ -323,7 +322,8 @@ def _drive(path: str, seed: int, duration_s: float | None, length_m: float) -> D
         return Steady(PAPER_TWIST)
     if path == "drive":
         return Manoeuvres((seed, _DRIVE))
-    assert duration_s is not None
+    if duration_s is None:
+        raise LinkposeError(f"the path {path!r} needs a duration")
     return Move((length_m, 0.0, 0.0) if path == "line" else (0.0, 0.0, 2 * math.pi), duration_s)
 
 
@@ -335,8 +335,8 @@ def _check(
         raise LinkposeError(f"the seed is {seed}: take a whole number from 0 up")
     if not 50 <= rate_hz <= 500:
         raise LinkposeError(f"the board samples at 50 to 500 Hz, not at {rate_hz:g} Hz")
-    if not 1 <= mice <= MOST_MICE:
-        raise LinkposeError(f"{mice} mice cannot be: the board serves 1 to {MOST_MICE}")
+    if not 1 <= mice <= MAX_MICE:
+        raise LinkposeError(f"{mice} mice cannot be: the board serves 1 to {MAX_MICE}")
     if path not in PATHS:
         raise LinkposeError(f"there is no path called {path!r}: take {', '.join(PATHS)}")
     if errors not in LEVELS:

@@ -246,7 +246,7 @@ class StreamDecoder:
     Whatever is not a frame is dropped and counted in `corrupt` by cause; the decoder is in step again at the next 0x00.
     Memory is bounded for any input.
 
-    `from_board` selects which side's messages are known; those of the other side count as of unknown type.
+    `from_board` selects which side's messages are decoded; messages of the other side count as unknown types.
     """
 
     def __init__(self, from_board: bool = True) -> None:
