@@ -342,3 +342,8 @@ def test_a_person_reads_one_device_a_line_with_units(linkpose):
     assert any(line.split() == ["sample", "rate", "100", "Hz"] for line in lines)
     assert any("MPU-6050 at 0x68 (id 0x68): ok" in line for line in lines)
     assert not any("0x69" in line for line in lines)
+
+
+def test_a_slower_bus_is_put_in_force(linkpose, tmp_path):
+    assert linkpose("record", tmp_path / "r.csv", "--port", SIM, "--duration", 0.2, "--i2c", 100).status == 0
+    assert len(read_table(tmp_path / "r.csv", "recording")) == 20

@@ -434,7 +434,7 @@ def test_without_j2s_the_reason_and_the_cure_are_named():
         filters.create("joint", Rig(joint=Joint((0.0, 0.0, 0.0), 1.0)))
     with pytest.raises(filters.CannotRun, match="BMP180"):
         filters.create("baro", Rig(), Sensors.MPU6050)
-    with pytest.raises(LinkposeError, match="joint, tilt"):
+    with pytest.raises(LinkposeError, match="did you mean joint"):
         filters.create("jiont", Rig())
 
 

@@ -35,6 +35,11 @@ _OPTIONS = {
     ),
     "--dlpf": ("dlpf", click.IntRange(0, 6), "The MPU-6050's low-pass filter, 0 (widest) to 6. Default: 3."),
     "--baro-oversampling": ("baro_oversampling", click.IntRange(0, 3), "The BMP180's oversampling. Default: 1."),
+    "--i2c": (
+        "i2c_khz",
+        ("100", "400"),
+        "Clock of the I2C bus (kHz); 100 for long wires, up to 125 Hz. Default: 400.",
+    ),
     "--mouse-resolution": ("mouse_counts_per_mm", ("1", "2", "4", "8"), "Counts per mm of the mice. Default: 8."),
 }
 
