@@ -43,7 +43,7 @@ def dive(folder, linkpose):
 def test_the_help_shows_ranges_without_an_open_end(linkpose):
     text = linkpose("localize", "--help").out
     assert "None" not in text
-    assert "x>0" in text and ">=0" in text
+    assert ">0]" in text and ">=0]" in text
 
 
 def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
