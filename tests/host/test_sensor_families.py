@@ -6,12 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors import bmp280, magnetometer, mpu6050
 from linkpose.sensors.barometer import Barometer
 from linkpose.sensors.devices import Sensors, check_hello, describe, found, names
 from linkpose.simulation import board
+from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.wire.messages import DeviceFamily, DeviceState, HelloMouse
 
 # BST-BMP280-DS001, 3.12.
@@ -96,3 +99,25 @@ def test_an_impossible_hello_is_refused(change, named):
     check_hello(board.hello(board.DEFAULTS))
     with pytest.raises(LinkposeError, match=named):
         check_hello(board.hello(board.DEFAULTS)._replace(**change))
+
+
+WORD = st.integers(-0x8000, 0x7FFF)
+
+
+@given(
+    words=st.tuples(*[WORD] * 11),
+    ut=st.integers(0, 0xFFFF),
+    up=st.integers(0, 0x7FFFF),
+    oversampling=st.integers(0, 3),
+)
+@example(words=tuple(DATASHEET_WORDS), ut=27898, up=23843, oversampling=0)
+@example(words=(1,) * 11, ut=1, up=0x7FFFF, oversampling=3)  # a divisor near 0: products beyond 64 bits
+@settings(max_examples=300, deadline=None)
+def test_a_reading_alone_gives_the_same_bits_as_in_a_block(words, ut, up, oversampling):
+    barometer = Barometer(DeviceFamily.BMP180, (*(word & 0xFFFF for word in words), 0), oversampling)
+    with np.errstate(all="ignore"):  # arrays hold meaningless numbers for words that no BMP180 has
+        alone = barometer.compensate(np.array([ut]), np.array([up]))
+        block = barometer.compensate(np.array([ut] * 2), np.array([up] * 2))
+    for one, two in zip(alone, block, strict=True):
+        assert one.shape == (1,) and one.dtype == two.dtype
+        assert one.tobytes() == two[:1].tobytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,14 @@ from linkpose.errors import InvalidValue
 from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
+
+
+@lru_cache(maxsize=16)
+def _absent(size: int) -> dict[str, NDArray[Any]]:
+    """Read-only values of sensors that are not there, for `size` samples: they share the memory of one number."""
+    shapes = {"accel2_m_s2": (size, 3), "gyro2_rad_s": (size, 3), "imu2_temp_degC": (size,), "mag_uT": (size, 3)}
+    values: dict[str, NDArray[Any]] = {name: np.broadcast_to(np.nan, shape) for name, shape in shapes.items()}
+    return values | {"mag_fresh": np.broadcast_to(np.False_, size)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +48,9 @@ class Measurements:
 
     def __post_init__(self) -> None:
         """Absent sensors become rows of NaN, without memory of their own."""
-        size = len(self.time_s)
-        absent = {"accel2_m_s2": (size, 3), "gyro2_rad_s": (size, 3), "imu2_temp_degC": (size,), "mag_uT": (size, 3)}
-        for name, shape in absent.items():
+        for name, values in _absent(len(self.time_s)).items():
             if getattr(self, name) is None:
-                object.__setattr__(self, name, np.broadcast_to(np.nan, shape))
-        if getattr(self, "mag_fresh") is None:  # noqa: B009
-            object.__setattr__(self, "mag_fresh", np.broadcast_to(np.False_, size))
+                object.__setattr__(self, name, values)
         if self.flags.dtype != np.uint32:  # one type: the filters are compiled for it
             object.__setattr__(self, "flags", self.flags.astype(np.uint32))
 
