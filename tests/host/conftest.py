@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
@@ -69,4 +70,4 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
         def cancel(self) -> None:
             """Too late."""
 
-    return lambda: monkeypatch.setattr(patience.threading, "Timer", OutOfPatience)
+    return lambda: monkeypatch.setattr(patience, "threading", SimpleNamespace(Timer=OutOfPatience))

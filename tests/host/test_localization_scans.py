@@ -103,7 +103,7 @@ def test_monte_carlo_localisation_is_seeded(drive):
     assert (tracks[0].state == tracks[1].state).all()
     assert (tracks[0].state != tracks[2].state).any()
     assert score_track(tracks[0], run.truth).position_rmse_m < 0.3
-    with pytest.raises(LinkposeError, match="--start X,Y,HEADING"):
+    with pytest.raises(LinkposeError, match="does not state where the robot starts"):
         localize(log, "mcl", Settings(), grid)
 
 
