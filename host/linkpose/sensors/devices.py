@@ -33,7 +33,8 @@ DEVICES = (Sensors.MPU6050, Sensors.IMU2, Sensors.BMP180, Sensors.MAG)
 # The flag of each mouse port, port 1 first. Their number is the largest number of mice that the protocol carries.
 MOUSE_VALID = tuple(int(flag) for flag in SampleFlags if re.fullmatch(r"MOUSE\d_VALID", flag.name or ""))
 MAX_MICE = len(MOUSE_VALID)
-_USABLE = (DeviceState.STARTING, DeviceState.OK, DeviceState.UNVERIFIED)
+# A sensor that failed answered once: its readings may be valid again at any moment.
+_USABLE = (DeviceState.STARTING, DeviceState.OK, DeviceState.UNVERIFIED, DeviceState.FAILED)
 
 # Identification registers of supported chips.
 _IMUS = {
