@@ -124,6 +124,83 @@ def test_the_firmware_s_causes_are_used(flag: SampleFlags, cause: Cause) -> None
     assert report["imu"]["invalid"] == {cause.label: 200}
 
 
+def with_everything() -> Measurements:
+    """Healthy measurements with a second inertial sensor and a QMC5883L of 75 Hz at rest."""
+    first, second = healthy(), healthy(seed=7)
+    fresh = np.arange(N) % 4 != 3
+    field = np.round(np.random.default_rng(8).normal((30.0, 0.0, -42.0), 0.2, (N, 3)) * 30) / 30
+    held = np.maximum.accumulate(np.where(fresh, np.arange(N), 0))
+    return replace(
+        first,
+        accel2_m_s2=second.accel_m_s2,
+        gyro2_rad_s=second.gyro_rad_s,
+        imu2_temp_degC=second.imu_temp_degC,
+        mag_uT=field[held],
+        mag_fresh=fresh,
+        flags=first.flags | np.uint32(SampleFlags.IMU2_VALID | SampleFlags.MAG_VALID),
+    )
+
+
+EVERYTHING = ALL_OK | {"imu2": "being set up", "mag": "being set up"}
+
+
+def test_a_second_imu_and_a_magnetometer_are_counted() -> None:
+    block = with_everything()
+    block.flags[10:15] |= int(SampleFlags.GYRO2_SATURATED | SampleFlags.MAG_SATURATED)
+    clean, changes, report = run(block, EVERYTHING)
+    assert not changes
+    assert clean is block
+    for name in ("imu2", "mag"):
+        assert report[name] == {"state": "ok", "samples": N, "valid": N, "invalid": {}, "saturated": 5}
+    assert report["imu"]["saturated"] == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "cause", "latest_s"),
+    [
+        (np.zeros(6), Cause.BLANK, 0.0),
+        (np.full(6, np.nan), Cause.SILENT, 0.0),
+        ((0.1, 0.2, 9.8, 0.0, 0.001, 0.0), Cause.FROZEN, 0.21),
+    ],
+    ids=["zeros", "missing", "frozen"],
+)
+def test_a_faulty_second_imu_does_not_touch_the_first(values: object, cause: Cause, latest_s: float) -> None:
+    block = with_everything()
+    block.accel2_m_s2[100:300], block.gyro2_rad_s[100:300] = np.asarray(values)[:3], np.asarray(values)[3:]
+    clean, [fault, back], report = run(block, EVERYTHING)
+    assert (fault.sensor, fault.cause, back.cause) == ("imu2", cause, Cause.OK)
+    assert 1.0 <= fault.time_s <= 1.0 + latest_s + 1e-9
+    bad = np.isnan(clean.gyro2_rad_s).all(axis=1) & np.isnan(clean.accel2_m_s2).all(axis=1)
+    assert bad[100 + round(latest_s * RATE_HZ) : 300].all() and not bad[300:].any()
+    assert not (clean.flags[bad] & int(SampleFlags.IMU2_VALID)).any()
+    assert report["imu2"]["invalid"] == {cause.label: int(bad.sum())}
+    assert clean.accel_m_s2 is block.accel_m_s2
+
+
+@pytest.mark.parametrize(
+    ("field", "fresh", "cause", "latest_s"),
+    [
+        (np.zeros(3), True, Cause.BLANK, 0.0),
+        (np.full(3, np.nan), False, Cause.SILENT, 0.0),
+        (np.array([30.0, 0.1, -42.0]), True, Cause.FROZEN, 0.51),
+        (np.array([30.0, 0.1, -42.0]), False, Cause.FROZEN, 1.01),
+    ],
+    ids=["zeros", "missing", "frozen", "no new reading"],
+)
+def test_a_faulty_magnetometer_is_left_out_counted_and_reported(
+    field: np.ndarray, fresh: bool, cause: Cause, latest_s: float
+) -> None:
+    block = with_everything()
+    block.mag_uT[100:300], block.mag_fresh[100:300] = field, fresh
+    clean, [fault, back], report = run(block, EVERYTHING)
+    assert (fault.sensor, fault.cause, back.cause) == ("mag", cause, Cause.OK)
+    assert 1.0 <= fault.time_s <= 1.0 + latest_s + 1e-9
+    bad = np.isnan(clean.mag_uT).all(axis=1)
+    assert bad[100 + round(latest_s * RATE_HZ) : 300].all() and not bad[300:].any()
+    assert not clean.mag_fresh[bad].any()
+    assert report["mag"]["invalid"] == {cause.label: int(bad.sum())}
+
+
 @pytest.mark.parametrize("pressure", [500.0, 200_000.0, np.inf])
 def test_one_impossible_pressure_is_left_out_and_only_counted(pressure: float) -> None:
     clean, changes, report = run(between(99, 102, None, pressure_Pa=pressure))

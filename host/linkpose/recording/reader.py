@@ -95,7 +95,9 @@ def _sensors_in(recording: Recording) -> list[str]:
     listed, block = recording.metadata.get("sensors"), recording.measurements
     names = listed if isinstance(listed, list) else []
     sensors = ["imu"] if "mpu6050" in names or np.isfinite(block.accel_m_s2).any() else []
+    sensors += ["imu2"] if "imu2" in names or block.has_imu2 else []
     sensors += ["baro"] if "bmp180" in names or np.isfinite(block.pressure_Pa).any() else []
+    sensors += ["mag"] if "mag" in names or block.has_mag else []
     counted = np.isfinite(block.mice_counts).any(axis=(0, 2))
     return sensors + [f"mouse{port + 1}" for port in np.flatnonzero(counted).tolist()]
 

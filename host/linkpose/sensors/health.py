@@ -36,6 +36,11 @@ LIVELY_REPEATS = 5  # an axis that repeats so often is too quiet to compare anot
 BARO_FROZEN_S = 1.0
 BARO_FROZEN_REPEATS = 20
 BARO_STALE_S = 3.0  # without a new reading
+# QMC5883L: noise 2 mG (13-52-04, table 2), 6 counts; HMC5883L: 2 mG (900405 rev E, table 2), 2 counts. Three axes that
+# repeat 25 times by chance occur in no recording. Twice of it exceeds the second within which a fault is reported.
+MAG_FROZEN_S = 0.5
+MAG_FROZEN_REPEATS = 25  # for chips that convert slower than 50 Hz
+MAG_STALE_S = 1.0  # without a new reading; the slowest supported setting gives 75 in a second
 PRESSURE_RANGE_PA = (30_000.0, 110_000.0)  # BMP180 data sheet, table 1
 TEMPERATURE_RANGE_DEGC = (-41.0, 126.0)  # of the die: the data sheet's operating range, and its tolerance
 
@@ -231,6 +236,11 @@ def _imu_flags(number: str) -> _ImuFlags:
 
 
 _IMU_FLAGS, _IMU2_FLAGS = _imu_flags(""), _imu_flags("2")
+_IMU_FIELDS = {
+    "imu": ("accel_m_s2", "gyro_rad_s", "imu_temp_degC"),
+    "imu2": ("accel2_m_s2", "gyro2_rad_s", "imu2_temp_degC"),
+}
+_MAG_VALID, _MAG_SATURATED = int(SampleFlags.MAG_VALID), int(SampleFlags.MAG_SATURATED)
 _MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in range(1, MAX_MICE + 1)}
 
 
@@ -280,25 +290,25 @@ class _Imu:
         return np.where(repeats >= STUCK_REPEATS, held_s, 0.0)
 
 
-class _Baro:
-    """Checks a barometer."""
+class _Held:
+    """Finds the faults of a sensor that holds each reading until the next: a barometer, a magnetometer."""
 
-    def __init__(self) -> None:
+    def __init__(self, frozen_repeats: int, frozen_s: float, stale_s: float) -> None:
+        self._frozen_repeats, self._frozen_s, self._stale_s = frozen_repeats, frozen_s, stale_s
         self._value = _Repeats()
         self._fresh = _Repeats()
         self._readings = 0  # equal ones in a row, the first excluded
 
-    def check(self, pressure: Floats, fresh: Bools, time_s: Floats) -> Codes:
-        """Cause (N,) of each sample."""
-        codes = np.zeros(len(pressure), np.int8)
-        counts, held_s = self._value.follow(pressure[:, None], time_s)
+    def check(self, values: Floats, fresh: Bools, time_s: Floats) -> Codes:
+        """Cause (N,) of each sample of `values` (N, K)."""
+        codes = np.zeros(len(values), np.int8)
+        same = np.asarray(self._value.same(values).all(axis=1))[:, None]
+        counts, held_s = self._value.run(same, time_s)
         readings = self._count_readings(fresh, counts[:, 0])
         _, stale_s = self._fresh.run(~fresh[:, None], time_s)
         with np.errstate(invalid="ignore"):
-            codes[(readings >= BARO_FROZEN_REPEATS) & (held_s[:, 0] >= BARO_FROZEN_S)] = Cause.FROZEN
-            codes[stale_s[:, 0] >= BARO_STALE_S] = Cause.FROZEN
-            codes[(pressure < PRESSURE_RANGE_PA[0]) | (pressure > PRESSURE_RANGE_PA[1])] = Cause.OUT_OF_RANGE
-        codes[np.isnan(pressure)] = Cause.SILENT
+            codes[(readings >= self._frozen_repeats) & (held_s[:, 0] >= self._frozen_s)] = Cause.FROZEN
+            codes[stale_s[:, 0] >= self._stale_s] = Cause.FROZEN
         return codes
 
     def _count_readings(self, fresh: Bools, repeats: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -310,6 +320,34 @@ class _Baro:
         equal = total - base
         self._readings = int(equal[-1])
         return equal
+
+
+class _Baro:
+    """Checks a barometer."""
+
+    def __init__(self) -> None:
+        self._held = _Held(BARO_FROZEN_REPEATS, BARO_FROZEN_S, BARO_STALE_S)
+
+    def check(self, pressure: Floats, fresh: Bools, time_s: Floats) -> Codes:
+        """Cause (N,) of each sample."""
+        codes = self._held.check(pressure[:, None], fresh, time_s)
+        codes[(pressure < PRESSURE_RANGE_PA[0]) | (pressure > PRESSURE_RANGE_PA[1])] = Cause.OUT_OF_RANGE
+        codes[np.isnan(pressure)] = Cause.SILENT
+        return codes
+
+
+class _Mag:
+    """Checks a magnetometer."""
+
+    def __init__(self) -> None:
+        self._held = _Held(MAG_FROZEN_REPEATS, MAG_FROZEN_S, MAG_STALE_S)
+
+    def check(self, field: Floats, fresh: Bools, time_s: Floats) -> Codes:
+        """Cause (N,) of each sample of `field` (N, 3)."""
+        codes = self._held.check(field, fresh, time_s)
+        codes[~field.any(axis=1)] = Cause.BLANK  # the earth's field is nowhere zero
+        codes[~np.isfinite(field).all(axis=1)] = Cause.SILENT
+        return codes
 
 
 def expected_sensors(hello: Hello, mouse_ports: int) -> dict[str, str]:
@@ -333,8 +371,9 @@ class HealthMonitor:
             for name, state in sensors.items()
             if state != "absent"
         }
-        self._imu = _Imu(_IMU_FLAGS)
+        self._imus = {"imu": _Imu(_IMU_FLAGS), "imu2": _Imu(_IMU2_FLAGS)}
         self._baro = _Baro()
+        self._mag = _Mag()
 
     def check(self, block: Measurements) -> tuple[Measurements, list[Change]]:
         """The block with NaN for every invalid value, and the sensors whose state changed."""
@@ -343,10 +382,12 @@ class HealthMonitor:
         self._samples += len(block)
         changes: list[Change] = []
         flags, time_s = block.flags.astype(np.int64), block.time_s
-        if "imu" in self.sensors:
-            block = self._check_imu(block, flags, changes)
+        for name in [name for name in self._imus if name in self.sensors]:
+            block = self._check_imu(name, block, flags, changes)
         if "baro" in self.sensors:
             block = self._check_baro(block, changes)
+        if "mag" in self.sensors:
+            block = self._check_mag(block, flags, changes)
         for port in range(block.mice_counts.shape[1]):
             name = f"mouse{port + 1}"
             if (health := self.sensors.get(name)) is not None:
@@ -355,19 +396,23 @@ class HealthMonitor:
                 changes += health.count(silent, time_s, overflow)
         return block, changes
 
-    def _check_imu(self, block: Measurements, flags: NDArray[np.int64], changes: list[Change]) -> Measurements:
-        codes = self._imu.check(block.accel_m_s2, block.gyro_rad_s, block.imu_temp_degC, flags, block.time_s)
-        changes += self.sensors["imu"].count(codes, block.time_s, flags & _IMU_FLAGS.saturated != 0)
+    def _check_imu(
+        self, name: str, block: Measurements, flags: NDArray[np.int64], changes: list[Change]
+    ) -> Measurements:
+        fields, bits = _IMU_FIELDS[name], _IMU2_FLAGS if name == "imu2" else _IMU_FLAGS
+        accel, gyro, temp = (getattr(block, field) for field in fields)
+        codes = self._imus[name].check(accel, gyro, temp, flags, block.time_s)
+        changes += self.sensors[name].count(codes, block.time_s, flags & bits.saturated != 0)
         bad = codes != 0
         if not bad.any():
             return block
-        return replace(
-            block,
-            accel_m_s2=np.where(bad[:, None], np.nan, block.accel_m_s2),
-            gyro_rad_s=np.where(bad[:, None], np.nan, block.gyro_rad_s),
-            imu_temp_degC=np.where(bad, np.nan, block.imu_temp_degC),
-            flags=(block.flags & ~np.where(bad, _IMU_FLAGS.valid, 0).astype(block.flags.dtype)),
+        values = (
+            np.where(bad[:, None], np.nan, accel),
+            np.where(bad[:, None], np.nan, gyro),
+            np.where(bad, np.nan, temp),
         )
+        cleared = block.flags & ~np.where(bad, bits.valid, 0).astype(block.flags.dtype)
+        return replace(block, flags=cleared, **dict(zip(fields, values, strict=True)))
 
     def _check_baro(self, block: Measurements, changes: list[Change]) -> Measurements:
         codes = self._baro.check(block.pressure_Pa, block.baro_fresh, block.time_s)
@@ -380,6 +425,19 @@ class HealthMonitor:
             pressure_Pa=np.where(bad, np.nan, block.pressure_Pa),
             baro_temp_degC=np.where(bad, np.nan, block.baro_temp_degC),
             baro_fresh=block.baro_fresh & ~bad,
+        )
+
+    def _check_mag(self, block: Measurements, flags: NDArray[np.int64], changes: list[Change]) -> Measurements:
+        codes = self._mag.check(block.mag_uT, block.mag_fresh, block.time_s)
+        changes += self.sensors["mag"].count(codes, block.time_s, flags & _MAG_SATURATED != 0)
+        bad = codes != 0
+        if not bad.any():
+            return block
+        return replace(
+            block,
+            mag_uT=np.where(bad[:, None], np.nan, block.mag_uT),
+            mag_fresh=block.mag_fresh & ~bad,
+            flags=block.flags & ~np.where(bad, _MAG_VALID, 0).astype(block.flags.dtype),
         )
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
