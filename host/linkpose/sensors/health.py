@@ -36,8 +36,8 @@ LIVELY_REPEATS = 5  # an axis that repeats so often is too quiet to compare anot
 BARO_FROZEN_S = 1.0
 BARO_FROZEN_REPEATS = 20
 BARO_STALE_S = 3.0  # without a new reading
-# QMC5883L: noise 2 mG (13-52-04, table 2), 6 counts; HMC5883L: 2 mG (900405 rev E, table 2), 2 counts. Three axes that
-# repeat 25 times by chance have not been seen in any recording so far. Twice of it exceeds the second within which a fault is reported.
+# QMC5883L: noise 2 mG (13-52-04, table 2), 6 counts; HMC5883L: 2 mG (900405 rev E, table 2), 2 counts. No recording so
+# far holds three axes that repeat 25 times by chance. A fault must be reported within 1 s.
 MAG_FROZEN_S = 0.5
 MAG_FROZEN_REPEATS = 25  # for chips that convert slower than 50 Hz
 MAG_STALE_S = 1.0  # without a new reading; the slowest supported setting gives 75 in a second
