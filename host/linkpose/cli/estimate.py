@@ -16,7 +16,6 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.page import PageOptions
-from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
@@ -140,13 +139,12 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
-    with while_compiling(console.say):
-        measurements = recording.measurements
-        estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
-        _check(estimator, request, console)
-        if request.smooth:
-            _smooth(estimator)
-        estimator.warm_up()
+    measurements = recording.measurements
+    estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
+    _check(estimator, request, console)
+    if request.smooth:
+        _smooth(estimator)
+    console.compile([f.name for f in estimator.filters])
     estimates = estimator.process(measurements)
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "rig": rig.as_dict()}
@@ -231,8 +229,8 @@ def _live(
         ended = live.run_board(connected, duration, handle)
         view.close()
         if compiling.waiting:
-            console.say(f"{compiling.progress}; its estimates follow")
-            compiling.wait()
+            console.say("The estimates of filters that are still being compiled follow.")
+            compiling.wait(lambda text: console.progress(lambda: text))
         write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
