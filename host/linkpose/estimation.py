@@ -167,7 +167,7 @@ class LiveEstimator:
     """
 
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
-        """`is_ready` says of a filter's name, and of precompile.TEXT, whether it can run now; if so, it always can."""
+        """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
         self._filters = estimator.filters
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready

@@ -278,20 +278,20 @@ def _fit_sphere(p: Floats) -> tuple[Floats, float, float, Floats]:
         distance = np.linalg.norm(away, axis=1)
         jacobian = np.column_stack([away / np.maximum(distance, 1e-9)[:, None], np.ones(len(p))])
         off = distance - state[3]
-        told = jacobian.T @ jacobian
-        step = _solve(told, jacobian.T @ off, 1e-12 * len(p))
+        information = jacobian.T @ jacobian
+        step = _solve(information, jacobian.T @ off, 1e-12 * len(p))
         state = state + step / max(1.0, float(np.linalg.norm(step)))
         if np.linalg.norm(step) < 1e-6:
             break
     noise = max(float(np.sqrt(np.mean(off**2))), _LEAST_NOISE_M)
     radius = max(float(state[3]), noise)
     # Noise across the radius turns the rows of the Jacobian. That looks like motion, but holds no information.
-    told[:3, :3] -= (noise / radius) ** 2 * (len(p) * np.eye(3) - told[:3, :3])
-    covariance = noise**2 * _solve(told, np.eye(4), (noise / _LONGEST_LINK_M) ** 2)
+    information[:3, :3] -= (noise / radius) ** 2 * (len(p) * np.eye(3) - information[:3, :3])
+    covariance = noise**2 * _solve(information, np.eye(4), (noise / _LONGEST_LINK_M) ** 2)
     return state[:3], radius, noise, np.sqrt(np.diag(covariance))[:3]
 
 
 def _solve(information: Floats, right: Floats, least: float) -> Floats:
-    """information⁻¹ · right, with at least so much information in each direction."""
-    told, directions = np.linalg.eigh(information)
-    return np.asarray(directions / np.maximum(told, least) @ (directions.T @ right))
+    """information⁻¹ · right, with the eigenvalues of the information raised to at least `least`."""
+    eigenvalues, directions = np.linalg.eigh(information)
+    return np.asarray(directions / np.maximum(eigenvalues, least) @ (directions.T @ right))

@@ -116,7 +116,7 @@ def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_
     offset_s, residual = _common_offset(compared.values())
     window = (-np.inf if from_s is None else from_s, np.inf if to_s is None else to_s)
     scores = [_score(estimate, reference, name, both, offset_s, window) for name, both in compared.items()]
-    return Evaluation(scores, _doubts(estimate, reference, compared.values(), offset_s, residual))
+    return Evaluation(scores, _mismatches(estimate, reference, compared.values(), offset_s, residual))
 
 
 # ---- what can be compared ----
@@ -166,7 +166,7 @@ def _filters(estimate: Table) -> dict[str, dict[Quantity, str]]:
 
 
 def _reference_column(reference: Table, quantity: Quantity) -> str | None:
-    """The reference's column of a quantity. That of a chain may have the filter's prefix; z is the height."""
+    """The reference's column of a quantity. A chain's column may have the filter's prefix; z is the height."""
     names = [quantity.column]
     names += [f"chain_{quantity.column}"] if quantity in _CHAIN else []
     names += [HEIGHT.column] if quantity is Z else []
@@ -206,10 +206,10 @@ def _comparable(both: Mapping[Quantity, Pair]) -> list[Pair]:
     return [pair for q, pair in both.items() if q not in unaligned]
 
 
-# ---- doubts ----
+# ---- signs of a mismatch ----
 
 
-def _doubts(
+def _mismatches(
     estimate: Table,
     reference: Table,
     compared: Collection[Mapping[Quantity, Pair]],
