@@ -19,7 +19,7 @@ from linkpose.recording.reader import Recording, load_recording
 from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
+from linkpose.sensors.rig import CHAIN_JOINTS, UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
 
 if TYPE_CHECKING:
     import pandas
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 def sensors_of(measurements: Measurements) -> Sensors:
     """Those that ever gave a value in these measurements."""
     imu = Sensors.MPU6050 if np.isfinite(measurements.gyro_rad_s).any() else Sensors(0)
+    imu |= Sensors.IMU2 if measurements.has_imu2 else Sensors(0)
     return imu | (Sensors.BMP180 if measurements.baro_fresh.any() else Sensors(0))
 
 
@@ -83,10 +84,13 @@ class Estimator:
         self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
 
     @staticmethod
-    def for_board(names: Sequence[str], board: Board) -> Estimator:
-        """An estimator for a connected board's stream. Raises as the constructor does."""
+    def for_board(names: Sequence[str], board: Board, chain_joint: str | None = None) -> Estimator:
+        """An estimator for a connected board's stream; `chain_joint` as for `with_chain_joint`.
+
+        Raises as the constructor does.
+        """
         settings = BoardSettings.of(board.hello)
-        rig = board.rig.with_delay_of(settings.dlpf)
+        rig = with_chain_joint(board.rig.with_delay_of(settings.dlpf), chain_joint)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
@@ -308,6 +312,7 @@ def estimate(
     *,
     j2s_m: Sequence[float] | Literal["auto"] | None = None,
     j2s_std_m: float | None = None,
+    joint: Literal["ball", "hinge"] | None = None,
     rig: Rig | str | PathLike[str] | None = None,
     smooth: bool = False,
 ) -> Estimates:
@@ -319,6 +324,7 @@ def estimate(
         j2s_m: J2S, the vector from the joint centre to the sensor in the sensor's axes (m); "auto" estimates it from
             the motion. None: the rig's.
         j2s_std_m: standard deviation of `j2s_m`, each axis (m). Default: 0.1 mm.
+        joint: the joint between the two links of a chain. None: the rig's.
         rig: sensor placement and calibration, or the path of a rig.toml. None: the recording's own.
         smooth: use a smoother, which also uses later measurements, for each filter that has one.
 
@@ -329,9 +335,10 @@ def estimate(
     own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
     measurements = recording if isinstance(recording, Measurements) else recording.measurements
     in_force = as_rig(rig, own).with_delay_of(dlpf)
-    joint = _joint(j2s_m, j2s_std_m)
-    if joint is not None:
-        in_force = replace(in_force, joint=joint)
+    first_joint = _joint(j2s_m, j2s_std_m)
+    if first_joint is not None:
+        in_force = replace(in_force, joint=first_joint)
+    in_force = with_chain_joint(in_force, joint)
     estimator = Estimator.for_measurements(filters or (), in_force, measurements)
     if smooth:
         estimator.smooth()
@@ -345,6 +352,15 @@ def estimate(
         estimator.found_j2s,
         in_force,
     )
+
+
+def with_chain_joint(rig: Rig, joint: str | None) -> Rig:
+    """The rig with another joint between the links of its chain; None keeps it. Raises InvalidValue."""
+    if joint is None:
+        return rig
+    if joint not in CHAIN_JOINTS:
+        raise InvalidValue("joint", f'is {joint!r}; it must be "ball" or "hinge"')
+    return replace(rig, chain=replace(rig.chain, joint=joint))
 
 
 def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | None) -> Joint | None:

@@ -41,6 +41,7 @@ class Request:
     plain: bool
     targets: tuple[str, ...]
     page: PageOptions
+    chain_joint: str | None = None
 
 
 @click.command(name="estimate")
@@ -61,6 +62,12 @@ class Request:
 )
 @click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
 @options.rig_and_j2s
+@click.option(
+    "--joint",
+    "chain_joint",
+    type=click.Choice(["ball", "hinge"]),
+    help="Joint between the two links of a chain. Default: the rig file's, or ball.",
+)
 @options.page
 @board_settings
 @options.force
@@ -87,6 +94,7 @@ def command(
     rig_file: Path | None,
     joint: Joint | None,
     j2s_std: float | None,
+    chain_joint: str | None,
     has_page: bool,
     view_host: str,
     view_port: int | None,
@@ -120,7 +128,9 @@ def command(
     page.check()
     refuse_same_file(output, record, raw, source=recording)
     joint = options.joint_from(joint, j2s_std)
-    request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
+    request = Request(
+        output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page, chain_joint
+    )
     console = Console(quiet, verbose)
     if recording is not None:
         _replay(recording, request, console)
@@ -130,7 +140,7 @@ def command(
 
 def _replay(path: Path, request: Request, console: Console) -> None:
     """Estimates over a recording, as fast as it goes."""
-    from linkpose.estimation import Estimator
+    from linkpose.estimation import Estimator, with_chain_joint
     from linkpose.recording.reader import load_recording
 
     recording = load_recording(path)
@@ -139,6 +149,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    rig = with_chain_joint(rig, request.chain_joint)
     measurements = recording.measurements
     estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
     _check(estimator, request, console)
@@ -190,7 +201,7 @@ def _live(
         from linkpose.page.status import Status
         from linkpose.precompile import Precompilation
 
-        estimator = Estimator.for_board(request.filter_names, connected)
+        estimator = Estimator.for_board(request.filter_names, connected, request.chain_joint)
         _check(estimator, request, console)
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))

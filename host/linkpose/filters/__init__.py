@@ -17,7 +17,7 @@ from linkpose.sensors.rig import Mouse, Rig
 
 Floats = NDArray[np.float64]
 
-ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180
+ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180 | Sensors.IMU2 | Sensors.MAG
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +47,10 @@ REGISTRY: dict[str, Capabilities] = {
         "joint_inertial", "JointInertialFilter", _IMU, "guess", smoother="JointInertialSmoother"
     ),
     "tilt-inertial": Capabilities("tilt_inertial", "TiltInertialFilter", _IMU),
+    "chain": Capabilities("chain", "ChainFilter", _IMU | Sensors.IMU2),
     "joint": Capabilities("joint", "JointFilter", _IMU, "known"),
     "tilt": Capabilities("tilt", "TiltFilter", _IMU),
-    "imu-baro": Capabilities("imu_baro", "ImuBaroFilter", ALL_SENSORS),
+    "imu-baro": Capabilities("imu_baro", "ImuBaroFilter", _IMU | Sensors.BMP180),
     "baro": Capabilities("baro", "BaroFilter", Sensors.BMP180),
     "planar-ekf": Capabilities("planar", "PlanarEkf", _ANY, needs_mice=True, is_odometric=True),
     "planar-ukf": Capabilities("planar", "PlanarUkf", _ANY, needs_mice=True, is_odometric=True),
@@ -156,6 +157,8 @@ def _two_samples_at_rest() -> Measurements:
         time_s=np.array([0.0, 0.01]),
         accel_m_s2=np.array([[0.0, 0.0, 9.8]] * 2),
         gyro_rad_s=np.zeros((2, 3)),
+        accel2_m_s2=np.array([[0.0, 0.0, 9.8]] * 2),
+        gyro2_rad_s=np.zeros((2, 3)),
         imu_temp_degC=np.full(2, 25.0),
         pressure_Pa=np.full(2, 1e5),
         baro_temp_degC=np.full(2, 25.0),

@@ -26,6 +26,9 @@ _POSITIVE = (
 )  # fmt: skip
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
+CHAIN_JOINTS = ("ball", "hinge")
+_SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
+
 # A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
 _GUESS_M = 0.1
 
@@ -68,6 +71,25 @@ class Imu:
     def known_delay_s(self) -> float:
         """The delay (s); 0 if it is unknown."""
         return self.delay_s or 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Two links with a sensor on each, and the joint between them.
+
+    r1 and r2 are the vectors from the joint centre to each sensor, axis1 and axis2 the axis of a hinge, each in the
+    sensor's own axes. The angle of a hinge grows as link 2 turns about axis2 by the right-hand rule.
+    """
+
+    joint: str = "ball"  # or "hinge"
+    r1_m: Vector | None = None  # None: unknown; the chain filter estimates it
+    r1_std_m: float = 0.005  # standard deviation, each axis (m); measured with a ruler
+    r2_m: Vector | None = None
+    r2_std_m: float = 0.005
+    axis1: Vector | None = None  # of any length; None: unknown
+    axis1_std_deg: float = 3.0  # standard deviation about each axis across it
+    axis2: Vector | None = None
+    axis2_std_deg: float = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +153,7 @@ class Rig:
     mag: Mag = field(default_factory=Mag)
     baro: Baro = field(default_factory=Baro)
     mouse: tuple[Mouse, ...] = ()
+    chain: Chain = field(default_factory=Chain)
 
     def with_j2s(self, j2s_m: Vector) -> Rig:
         """The rig with another J2S, assumed accurate to 0.1 mm (1σ)."""
@@ -152,7 +175,9 @@ class Rig:
             del tables["joint"]
         if self.mag.hard_iron_uT is None:
             del tables["mag"]
-        for name in ("imu", "noise", "mag"):
+        if self.chain == Chain():
+            del tables["chain"]
+        for name in ("chain", "imu", "noise", "mag"):
             if name in tables:
                 tables[name] = {key: value for key, value in tables[name].items() if value is not None}
         if not tables["noise"]:
@@ -164,7 +189,14 @@ class Rig:
         """The inverse of `as_dict`; `origin` names the file. Raises FileFormatError for an invalid key or value."""
         _refuse_unknown(tables, [f.name for f in fields(Rig)], origin, "")
         parts: dict[str, Any] = {}
-        for name, cls in (("joint", Joint), ("imu", Imu), ("noise", Noise), ("mag", Mag), ("baro", Baro)):
+        for name, cls in (
+            ("joint", Joint),
+            ("chain", Chain),
+            ("imu", Imu),
+            ("noise", Noise),
+            ("mag", Mag),
+            ("baro", Baro),
+        ):
             if name in tables:
                 parts[name] = _read_table(cls, tables[name], origin, name)
         mice = tables.get("mouse", [])
@@ -200,9 +232,15 @@ class Rig:
         for name, table in self.as_dict().items():
             for row in table if isinstance(table, list) else [table]:
                 lines.append(f"[[{name}]]" if isinstance(table, list) else f"[{name}]")
-                lines += [f"{key} = {list(value) if isinstance(value, tuple) else value}" for key, value in row.items()]
+                lines += [f"{key} = {_toml(value)}" for key, value in row.items()]
                 lines.append("")
         return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, str):
+        return f'"{value}"'
+    return str(list(value) if isinstance(value, tuple) else value)
 
 
 def to_vector(values: Iterable[float], decimals: int = 8) -> Vector:
@@ -226,10 +264,7 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     _refuse_unknown(table, list(known), origin, f"{name}.")
     values: dict[str, Any] = {}
     for key, value in table.items():
-        is_vector = "Vector" in str(known[key].type)
-        values[key] = (
-            _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
-        )
+        values[key] = _read_value(str(known[key].type), value, origin, f"{name}.{key}")
         if key.endswith(_POSITIVE) and values[key] <= 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be above 0")
         if name == "noise" and not key.endswith("degC") and min(values[key]) < 0:
@@ -245,6 +280,20 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         raise FileFormatError(
             origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
+
+
+def _read_value(kind: str, value: Any, origin: str, where: str) -> Any:
+    """A value of the type that the field declares."""
+    if kind == "str":
+        if value not in CHAIN_JOINTS:
+            raise FileFormatError(origin, f'{origin}: {where} is {quoted(value)}; it must be "ball" or "hinge"')
+        return value
+    if "Vector" not in kind:
+        return _read_number(value, origin, where)
+    vector = _read_vector(value, origin, where)
+    if "axis" in where and math.hypot(*vector) < _SHORTEST_AXIS:
+        raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; an axis must not be zero")
+    return vector
 
 
 def _read_number(value: Any, origin: str, where: str) -> float:

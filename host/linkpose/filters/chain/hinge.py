@@ -1,0 +1,130 @@
+"""The axis of a hinge as a measurement, and the hinge angle.
+
+    0 = R_1 j_1 − R_2 j_2 + e
+
+e is the play of the hinge, whose mean square is measured. Unknown axes begin as the direction of the relative rate,
+the first principal axis of ∫ω_rel ω_relᵀ dt; both constraints then refine them.
+
+Source: T. Seel, J. Raisch, T. Schauer, "IMU-based joint angle measurement for gait analysis", Sensors 14(4), 2014, 3.2.
+"""
+
+from __future__ import annotations
+
+import math
+
+from linkpose.compiling import inner
+from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
+from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
+from linkpose.filters.chain.update import clear_row, expected_square, update
+
+# The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
+_SIDE = (1.0, 0.77, 0.61)
+# Square of the axis's horizontal part below which it gives no heading: the axis itself is uncertain by as much.
+_VERTICAL = 0.01
+_POWER_STEPS = 30  # of the power iteration: a second eigenvalue of 0.25 the first is down by 1e-18
+
+
+@inner
+def follow_axis(s: Record, size: int, hinge: int, gyro: Floats, h: float, q: Record) -> None:
+    """Accumulate the relative rate in sensor 1's axes until it gives the axis."""
+    rate, m, spread = s.a, s.c, s.relative_spread
+    for i in range(3):
+        rate[i] = gyro[1, i] - s.gyro_bias[1, i]
+    rotate(s.rotation[1], rate, s.b)
+    rotate_back(s.rotation[0], s.b, m)
+    for i in range(3):
+        rate[i] = m[i] - gyro[0, i] + s.gyro_bias[0, i]
+    for i in range(3):
+        for j in range(3):
+            spread[i, j] += h * rate[i] * rate[j] - h / q.axis_memory_s * spread[i, j]
+    total = spread[0, 0] + spread[1, 1] + spread[2, 2]
+    if total > q.axis_rotation and _principal_axis(spread, s.axis[0], s.b) > q.axis_share * total:
+        _begin_axes(s, size, hinge, q)
+
+
+@inner
+def _principal_axis(spread: Floats, axis: Floats, product: Floats) -> float:
+    """The unit eigenvector of the largest eigenvalue, by power iteration, and this eigenvalue."""
+    axis[0], axis[1], axis[2] = _SIDE
+    value = 0.0
+    for _ in range(_POWER_STEPS):
+        rotate(spread, axis, product)
+        value = math.sqrt(square(product)) + 1e-30
+        for i in range(3):
+            axis[i] = product[i] / value
+    return value
+
+
+@inner
+def _begin_axes(s: Record, size: int, hinge: int, q: Record) -> None:
+    """j_2 from j_1 and the present attitudes; wide variances across both."""
+    p = s.covariance
+    rotate(s.rotation[0], s.axis[0], s.a)
+    rotate_back(s.rotation[1], s.a, s.axis[1])
+    if s.axis[1, 0] * _SIDE[0] + s.axis[1, 1] * _SIDE[1] + s.axis[1, 2] * _SIDE[2] < 0:
+        for k in range(2):
+            for i in range(3):
+                s.axis[k, i] = -s.axis[k, i]
+    for k in range(2):
+        o, axis = hinge + AXES + 3 * k, s.axis[k]
+        for i in range(3):
+            for j in range(size):
+                p[o + i, j] = p[j, o + i] = 0.0
+        for i in range(3):
+            for j in range(3):
+                p[o + i, o + j] = q.axis_std_rad**2 * ((1.0 if i == j else 0.0) - axis[i] * axis[j])
+    s.has_axis = 1.0
+
+
+@inner
+def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
+    """Apply the constraint, `h` (s) after the last time. Returns its log likelihood."""
+    rotate(s.rotation[0], s.axis[0], s.a)
+    rotate(s.rotation[1], s.axis[1], s.b)
+    variance = q.play_correlation * max(s.play_square, q.least_play_rad**2)
+    across = s.a[0] ** 2 + s.a[1] ** 2
+    heading_share = min(max(across / _VERTICAL - 1, 0.0), 1.0)
+    likelihood = found = expected = 0.0
+    for row in range(3):
+        clear_row(s)
+        i, j = (row + 1) % 3, (row + 2) % 3
+        s.row[i] = s.a[j]  # δ(R j) = δθ × R j
+        s.row[j] = -s.a[i]
+        s.row[OF_SENSOR + i] = -s.b[j]
+        s.row[OF_SENSOR + j] = s.b[i]
+        s.row[2] *= heading_share
+        s.row[OF_SENSOR + 2] *= heading_share
+        for c in range(3):
+            s.row[hinge + AXES + c] = s.rotation[0, row, c]
+            s.row[hinge + AXES + 3 + c] = -s.rotation[1, row, c]
+        value = s.a[row] - s.b[row]
+        found += value * value
+        expected += expected_square(s, size)
+        likelihood += update(s, size, -value, variance, q.huber)[0]
+    s.play_square += min(h / q.play_s, 1.0) * (max(found - expected, 0.0) / 2 - s.play_square)
+    return likelihood
+
+
+@inner
+def hinge_angle(s: Record) -> float:
+    """Angle (rad, ±π) about j_2 since the first sample: the twist of R_0ᵀ R_1ᵀ R_2."""
+    between(s.attitude[0], s.attitude[1], s.relative)
+    q, r, axis = s.start, s.relative, s.axis[1]
+    w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
+    x = q[0] * r[1] - q[1] * r[0] - (q[2] * r[3] - q[3] * r[2])
+    y = q[0] * r[2] - q[2] * r[0] - (q[3] * r[1] - q[1] * r[3])
+    z = q[0] * r[3] - q[3] * r[0] - (q[1] * r[2] - q[2] * r[1])
+    angle = 2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w)
+    return float(angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi)))
+
+
+@inner
+def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
+    """σ of that angle (rad): of the rotations now and at the start about the axis."""
+    to_matrix(s.start, s.m)
+    rotate(s.m, s.axis[1], s.a)  # the axis in sensor 1's axes
+    rotate(s.rotation[0], s.a, s.b)
+    clear_row(s)
+    for i in range(3):
+        s.row[i], s.row[OF_SENSOR + i], s.row[hinge + START + i] = -s.b[i], s.b[i], -s.a[i]
+    return math.sqrt(max(expected_square(s, size), 0.0))

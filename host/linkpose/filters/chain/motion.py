@@ -1,0 +1,58 @@
+"""What each sensor's own motion gives: a velocity that stays small, and the gyro bias at rest.
+
+The velocity is the measurement of `inertial.free_velocity`: 0 = v + e with the measured variance σ² of e and its
+correlation time T, to a slower estimate white noise of variance σ² 2T/h. It levels the tilts.
+"""
+
+from __future__ import annotations
+
+import math
+
+from linkpose.compiling import inner
+from linkpose.filters.chain.state import BG, OF_SENSOR, Floats, Record, V
+from linkpose.filters.chain.update import clear_row, update
+
+_REST_MEAN_S = 0.5  # over which readings are averaged to find rests
+
+
+@inner
+def update_velocity(s: Record, size: int, k: int, h: float, q: Record) -> float:
+    """Apply 0 = v_k + e, `h` (s) after the last time. Returns its log likelihood."""
+    time = q.most_correlation_s
+    if s.accel_square[k] > 0:
+        time = min(max(math.sqrt(s.speed_square[k] / s.accel_square[k]), q.least_correlation_s), time)
+    speed = min(max(s.speed_square[k], q.least_speed_m_s**2), q.most_speed_m_s**2)
+    variance = q.shared_motion * speed * max(2 * time / h, 1.0)
+    likelihood = 0.0
+    for row in range(3):
+        clear_row(s)
+        s.row[OF_SENSOR * k + V + row] = 1.0
+        likelihood += update(s, size, -s.velocity[k, row], variance, q.huber)[0]
+    return likelihood
+
+
+@inner
+def update_rest(s: Record, size: int, k: int, gyro: Floats, q: Record, noise: Floats) -> None:
+    """At rest the rate is the gyro bias."""
+    for row in range(3):
+        clear_row(s)
+        s.row[OF_SENSOR * k + BG + row] = 1.0
+        update(s, size, gyro[k, row] - s.gyro_bias[k, row], noise[0] + q.rest_std_rad_s**2, q.huber)
+
+
+@inner
+def follow_rest(bank: Record, best: Record, k: int, gyro: Floats, accel: Floats, h: float, q: Record) -> None:
+    """How long sensor k has been at rest: rate and force steady, and the rate explained by the bias's σ."""
+    p, o = best.covariance, OF_SENSOR * k + BG
+    keep = min(h / _REST_MEAN_S, 1.0)
+    rate_off = force_off = rate = 0.0
+    for i in range(3):
+        bank.mean_gyro[k, i] += keep * (gyro[k, i] - bank.mean_gyro[k, i])
+        bank.mean_accel[k, i] += keep * (accel[k, i] - bank.mean_accel[k, i])
+        rate_off = max(rate_off, abs(gyro[k, i] - bank.mean_gyro[k, i]))
+        force_off = max(force_off, abs(accel[k, i] - bank.mean_accel[k, i]))
+        rate = max(rate, abs(bank.mean_gyro[k, i] - best.gyro_bias[k, i]))
+    std = math.sqrt(p[o, o] + p[o + 1, o + 1] + p[o + 2, o + 2])
+    allowed = min(q.most_rest_rad_s, 3 * std + 5 * q.rest_std_rad_s)
+    steady = rate_off < q.rest_gyro_rad_s and force_off < q.rest_accel_m_s2 and rate < allowed
+    bank.still_s[k] = bank.still_s[k] + h if steady else 0.0

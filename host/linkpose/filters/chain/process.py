@@ -1,0 +1,328 @@
+"""Blocks of samples through the bank of hypotheses, each a filter from another heading of sensor 2 at the start.
+
+The relative heading is unknown at the start, and the constraint is far from linear in it. Several filters therefore
+start with headings all around; each step compares their likelihoods, and drops one that is improbable or has come to
+the same rotation as the best. In motion one is left after some seconds.
+
+Source: D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control
+10(4), 1965.
+"""
+
+from __future__ import annotations
+
+import math
+
+from linkpose.compiling import compiled, inner
+from linkpose.filters._imu import GRAVITY
+from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
+from linkpose.filters.chain.joint import update_fixed_joint, update_joint
+from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
+from linkpose.filters.chain.propagate import integrate, propagate_covariance
+from linkpose.filters.chain.rotation import between, rotate, rotate_back, to_matrix, turn
+from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
+from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
+
+
+@inner
+def _align(s: Record, k: int, accel: Floats, heading: float, std: float, heading_std: float, q: Record) -> None:
+    """Attitude of sensor k from one reading of the accelerometer, and a heading (rad); velocity 0."""
+    p, o = s.covariance, OF_SENSOR * k
+    x, y, z = accel[k, 0] - s.accel_bias[k, 0], accel[k, 1] - s.accel_bias[k, 1], accel[k, 2] - s.accel_bias[k, 2]
+    norm = math.sqrt(x * x + y * y + z * z) + 1e-9
+    w = 1 + z / norm
+    attitude = s.attitude[k]
+    if w > 1e-6:  # the shortest rotation of the force onto Z
+        attitude[0], attitude[1], attitude[2], attitude[3] = w, y / norm, -x / norm, 0.0
+    else:
+        attitude[0], attitude[1], attitude[2], attitude[3] = 0.0, 1.0, 0.0, 0.0
+    turn(attitude, 0.0, 0.0, heading, 1.0)
+    to_matrix(attitude, s.rotation[k])
+    for i in range(6):
+        s.velocity[k, i % 3] = 0.0
+        for j in range(p.shape[0]):
+            p[o + i, j] = p[j, o + i] = 0.0
+    for i in range(3):
+        p[o + i, o + i] = std * std
+        p[o + V + i, o + V + i] = q.speed_m_s**2
+    p[o + 2, o + 2] = heading_std**2
+
+
+@inner
+def _begin(bank: Record, states: Record, accel: Floats, q: Record) -> None:
+    """All hypotheses at the first sample, or anew after a gap: mounting and sensor errors stay as the best has them."""
+    count = states.shape[0]
+    best = states[bank.best]
+    for i in range(count):
+        s = states[i]
+        if bank.begun:
+            _copy_constants(best, s, bank.length)
+        for k in range(2):
+            force = math.sqrt(accel[k, 0] ** 2 + accel[k, 1] ** 2 + accel[k, 2] ** 2)
+            std = q.tilt_rad + abs(force / GRAVITY - 1)
+            spacing = 2 * math.pi / count
+            _align(s, k, accel, spacing * i * k, std, 0.4 * spacing * k, q)
+            s.speed_square[k], s.accel_square[k] = 0.25, 1.0
+        s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
+        s.play_square = q.first_play_rad**2
+        s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = 1, 0.0, 0.0, math.pi, math.pi
+        if bank.hinge >= 0 and not bank.begun:
+            _begin_start(s, bank.length, bank.hinge)
+    bank.begun = 1
+
+
+@inner
+def _copy_constants(best: Record, s: Record, size: int) -> None:
+    """What a gap does not change, with its variances but without covariances between parts."""
+    for k in range(2):
+        for i in range(3):
+            s.gyro_bias[k, i], s.accel_bias[k, i] = best.gyro_bias[k, i], best.accel_bias[k, i]
+            s.lever[k, i], s.axis[k, i] = best.lever[k, i], best.axis[k, i]
+    for i in range(3):
+        s.lever0[i] = best.lever0[i]
+    for i in range(4):
+        s.start[i] = best.start[i]
+    s.has_axis = best.has_axis
+    for i in range(size):
+        for j in range(size):
+            s.covariance[i, j] = best.covariance[i, j] if i // 3 == j // 3 else 0.0
+
+
+@inner
+def _begin_start(s: Record, size: int, hinge: int) -> None:
+    """R_0 is the relative rotation now, with its error: δφ_0 = R_1ᵀ (δθ_2 − δθ_1)."""
+    p = s.covariance
+    between(s.attitude[0], s.attitude[1], s.start)
+    for j in range(size):
+        for i in range(3):
+            s.a[i] = p[OF_SENSOR + i, j] - p[i, j]
+        rotate_back(s.rotation[0], s.a, s.b)
+        for i in range(3):
+            p[hinge + START + i, j] = s.b[i]
+    for j in range(size):
+        if hinge <= j < hinge + 3:
+            for i in range(3):
+                s.a[i] = p[hinge + START + j - hinge, OF_SENSOR + i] - p[hinge + START + j - hinge, i]
+            rotate_back(s.rotation[0], s.a, s.b)
+            for i in range(3):
+                p[hinge + START + i, j] = s.b[i]
+        else:
+            for i in range(3):
+                p[j, hinge + START + i] = p[hinge + START + i, j]
+
+
+@inner
+def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: Floats) -> None:
+    """All measurements of one update, `h` (s) after the last."""
+    size, hinge, base = bank.length, bank.hinge, bank.fixed
+    propagate_covariance(s, size, q)
+    likelihood = s.heading_share * update_joint(s, size, gyro, h, q, noise)
+    apply_correction(s, size, hinge, base)
+    if base >= 0:
+        likelihood += update_fixed_joint(s, size, base, gyro, q, noise)
+    for k in range(2):
+        likelihood += update_velocity(s, size, k, h, q)
+        if bank.still_s[k] > q.rest_s:
+            update_rest(s, size, k, gyro, q, noise)
+    apply_correction(s, size, hinge, base)
+    if hinge >= 0:
+        if s.has_axis > 0.0:
+            likelihood += update_axis(s, size, hinge, h, q)
+            apply_correction(s, size, hinge, base)
+        else:
+            follow_axis(s, size, hinge, gyro, h, q)
+        s.angle_std = hinge_angle_std(s, size, hinge)
+    s.log_likelihood += q.tempering * likelihood
+    p, total = s.covariance, 0.0
+    for i in range(3):
+        total += p[i, i] + p[OF_SENSOR + i, OF_SENSOR + i] - 2 * p[i, OF_SENSOR + i]
+    s.rotation_std = math.sqrt(max(total, 0.0))
+
+
+@inner
+def _select(bank: Record, states: Record, q: Record) -> None:
+    """The best hypothesis; the others' odds against it; those that are improbable or the same end."""
+    top = -math.inf
+    for i in range(states.shape[0]):
+        s = states[i]
+        if s.alive:
+            far = 0.0  # a wrong heading is often explained by impossible gyro biases
+            for k in range(2):
+                for j in range(3):
+                    far += s.gyro_bias[k, j] ** 2
+            s.odds = s.log_likelihood - 0.5 * far / q.gyro_bias_rad_s**2
+            if s.odds > top:
+                top, bank.best = s.odds, i
+    best = states[bank.best]
+    between(best.attitude[0], best.attitude[1], best.relative)
+    for i in range(states.shape[0]):
+        s = states[i]
+        if not s.alive:
+            continue
+        s.odds -= top
+        s.log_likelihood -= top
+        if i == bank.best:
+            s.apart = 0.0
+            continue
+        between(s.attitude[0], s.attitude[1], s.relative)
+        a, b = s.relative, best.relative
+        cosine = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
+        s.apart = 2 * math.acos(min(cosine, 1.0))
+        if s.odds < -q.most_odds or s.apart < max(s.rotation_std, best.rotation_std):
+            s.alive = 0
+
+
+@inner
+def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
+    """The best hypothesis, with σ of the mixture; the angle is the mean of all."""
+    best, size, hinge, base = states[bank.best], bank.length, bank.hinge, bank.fixed
+    weights = variance = 0.0
+    for i in range(states.shape[0]):
+        s = states[i]
+        if s.alive:
+            weight = math.exp(s.odds)
+            weights += weight
+            variance += weight * (s.rotation_std**2 + s.apart**2)
+    out.rotation_std = min(math.sqrt(variance / weights), math.pi)
+    between(best.attitude[0], best.attitude[1], best.relative)
+    sign = 1.0 if best.relative[0] >= 0 else -1.0
+    for i in range(4):
+        out.q[i] = sign * best.relative[i] if out.rotation_std < q.unknown_rad else math.nan
+    if hinge >= 0:
+        _report_angle(best, states, out)
+    if base >= 0:
+        for k in range(2):
+            out.height[k], out.height_std[k] = _height(best, k, size, base)
+    for k in range(2):
+        for i in range(3):
+            out.tilt[k, i] = best.rotation[k, 2, i]
+
+
+@inner
+def _report_covariance(s: Record, out: Record) -> None:
+    """Covariance of the relative rotation in sensor 1's axes: R_1ᵀ P_(θ2 − θ1) R_1."""
+    p, o = s.covariance, OF_SENSOR
+    for j in range(3):
+        for i in range(3):
+            s.a[i] = p[i, j] + p[o + i, o + j] - p[i, o + j] - p[o + i, j]
+        rotate_back(s.rotation[0], s.a, s.b)
+        for i in range(3):
+            s.m[i, j] = s.b[i]
+    for i in range(3):
+        rotate_back(s.rotation[0], s.m[i], s.b)
+        for j in range(3):
+            out.covariance[i, j] = s.b[j]
+
+
+@inner
+def _report_angle(best: Record, states: Record, out: Record) -> None:
+    out.angle = out.angle_std = math.nan
+    if best.has_axis == 0.0:
+        return
+    weights = mean = square = 0.0
+    first = hinge_angle(best)
+    for i in range(states.shape[0]):
+        s = states[i]
+        if s.alive and s.has_axis > 0.0:
+            weight = math.exp(s.odds)
+            turned = hinge_angle(s) - first
+            turned -= 2 * math.pi * math.floor((turned + math.pi) / (2 * math.pi))
+            weights += weight
+            mean += weight * turned
+            square += weight * (turned * turned + s.angle_std**2)
+    mean /= weights
+    angle = first + mean
+    out.angle = angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
+    out.angle_std = min(math.sqrt(max(square / weights - mean * mean, 0.0)), math.pi)
+
+
+@inner
+def _height(s: Record, k: int, size: int, base: int) -> tuple[float, float]:
+    """Height of sensor k over the fixed joint (m) and its σ: Z of R_1 r_0; of sensor 2, R_1 (r_0 − r_1) + R_2 r_2."""
+    clear_row(s)
+    h, height = s.row, 0.0
+    for part in range(1 + k):  # link 1, then link 2
+        m, o = s.rotation[part], OF_SENSOR * part
+        for i in range(3):
+            s.a[i] = s.lever[1, i] if part == 1 else s.lever0[i] - (s.lever[0, i] if k == 1 else 0.0)
+            if part == 0:
+                h[base + i] = m[2, i]
+                if k == 1:
+                    h[R + i] = -m[2, i]
+            else:
+                h[OF_SENSOR + R + i] = m[2, i]
+        rotate(m, s.a, s.b)
+        height += s.b[2]
+        h[o], h[o + 1] = s.b[1], -s.b[0]  # Z of δθ × u
+    return height, math.sqrt(max(expected_square(s, size), 0.0))
+
+
+@compiled
+def process(
+    time: Floats, accel: Floats, gyro: Floats, valid: Floats, bank_of: Record, states: Record, q_of: Record,
+    noise: Floats, estimates: Record,
+) -> None:  # fmt: skip
+    """N samples: time (N,) s; accel (N, 2, 3) m/s²; gyro (N, 2, 3) rad/s; valid (N,) 1 or 0; estimates (N,).
+
+    `noise`: variances of one reading of gyro and accelerometer. Rows of invalid samples are NaN.
+    """
+    bank, q = bank_of[0], q_of[0]
+    for n in range(time.shape[0]):
+        out = estimates[n]
+        if valid[n] == 0.0:
+            bank.rejected += 1
+            _blank(out)
+            continue
+        h = time[n] - bank.time
+        if not bank.begun or h > q.longest_gap_s:
+            bank.restarts += bank.begun
+            _begin(bank, states, accel[n], q)
+            _remember(bank, time[n], gyro[n], accel[n], True)
+            bank.since_update = 0.0
+        elif h > 0.0:
+            _step(bank, states, gyro[n], accel[n], h, q, noise)
+            _remember(bank, time[n], gyro[n], accel[n], False)
+        _report(bank, states, out, q)
+        _report_covariance(states[bank.best], out)
+
+
+@inner
+def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q: Record, noise: Floats) -> None:
+    """One sample, `h` (s) after the last."""
+    for k in range(2):
+        follow_rest(bank, states[bank.best], k, gyro, accel, h, q)
+    bank.since_update += h
+    due = bank.since_update >= q.period_s
+    for i in range(states.shape[0]):
+        s = states[i]
+        if s.alive:
+            for k in range(2):
+                integrate(s, k, bank, gyro, accel, h, q, noise)
+            s.span += h
+            if due:
+                _update(s, bank, gyro, bank.since_update, q, noise)
+    if due:
+        bank.since_update = 0.0
+        _select(bank, states, q)
+
+
+@inner
+def _remember(bank: Record, time: float, gyro: Floats, accel: Floats, first: bool) -> None:
+    bank.time = time
+    for k in range(2):
+        if first:
+            bank.still_s[k] = 0.0
+        for i in range(3):
+            bank.gyro[k, i], bank.accel[k, i] = gyro[k, i], accel[k, i]
+            if first:
+                bank.mean_gyro[k, i], bank.mean_accel[k, i] = gyro[k, i], accel[k, i]
+
+
+@inner
+def _blank(out: Record) -> None:
+    for i in range(4):
+        out.q[i] = math.nan
+    out.rotation_std = out.angle = out.angle_std = math.nan
+    for k in range(2):
+        out.height[k] = out.height_std[k] = math.nan
+        for i in range(3):
+            out.tilt[k, i] = math.nan

@@ -1,0 +1,251 @@
+"""State of the chain's filter: two links, a sensor on each, and the joint between them.
+
+Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
+sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
+centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and R_0, the relative
+rotation at the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
+joint to sensor 1. Errors of rotations are in n (of R_0: in sensor 1's axes): R = exp([δθ×]) R̂.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.sensors.rig import Chain, Rig, Vector
+
+Floats = NDArray[np.float64]
+Record = Any  # a record of STATE, BANK or of the parameters, which compiled code reads by name
+
+# Errors of one sensor, relative to OF_SENSOR * k: attitude, velocity, gyro bias, accelerometer bias, r_k.
+TH, V, BG, BA, R = 0, 3, 6, 9, 12
+OF_SENSOR = 15
+BALL_SIZE = 2 * OF_SENSOR
+# Errors of the parts that only some chains have, relative to their first index.
+START, AXES, HINGE_SIZE = 0, 3, 9
+MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
+# Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
+# openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
+HYPOTHESES = 8
+
+
+class ChainParameters(NamedTuple):
+    """Parameters of the chain's filter. Unit, meaning; origin; effect of doubling where it matters.
+
+    Constants marked [D], [O], [E] were chosen on these recordings: [D] diodem_chain trial 1 in four joints, each from
+    four starting times; [O] openaxes_robot circle-100; [E] the first 400 s of mpu6050_encoder roll_slow.
+    """
+
+    period_s: float = 0.039  # between two updates: 25 Hz, above the bandwidth of links that a body moves
+    # Gyro scale and cross-axis errors as noise, share of the rate; correlated over 0.1 s. [D, O, E]; doubled: σ +20 %.
+    gyro_misfit: float = 0.015
+    # Scale and cross-axis errors of the accelerometer (data sheet: 3 %, 2 %) as a walk of its bias, share of the rate
+    # at which the force turns in the sensor's axes. [O]; doubled, ball joints of [D] lose a third of their accuracy.
+    accel_scale: float = 0.02
+    accel_scale_s: float = 0.5  # over which that rate is averaged (s)
+    accel_walk_m_s2_sqrts: float = 0.02  # of the accelerometer bias. [O, E]; halved, σ is too small on a slow robot.
+    accel_misfit: float = 0.02  # share of the linear acceleration that is noise, correlated over 0.05 s
+    gyro_walk_rad_s_sqrts: float = 3e-4  # 1 °/s in the hour in which a sensor warms up
+    lever_walk_m_sqrts: float = 1e-4  # lets an error of the model leave r_k again
+    # Residual of the joint: its floor (m/s), least share of ‖ω‖ ‖r‖, that share before it has been measured, and the
+    # time over which it is measured (s).
+    velocity_floor_m_s: float = 0.01
+    least_residual: float = 0.01
+    first_residual: float = 0.05
+    residual_s: float = 4.0
+    # Acceleration noise grows up to `most_widening` times where innovations exceed their σ, by e in 1/widening_rate s.
+    widening_rate: float = 1.0
+    most_widening: float = 100.0
+    # Play of a hinge (rad): σ before it has been measured, and the least; time over which it is measured (s).
+    first_play_rad: float = 0.01
+    least_play_rad: float = 0.003
+    play_s: float = 4.0
+    # Play is correlated: one update counts as 1/10 of an independent one at 25 Hz. [D]; at 1, the heading follows a
+    # play of 3°.
+    play_correlation: float = 10.0
+    axis_std_rad: float = 0.3  # of the first estimate of the axis, from the direction of the relative rate
+    axis_rotation: float = 0.1  # ∫‖ω_rel‖² dt that the first estimate needs (rad²/s)
+    axis_share: float = 0.8  # of ∫ω_rel ω_relᵀ in its largest eigenvalue, ditto
+    axis_memory_s: float = 10.0
+    # Velocity of a sensor that a person or a machine moves: bounds of its measured σ (m/s) and correlation time (s).
+    least_speed_m_s: float = 0.1
+    most_speed_m_s: float = 2.0
+    least_correlation_s: float = 0.1
+    most_correlation_s: float = 1.0
+    # The heading follows from accelerations that both sensors measure. Slower motion of either (rms velocity gained in
+    # 1 s) is what errors of an accelerometer look like (0.1 m/s²), and gives no heading. [E]: at 0, σ is too small.
+    heading_speed_m_s: float = 0.1
+    shared_motion: float = 2.0  # both sensors measure the same motion: variance × 2
+    swing_s: float = 1.0  # over which acceleration is integrated to measure that σ (s)
+    speed_memory_s: float = 2.0  # over which the result is averaged (s)
+    # Rest: deviation of rate (rad/s) and force (m/s²) from their mean over 0.5 s, for how long (s); σ of its rate.
+    rest_gyro_rad_s: float = 0.02
+    rest_accel_m_s2: float = 0.3
+    rest_s: float = 0.3
+    rest_std_rad_s: float = 0.001
+    most_rest_rad_s: float = 0.03  # largest rate that may be a bias: slower turns of links at a constant rate are rare
+    huber: float = 3.0  # innovations beyond so many σ count less (P. J. Huber, 1964)
+    # Successive innovations are correlated: log likelihoods of hypotheses count by this factor. [O]; doubled, a slow
+    # start drops the true heading.
+    tempering: float = 0.1
+    most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
+    longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
+    unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
+    # Prior standard deviations.
+    tilt_rad: float = 0.1
+    speed_m_s: float = 0.3
+    gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a rest of 0.3 s finds any larger one
+    accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
+    lever_m: float = 0.3  # of an unknown r_k: links of people and robots
+
+
+_V3, _Q = ("f8", 3), ("f8", 4)
+STATE = np.dtype(
+    [
+        ("attitude", "f8", (2, 4)),  # quaternions of R_k
+        ("rotation", "f8", (2, 3, 3)),  # R_k as matrices
+        ("velocity", "f8", (2, 3)),
+        ("gyro_bias", "f8", (2, 3)),
+        ("accel_bias", "f8", (2, 3)),
+        ("lever", "f8", (2, 3)),  # r_k
+        ("axis", "f8", (2, 3)),  # j_k
+        ("start", *_Q),  # R_0
+        ("lever0", *_V3),  # r_0
+        ("covariance", "f8", (MAX_SIZE, MAX_SIZE)),
+        ("correction", "f8", MAX_SIZE),  # of the errors, by the updates since the last `apply_correction`
+        ("row", "f8", MAX_SIZE),  # of H
+        ("gain", "f8", MAX_SIZE),
+        # Accumulated since the last propagation of the covariance.
+        ("turned", "f8", (2, 3, 3)),  # ∫ R_k dt
+        ("impulse", "f8", (2, 3)),  # ∫ R_k f_k dt
+        ("span", "f8"),  # s
+        ("rotation_variance", "f8", 2),
+        ("velocity_variance", "f8", 2),
+        ("force_rate_square", "f8", 2),  # mean ‖ω × f‖²
+        # Memory of the measurement models.
+        ("swing", "f8", (2, 3)),
+        ("heading_share", "f8"),  # of the horizontal force that tells the heading, 0 to 1
+        ("speed_square", "f8", 2),
+        ("accel_square", "f8", 2),
+        ("excess_square", "f8"),  # mean square residual of the joint beyond its floor (m²/s²)
+        ("reach_square", "f8"),  # mean of ‖ω‖² ‖r‖² (m²/s²)
+        ("residual_share", "f8"),  # square of the measured share
+        ("innovation_ratio", "f8"),  # mean square innovation over its expectation
+        ("widening", "f8"),
+        ("play_square", "f8"),
+        ("relative_spread", "f8", (3, 3)),  # ∫ ω_rel ω_relᵀ dt
+        ("has_axis", "f8"),
+        # Hypothesis.
+        ("alive", "i8"),
+        ("log_likelihood", "f8"),
+        ("odds", "f8"),  # log odds against the best
+        ("apart", "f8"),  # angle between its relative rotation and the best's
+        ("rotation_std", "f8"),
+        ("angle_std", "f8"),
+        # Scratch.
+        ("a", *_V3),
+        ("b", *_V3),
+        ("c", *_V3),
+        ("m", "f8", (3, 3)),
+        ("relative", *_Q),
+    ],
+    align=True,
+)
+
+# What all hypotheses share.
+BANK = np.dtype(
+    [
+        ("begun", "i8"),
+        ("length", "i8"),  # of the error state
+        ("hinge", "i8"),  # first index of a hinge's errors, or −1
+        ("fixed", "i8"),  # first index of the error of r_0, or −1
+        ("time", "f8"),
+        ("since_update", "f8"),
+        ("gyro", "f8", (2, 3)),  # last readings
+        ("accel", "f8", (2, 3)),
+        ("mean_gyro", "f8", (2, 3)),
+        ("mean_accel", "f8", (2, 3)),
+        ("still_s", "f8", 2),
+        ("best", "i8"),
+        ("rejected", "i8"),
+        ("restarts", "i8"),
+    ],
+    align=True,
+)
+
+ESTIMATE = np.dtype(
+    [
+        ("q", *_Q),  # from sensor 2's axes into sensor 1's
+        ("rotation_std", "f8"),  # rad
+        ("angle", "f8"),
+        ("angle_std", "f8"),
+        ("height", "f8", 2),  # m
+        ("height_std", "f8", 2),
+        ("tilt", "f8", (2, 3)),  # Z of n in either sensor's axes
+        ("covariance", "f8", (3, 3)),  # of the relative rotation, in sensor 1's axes (rad²)
+    ],
+    align=True,
+)
+
+
+def record_of(parameters: NamedTuple) -> Any:
+    """Parameters as a record, which compiled code reads by name."""
+    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
+    return np.array([tuple(parameters)], dtype=dtype).view(np.recarray)
+
+
+def fresh_bank(rig: Rig) -> Any:
+    """The shared record of a chain that begins."""
+    banks = np.zeros(1, BANK).view(np.recarray)
+    bank: Any = banks[0]
+    bank.length, bank.hinge, bank.fixed = BALL_SIZE, -1, -1
+    if rig.chain.joint == "hinge":
+        bank.hinge, bank.length = bank.length, bank.length + HINGE_SIZE
+    if rig.joint.j2s_m is not None:
+        bank.fixed, bank.length = bank.length, bank.length + 3
+    return banks
+
+
+def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
+    """The hypotheses before the first sample: mounting and sensor errors as the rig states them."""
+    states = np.zeros(HYPOTHESES, STATE).view(np.recarray)
+    chain = rig.chain
+    gyro_std = _known(rig.imu.gyro_bias_std_rad_s, parameters.gyro_bias_rad_s)
+    accel_std = _known(rig.imu.accel_offset_std_m_s2, parameters.accel_bias_m_s2)
+    for state in states:
+        variance = np.zeros(MAX_SIZE)
+        levers = ((chain.r1_m, chain.r1_std_m), (chain.r2_m, chain.r2_std_m))
+        for k, (lever, std) in enumerate(levers):
+            first = OF_SENSOR * k
+            state.lever[k] = (0.0, 0.0, 0.0) if lever is None else lever
+            variance[first + BG : first + BA] = (gyro_std if k == 0 else parameters.gyro_bias_rad_s) ** 2
+            variance[first + BA : first + R] = (accel_std if k == 0 else parameters.accel_bias_m_s2) ** 2
+            variance[first + R : first + OF_SENSOR] = (parameters.lever_m if lever is None else std) ** 2
+        if bank.fixed >= 0:
+            state.lever0 = rig.joint.j2s_m
+            variance[bank.fixed : bank.fixed + 3] = rig.joint.j2s_std_m**2
+        state.covariance[:] = np.diag(variance)
+        if bank.hinge >= 0 and chain.axis1 is not None and chain.axis2 is not None:
+            _set_axes(state, bank.hinge + AXES, chain)
+    return states
+
+
+def _known(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
+def _set_axes(state: Any, first: int, chain: Chain) -> None:
+    """Both axes of a hinge, with variances across them."""
+    axes: tuple[tuple[Vector | None, float], ...] = (
+        (chain.axis1, chain.axis1_std_deg),
+        (chain.axis2, chain.axis2_std_deg),
+    )
+    for k, (axis, std_deg) in enumerate(axes):
+        unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(np.asarray(axis))
+        at = slice(first + 3 * k, first + 3 * k + 3)
+        state.axis[k] = unit
+        state.covariance[at, at] = math.radians(std_deg) ** 2 * (np.eye(3) - np.outer(unit, unit))
+    state.has_axis = 1.0
