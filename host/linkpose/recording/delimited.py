@@ -172,6 +172,12 @@ def has_rows(lines: Sequence[str]) -> bool:
     return any(line.strip(_PADDING) and not _is_comment(line) for line in lines)
 
 
+def last_comment(lines: Sequence[str], before: Sequence[str]) -> dict[str, Any] | None:
+    """The JSON object in the last of these comment lines; the names are in the last line of `before`."""
+    comments = [line for line in lines if _is_comment(line)]
+    return _comment(0, comments[-1], _separator(before[-1])).as_object() if comments else None
+
+
 def _is_comment(line: str) -> bool:
     return line.lstrip(' "').startswith("#")
 

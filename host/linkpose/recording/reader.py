@@ -45,9 +45,10 @@ if TYPE_CHECKING:
     from linkpose.wire.capture import Capture
 
 MOST_CHANGES = 10  # of sensors' states, in the remarks
-# Rows that stay in memory, and by which units are judged: 83 min at 100 Hz, 140 MB with all sensors. Twice of it
-# doubles the memory of a run, and files of that length are read once instead of twice.
+# Rows that stay in memory: 83 min at 100 Hz, 70 MB without a second sensor. Twice of it doubles that memory, and files
+# of that length are read once instead of twice.
 KEPT_ROWS = 500_000
+UNIT_ROWS = 100_000  # by which units are judged: a unit is wrong in all rows or in none
 Progress = Callable[[float], None]
 _T_WRAP = 1 << 32
 _SEQ_WRAP = 1 << 16
@@ -190,12 +191,13 @@ class RecordingFile:
             checked, changes = self._monitor.check(block)
             self._note(changes)
             self.survey.add(block, checked)
-            if self._kept is not None and first is not None:
-                self._kept.append(checked)
+            if self._kept is not None:
+                self._kept = [*self._kept, checked] if self.survey.rows <= KEPT_ROWS else None
+            if first is not None:
                 first.append(block)
-                if self.survey.rows > KEPT_ROWS:
+                if self.survey.rows > UNIT_ROWS:
                     self._judge_units(first)
-                    self._kept = first = None
+                    first = None
         if first is not None:
             self._judge_units(first)
 

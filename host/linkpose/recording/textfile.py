@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from linkpose.errors import FileFormatError
 from linkpose.recording.chunks import Chunk, open_binary, read_chunks
-from linkpose.recording.delimited import Cells, Comment, DecimalMark, has_rows, split_cells, text_lines
+from linkpose.recording.delimited import Cells, DecimalMark, has_rows, last_comment, split_cells, text_lines
 from linkpose.recording.numbers import parse_rows
 from linkpose.sensors.measurements import Floats
 
@@ -113,8 +113,9 @@ class TextTable:
         return self._part_of(cells)
 
     def _part_of_others(self, chunk: Chunk) -> Part | None:
-        if not has_rows(text_lines(chunk.data)):
-            self.closing = _last_comment(chunk.data) or self.closing
+        lines = text_lines(chunk.data)
+        if not has_rows(lines):
+            self.closing = last_comment(lines, self._before) or self.closing
             return None
         cells = split_cells(self._path, chunk.data, self._before, chunk.first_line)
         if cells.names != self.names:
@@ -142,12 +143,6 @@ def _metadata(cells: Cells) -> tuple[dict[str, Any], tuple[str, ...]]:
         f"{cells.path}, line {comment.line}: a spreadsheet damaged the metadata; the settings and the rig in it are "
         "not used",
     )
-
-
-def _last_comment(data: bytes) -> dict[str, Any] | None:
-    """The content of the closing line, where a part holds nothing else."""
-    lines = [line for line in text_lines(data) if line.startswith("#")]
-    return Comment(lines[-1][1:], 0, True).as_object() if lines else None
 
 
 def _head_lines(data: bytes) -> tuple[int, int, list[str]]:
