@@ -16,7 +16,6 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.page import PageOptions
-from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
@@ -141,12 +140,11 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         console.say(remark)
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
-    with while_compiling(console.say):
-        estimator = Estimator.for_recording(request.filter_names, rig, recording)
-        _check(estimator, request, console)
-        if request.smooth:
-            _smooth(estimator)
-        estimator.warm_up()
+    estimator = Estimator.for_recording(request.filter_names, rig, recording)
+    _check(estimator, request, console)
+    if request.smooth:
+        _smooth(estimator)
+    console.compile([f.name for f in estimator.filters])
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "rig": rig.as_dict()}
     rows = 0
@@ -236,8 +234,8 @@ def _live(
         ended = live.run_board(connected, duration, handle)
         view.close()
         if compiling.waiting:
-            console.say(f"{compiling.progress}; its estimates follow")
-            compiling.wait()
+            console.say("The estimates of filters that are still being compiled follow.")
+            compiling.wait(lambda text: console.progress(lambda: text))
         write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
