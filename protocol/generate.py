@@ -356,7 +356,7 @@ def python_module(schema: dict) -> str:
         "    cls: type[tuple[int, ...]] | None  # None: the values of all repetitions form one tuple",
         "    least: int  # repetitions",
         "    most: int",
-        "    mask: int  # bits of the field `sections` that say how often it is present; 0: `least` to `most` times",
+        "    mask: int  # bits of the field `sections` that count how often it is present; 0: `least` to `most` times",
         "",
         "",
         "class Layout(NamedTuple):",
@@ -575,7 +575,8 @@ def presence(group: dict) -> str:
     if "section" in group:
         return f"Then, if bit {group['section']:#04x} of `sections` is set, {name}"
     if "counted" in group:
-        return f"Then, as many times as bits {group['counted']:#04x} of `sections` say (0 to {group['max']}), {name}"
+        bits = f"bits {group['counted']:#04x} of `sections`"
+        return f"Then {name}, repeated as often as {bits} count (0 to {group['max']})"
     return f"Then 0 to {group['max']} times {name}"
 
 

@@ -64,7 +64,7 @@ class MissingLibrary(LinkposeError):
 
 
 class TooFewRows(LinkposeError):
-    """Less than half of a filter's estimates have a reference: a score would be that of another run than the user's.
+    """Less than half of a filter's estimates have a reference: a score would describe another run than the user's.
 
     `rows` of `known` estimates have one, between `common_s` (from, to).
     """
@@ -98,7 +98,7 @@ class PortNotFound(PortError):
 
 
 class NotASerialPort(PortError):
-    """The name is that of a file or device which is not a serial port."""
+    """The name belongs to a file or device that is not a serial port."""
 
     def __init__(self, port: str) -> None:
         super().__init__(port, f"{port} is not a serial port")
@@ -127,7 +127,7 @@ class PermissionDenied(PortError):
 class NoBoardFound(LinkposeError):
     """No port was named, and none of the ports of this machine is an UNO. `ports` lists them.
 
-    `simulated_will_do` says whether a simulated board would serve the purpose.
+    `simulated_will_do` is True where a simulated board would serve the purpose.
     """
 
     def __init__(self, ports: Sequence[Any], simulated_will_do: bool = True) -> None:
@@ -154,15 +154,15 @@ class BoardError(LinkposeError):
 
 
 class NoFirmware(BoardError):
-    """No linkpose firmware answers at the port. `heard` is what came instead (bytes)."""
+    """No linkpose firmware answers at the port. `received` is what came instead (bytes)."""
 
-    def __init__(self, port: str, heard: bytes, text: str) -> None:
+    def __init__(self, port: str, received: bytes, text: str) -> None:
         super().__init__(f"{port}: {text}")
-        self.port, self.heard = port, heard
+        self.port, self.received = port, received
 
 
 class WrongFirmware(BoardError):
-    """The board's firmware and this linkpose do not understand each other. `is_older` says which side is old."""
+    """Firmware and linkpose use different protocols. `is_older` is True where the firmware is the older side."""
 
     def __init__(self, text: str, is_older: bool) -> None:
         super().__init__(text)
@@ -211,7 +211,7 @@ class SensorMissing(CannotRun):
 
 
 class FilterCannotRun(LinkposeError):
-    """A filter that was asked for cannot run. `filter` is its name, `reason` the error that says why."""
+    """A filter that was asked for cannot run. `filter` is its name, `reason` the error that explains it."""
 
     def __init__(self, name: str, reason: CannotRun) -> None:
         super().__init__(f"the filter {name} cannot run: {reason}")
@@ -219,7 +219,7 @@ class FilterCannotRun(LinkposeError):
 
 
 class NoFilterRuns(LinkposeError):
-    """None of the filters can run. `reasons` says why, filter by filter."""
+    """None of the filters can run. `reasons` maps each filter's name to its error."""
 
     def __init__(self, reasons: dict[str, CannotRun]) -> None:
         listed = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())

@@ -62,7 +62,7 @@ class Quantity:
 
     @property
     def axis_label(self) -> str:
-        """What the axis of a plot says: height over the joint (m)."""
+        """The label of a plot's axis, for example: height over the joint (m)."""
         return f"{self.label} ({self.value.unit})" if self.value.unit else self.label
 
 
@@ -128,7 +128,7 @@ ROLL_RAD, PITCH_RAD, YAW_RAD = _radians("roll", "roll"), _radians("pitch", "pitc
 EXCLUDED = Quantity("excluded", "", "mice left out", Shown("", 1.0, 0), Shown(""), "mice left out", decimals=0)
 ANGLE = _degrees("angle", "joint angle")
 QW, QX, QY, QZ = (_part_of_rotation(axis) for axis in "wxyz")
-# σ of the whole rotation of a chain's joint, the only figure that says how sure the quaternion is.
+# σ of the rotation of a chain's joint: the only uncertainty given for the quaternion.
 ROTATION = _degrees("rotation", "joint rotation")
 HEIGHT1 = _length("height1", "height of sensor 1", "height")
 HEIGHT2 = _length("height2", "height of sensor 2", "height")

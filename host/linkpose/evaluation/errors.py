@@ -38,7 +38,7 @@ def errors_of(name: str, ours: Values, theirs: Values) -> dict[Quantity, Floats]
     """Estimate − reference of each quantity, angles within ±π.
 
     A pose without an absolute origin is compared after moving it as a whole to agree with the reference at the first
-    common instant: that of odometry entirely, that of a link without compass about the vertical only.
+    common instant: odometry in position and heading, a link without compass about the vertical only.
     The four numbers of a quaternion give one error: the angle of the rotation between the two.
     """
     errors = {q: _difference(q, ours[q], theirs[q]) for q in ours if q not in CHAIN_ROTATION}

@@ -12,6 +12,7 @@ from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, Errors, errors_of, scored, yaw_drift_deg_per_min
 from linkpose.evaluation.series import Series, find_offset, is_sparser, paired
 from linkpose.evaluation.statistics import Statistics
+from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.quantities import (
     ANGLE,
     CHAIN_ROTATION,
@@ -116,7 +117,7 @@ def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_
     offset_s, residual = _common_offset(compared.values())
     window = (-np.inf if from_s is None else from_s, np.inf if to_s is None else to_s)
     scores = [_score(estimate, reference, name, both, offset_s, window) for name, both in compared.items()]
-    return Evaluation(scores, _doubts(estimate, reference, compared.values(), offset_s, residual))
+    return Evaluation(scores, _mismatches(estimate, reference, compared.values(), offset_s, residual))
 
 
 # ---- what can be compared ----
@@ -166,7 +167,7 @@ def _filters(estimate: Table) -> dict[str, dict[Quantity, str]]:
 
 
 def _reference_column(reference: Table, quantity: Quantity) -> str | None:
-    """The reference's column of a quantity. That of a chain may have the filter's prefix; z is the height."""
+    """The reference's column of a quantity. A chain's column may have the filter's prefix; z is the height."""
     names = [quantity.column]
     names += [f"chain_{quantity.column}"] if quantity in _CHAIN else []
     names += [HEIGHT.column] if quantity is Z else []
@@ -206,10 +207,10 @@ def _comparable(both: Mapping[Quantity, Pair]) -> list[Pair]:
     return [pair for q, pair in both.items() if q not in unaligned]
 
 
-# ---- doubts ----
+# ---- signs of a mismatch ----
 
 
-def _doubts(
+def _mismatches(
     estimate: Table,
     reference: Table,
     compared: Collection[Mapping[Quantity, Pair]],
@@ -223,7 +224,7 @@ def _doubts(
     if apart > _SAME_TILT_DEG:
         cure = (
             "try the other axis with --up y or z, and check the order of the markers"
-            if reference.kind == "motive"
+            if reference.kind == MOTION_CAPTURE
             else "are they of the same run, and of the same axes?"
         )
         return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]

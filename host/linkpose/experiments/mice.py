@@ -29,7 +29,7 @@ class Redundancy:
 
     @property
     def ratio(self) -> float:
-        """Noise of all mice together over that of one."""
+        """Noise of the velocity from all mice, divided by the noise from one mouse."""
         return self.fused_std / self.single_std
 
 

@@ -45,7 +45,7 @@ class Detection:
         self.false_alarms += len(track.rejected_ranges) - found
 
     def as_row(self) -> dict[str, object]:
-        """The part of the JSON object that says how well outliers were detected."""
+        """The part of the JSON object that reports how well outliers were detected."""
         return {
             "detection_rate": self.found / self.injected if self.injected else None,
             "false_alarm_rate": self.false_alarms / self.good,

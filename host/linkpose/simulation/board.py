@@ -188,7 +188,7 @@ def hello(
     sensors: Sensors = Sensors.MPU6050 | Sensors.BMP180,
     mice: tuple[HelloMouse, ...] = (),
 ) -> Hello:
-    """What a simulated board with these settings says of itself."""
+    """The HELLO of a simulated board with these settings."""
     major, minor, patch = map(int, VERSION.split("."))
     return Hello(
         protocol_major=PROTOCOL_MAJOR,

@@ -1,6 +1,6 @@
 """A wheeled robot with a laser scanner in an office floor of 100 x 40 m, the size of the thesis's indoor experiment.
 
-The robot drives a round through the corridors. What it does differs from what it is told (Table 2.2), its odometry errs
+The robot drives a round through the corridors. Its motion deviates from the commands (Table 2.2), its odometry errs
 on every sample, and the noise of a beam grows with its range. Every seed drives the same round with other errors.
 """
 
@@ -44,9 +44,9 @@ class IndoorErrors:
     somewhere before the wall.
     """
 
-    motion_speed_m_s: float = 0.05  # the command against what the robot does
+    motion_speed_m_s: float = 0.05  # commanded against actual motion
     motion_turn_rad_s: float = 0.02
-    odometry_speed_m_s: float = 0.05  # what the robot does against what its odometry says
+    odometry_speed_m_s: float = 0.05  # measured against actual motion
     odometry_turn_rad_s: float = 0.05
     range_m: float = 0.03
     range_growth: float = 0.02

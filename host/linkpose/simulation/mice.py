@@ -71,7 +71,7 @@ class Fault:
 class MouseErrors:
     """How the mice err. `scatter` and `floor` are standard deviations as a share of the speed, drawn each NOISE_S: of
     each mouse by itself, and common to all. `uniform_m_s` is noise between ± that velocity. `scale` and `angle_deg` are
-    standard deviations of what a mouse is from what the rig file says.
+    standard deviations of the true scale and angle about the rig file's values.
     """
 
     scatter: float = 0.01
@@ -162,7 +162,7 @@ class MiceRun:
 
     @property
     def hello_mice(self) -> tuple[HelloMouse, ...]:
-        """What HELLO says of the mice."""
+        """The mice as HELLO reports them."""
         return tuple(
             HelloMouse(DeviceState.OK, 0x00, 0x60, min(255, round(mouse.counts_per_m / 1000)), 200, 0)
             for mouse in self.mice

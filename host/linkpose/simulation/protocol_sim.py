@@ -28,7 +28,7 @@ _IDLE_S = 0.005  # a step of a board that is read as fast as it can and sends no
 
 
 class Serial(serial.SerialBase):
-    """A port with a simulated board behind it. `clock` tells the host's time as this board lives it."""
+    """A port with a simulated board behind it. `clock` returns the host's time (s) as this board experiences it."""
 
     rig: Rig
 
@@ -78,11 +78,11 @@ class Serial(serial.SerialBase):
                     wait = min(wait, deadline - time.perf_counter())
                 if wait < 0:
                     break
-                self._changed.wait(wait)  # until the next tick, or until the host says something
+                self._changed.wait(wait)  # until the next tick, or until the host sends something
         return b""
 
     def _until_next_tick(self) -> float:
-        """Seconds to sleep until the board has something to say; a board read at full speed goes on at once."""
+        """Seconds to sleep until the board has something to send; a board read at full speed goes on at once."""
         due = self._board.next_tick_us
         if self._speed:
             left = 0.02 if due is None else (due - self._board_us()) * 1e-6 / self._drift / self._speed

@@ -242,8 +242,8 @@ class Check:
 def self_check(run: UnderwaterRun) -> list[Check]:
     """The noise's statistics computed back from the measurements and the true path, as chapter 3.2 does.
 
-    The common error is told from the Gaussian noise by the variance between the intervals against that within them;
-    the instants of outliers are left out of both. An error beyond half an outlier's size counts as one.
+    The variance between the intervals gives the common error, and the variance within them the Gaussian noise.
+    Both leave out the instants of outliers. An error beyond half an outlier's size counts as one.
     """
     errors, motion = run.errors, run.motion
     spread = np.std(run.velocity_m_s - motion.twist[motion.index(run.times_s["dvl"]), :3])

@@ -364,7 +364,7 @@ class Group(NamedTuple):
     cls: type[tuple[int, ...]] | None  # None: the values of all repetitions form one tuple
     least: int  # repetitions
     most: int
-    mask: int  # bits of the field `sections` that say how often it is present; 0: `least` to `most` times
+    mask: int  # bits of the field `sections` that count how often it is present; 0: `least` to `most` times
 
 
 class Layout(NamedTuple):
