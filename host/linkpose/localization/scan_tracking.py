@@ -17,8 +17,8 @@ from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, S
 # The errors of a map do not average out over scans; they are added to the reported covariance. GRID_ERROR (m, m, rad)
 # is the part that no beam shows: the reference paths of two public buildings differ by so much. SHARED_BEAMS
 # neighbouring beams of a full scan end in one piece of wall and share its error, whose deviation (m) is at least
-# LEAST_WALL_STD_M. Where the walls do not bind a direction, the error is at most UNBOUND (m, m, rad). Twice SHARED_BEAMS
-# widens the stated deviations by 1.4.
+# LEAST_WALL_STD_M. Where the walls do not bind a direction, the error is at most UNBOUND (m, m, rad). Twice
+# SHARED_BEAMS widens the stated deviations by 1.4.
 GRID_ERROR = np.array([0.02, 0.02, 0.012])
 SHARED_BEAMS, LEAST_WALL_STD_M = 18.0, 0.025
 UNBOUND = np.array([0.5, 0.5, 0.2])
