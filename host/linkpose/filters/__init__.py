@@ -47,9 +47,9 @@ REGISTRY: dict[str, Capabilities] = {
         "joint_inertial", "JointInertialFilter", _IMU, "guess", smoother="JointInertialSmoother"
     ),
     "tilt-inertial": Capabilities("tilt_inertial", "TiltInertialFilter", _IMU),
-    "chain": Capabilities("chain", "ChainFilter", _IMU | Sensors.IMU2),
     "joint": Capabilities("joint", "JointFilter", _IMU, "known"),
     "tilt": Capabilities("tilt", "TiltFilter", _IMU),
+    "chain": Capabilities("chain", "ChainFilter", _IMU | Sensors.IMU2),
     "imu-baro": Capabilities("imu_baro", "ImuBaroFilter", _IMU | Sensors.BMP180),
     "baro": Capabilities("baro", "BaroFilter", Sensors.BMP180),
     "planar-ekf": Capabilities("planar", "PlanarEkf", _ANY, needs_mice=True, is_odometric=True),

@@ -38,12 +38,17 @@ class Joint:
     """The joint of the link. J2S is the vector from the joint centre to the sensor."""
 
     j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None if unknown
-    j2s_std_m: float = 0.0001  # its standard deviation, each axis (m)
+    j2s_std_m: float | Vector = 0.0001  # its standard deviation (m), one for all axes or one for each
 
     @property
     def known_j2s_m(self) -> Vector | None:
         """J2S; None if it is unknown or only a first guess."""
-        return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
+        return self.j2s_m if self.largest_std_m <= _GUESS_M else None
+
+    @property
+    def largest_std_m(self) -> float:
+        """Standard deviation along the axis that is known least (m)."""
+        return max(self.j2s_std_m) if isinstance(self.j2s_std_m, tuple) else self.j2s_std_m
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
@@ -265,7 +270,7 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     values: dict[str, Any] = {}
     for key, value in table.items():
         values[key] = _read_value(str(known[key].type), value, origin, f"{name}.{key}")
-        if key.endswith(_POSITIVE) and values[key] <= 0:
+        if key.endswith(_POSITIVE) and _least(values[key]) <= 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be above 0")
         if name == "noise" and not key.endswith("degC") and min(values[key]) < 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; no axis may be below 0")
@@ -282,13 +287,17 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         ) from None
 
 
+def _least(value: float | Vector) -> float:
+    return min(value) if isinstance(value, tuple) else value
+
+
 def _read_value(kind: str, value: Any, origin: str, where: str) -> Any:
     """A value of the type that the field declares."""
     if kind == "str":
         if value not in CHAIN_JOINTS:
             raise FileFormatError(origin, f'{origin}: {where} is {quoted(value)}; it must be "ball" or "hinge"')
         return value
-    if "Vector" not in kind:
+    if "Vector" not in kind or ("float |" in kind and not isinstance(value, list | tuple)):
         return _read_number(value, origin, where)
     vector = _read_vector(value, origin, where)
     if "axis" in where and math.hypot(*vector) < _SHORTEST_AXIS:

@@ -226,7 +226,7 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
             variance[first + R : first + OF_SENSOR] = (parameters.lever_m if lever is None else std) ** 2
         if bank.fixed >= 0:
             state.lever0 = rig.joint.j2s_m
-            variance[bank.fixed : bank.fixed + 3] = rig.joint.j2s_std_m**2
+            variance[bank.fixed : bank.fixed + 3] = np.square(rig.joint.j2s_std_m)
         state.covariance[:] = np.diag(variance)
         if bank.hinge >= 0 and chain.axis1 is not None and chain.axis2 is not None:
             _set_axes(state, bank.hinge + AXES, chain)

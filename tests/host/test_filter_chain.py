@@ -1,0 +1,135 @@
+"""The chain filter on a simulated hinge and ball joint with known answers, through public doors."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import linkpose as lp
+from linkpose.errors import InvalidValue
+from linkpose.filters.chain import ChainFilter
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
+from linkpose.sensors.rig import Chain, Rig
+
+RATE_HZ, SECONDS = 100.0, 30.0
+R1, R2 = np.array([0.05, -0.02, -0.20]), np.array([-0.03, 0.04, 0.15])
+
+
+def _turn(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3) about a unit axis (Rodrigues)."""
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    s, c = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.eye(3) + s * k + (1 - c) * (k @ k)
+
+
+def _rate(rotation: np.ndarray, h: float) -> np.ndarray:
+    """Angular rate in body axes from central differences."""
+    before, after = rotation[:-2], rotation[2:]
+    step = np.einsum("nji,njk->nik", before, after)
+    angle = np.arccos(np.clip((np.trace(step, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    scale = np.where(angle > 1e-9, angle / (2 * np.sin(np.maximum(angle, 1e-9))), 0.5)
+    vee = np.stack([step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]], 1)
+    return scale[:, None] * vee / (2 * h)
+
+
+def _chain(joint: str, seed: int = 0) -> tuple[lp.Measurements, np.ndarray, np.ndarray]:
+    """A chain moved by hand: measurements, rotations 2 → 1 (N, 3, 3), and the hinge angle (N,) since the start."""
+    rng, h = np.random.default_rng(seed), 1 / RATE_HZ
+    t = np.arange(-1, round(SECONDS * RATE_HZ) + 1) * h
+    grow = np.clip((t - 1) / 2, 0, 1) ** 2 * (3 - 2 * np.clip((t - 1) / 2, 0, 1))
+
+    def wave(size: float) -> np.ndarray:
+        tones = [np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(0.2, 0.9, 3)]
+        return size * grow * sum(tones)
+
+    x, y, z = np.eye(3)
+    first = _turn(z, wave(0.4)) @ _turn(y, 0.2 + wave(0.25)) @ _turn(x, -0.3 + wave(0.25))
+    mount = _turn(np.array([0.6, 0.0, 0.8]), np.array([2.0]))[0]
+    angle = wave(0.4)
+    relative = _turn(y, angle) @ mount
+    if joint == "ball":
+        relative = _turn(y, angle) @ _turn(x, wave(0.3)) @ _turn(z, wave(0.3)) @ mount
+    second = first @ relative
+    centre = np.stack([wave(0.10), wave(0.10), wave(0.08)], 1)
+    out = []
+    for rotation, r in ((first, R1), (second, R2)):
+        place = centre + rotation @ r
+        accel = (place[2:] - 2 * place[1:-1] + place[:-2]) / h**2 + [0, 0, STANDARD_GRAVITY]
+        force = np.einsum("nji,nj->ni", rotation[1:-1], accel) + 0.04 * rng.standard_normal(accel.shape)
+        gyro = _rate(rotation, h) + 0.0009 * rng.standard_normal(accel.shape) + 0.002 * rng.standard_normal(3)
+        out += [force + 0.03 * rng.standard_normal(3), gyro]
+    measured = lp.Measurements.from_imu(t[1:-1], out[0], out[1], accel2_m_s2=out[2], gyro2_rad_s=out[3])
+    return measured, relative[1:-1], np.degrees(angle[1:-1] - angle[1])
+
+
+def _error_deg(estimates: lp.Estimates, truth: np.ndarray) -> np.ndarray:
+    """Angle between the estimated and the true rotation; NaN where not known."""
+    w, x, y, z = (estimates[f"chain_q{axis}"] for axis in "wxyz")
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    found = np.moveaxis(np.array(rows), 2, 0)
+    return np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", found, truth) - 1) / 2, -1, 1)))
+
+
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_unknown_mounting_the_rotation_is_found_and_its_std_holds(joint: str) -> None:
+    measured, truth, _ = _chain(joint)
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint)
+    late = measured.time_s > 15
+    error, std = _error_deg(estimates, truth)[late], estimates["chain_rotation_std_deg"][late]
+    assert np.sqrt(np.mean(error**2)) < 1.0
+    assert np.mean(error < 2 * std) > 0.9
+    assert std.max() < 5.0  # and the heading has been found
+
+
+def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
+    measured, _, angle = _chain("hinge")
+    estimates = lp.estimate(measured, filters=["chain"], joint="hinge")
+    late = measured.time_s > 15
+    found = estimates["chain_angle_deg"]
+    error = min((sign * found - angle for sign in (1, -1)), key=lambda e: np.square(e[late]).sum())[late]
+    assert np.sqrt(np.mean(error**2)) < 1.5  # the zero of the angle is the tilt of the first reading
+    assert np.mean(np.abs(error) < 2 * estimates["chain_angle_std_deg"][late]) > 0.9
+
+
+def test_blocks_do_not_change_the_estimates() -> None:
+    measured = _chain("hinge")[0][:600]
+    whole, parts = ChainFilter(Rig(chain=Chain("hinge"))), ChainFilter(Rig(chain=Chain("hinge")))
+    cuts = [0, 1, 2, 37, 400, 600]
+    pieces = [parts.process(measured[a:b]) for a, b in pairwise(cuts)]
+    np.testing.assert_array_equal(whole.process(measured), np.vstack(pieces))
+
+
+def test_at_rest_the_heading_is_not_reported() -> None:
+    n = 500
+    force = np.tile([0.0, 0.0, STANDARD_GRAVITY], (n, 1)) + 0.01 * np.random.default_rng(0).standard_normal((n, 3))
+    measured = lp.Measurements.from_imu(
+        np.arange(n) / 100, force, np.zeros((n, 3)), accel2_m_s2=force, gyro2_rad_s=np.zeros((n, 3))
+    )
+    estimates = lp.estimate(measured, filters=["chain"])
+    assert np.isnan(estimates["chain_qw"]).all()
+    assert estimates["chain_rotation_std_deg"].min() > 57
+
+
+def test_a_long_gap_blanks_and_keeps_the_mounting() -> None:
+    measured, _, _ = _chain("ball")
+    gone = (measured.time_s > 15) & (measured.time_s < 17)
+    gyro2 = np.where(gone[:, None], np.nan, measured.gyro2_rad_s)
+    broken = lp.Measurements.from_imu(
+        measured.time_s, measured.accel_m_s2, measured.gyro_rad_s, accel2_m_s2=measured.accel2_m_s2, gyro2_rad_s=gyro2
+    )
+    chain = ChainFilter(Rig())
+    found = chain.process(broken)
+    assert np.isnan(found[gone]).all()
+    assert (chain.rejected, chain.restarts) == (int(gone.sum()), 1)
+    assert np.linalg.norm(chain.state.lever - [R1, R2]) < 0.03
+
+
+def test_an_unknown_joint_is_refused() -> None:
+    with pytest.raises(InvalidValue, match='must be "ball" or "hinge"'):
+        lp.estimate(_chain("ball")[0][:10], filters=["chain"], joint="slider")  # type: ignore[arg-type]
