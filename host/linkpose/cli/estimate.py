@@ -21,8 +21,11 @@ from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
     from linkpose.board import Board
+    from linkpose.cli.keys import Keys
     from linkpose.cli.live import Console
     from linkpose.estimation import EstimateWriter, Estimator
+    from linkpose.precompile import Precompilation
+    from linkpose.sensors.measurements import Floats, Measurements
 
 WORST_STD_M = 0.03  # of a J2S that the motion has told
 
@@ -119,6 +122,7 @@ def command(
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     refuse_same_file(output, record, raw, source=recording)
+    options.refuse_mixed_output(output, json_lines)
     joint = options.joint_from(joint, j2s_std)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
     console = Console(quiet, verbose)
@@ -154,7 +158,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     if request.output:
-        console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
+        console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}{options.written(request.output)}")
+        options.show_next(console.is_quiet, f"plot {request.output}")
 
 
 def _smooth(estimator: Estimator) -> None:
@@ -176,8 +181,7 @@ def _live(
     """Estimates as the board measures."""
     from linkpose.board import Board
     from linkpose.cli import live
-    from linkpose.cli.view import Extremes, View, final_table
-    from linkpose.sensors.measurements import Floats, Measurements
+    from linkpose.cli.keys import Keys
 
     with contextlib.ExitStack() as stack:
         connected = stack.enter_context(
@@ -186,8 +190,7 @@ def _live(
                 notify=console.say,
             )
         )  # fmt: skip
-        from linkpose.estimation import Estimator, LiveEstimator
-        from linkpose.page.status import Status
+        from linkpose.estimation import Estimator
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board(request.filter_names, connected)
@@ -196,55 +199,122 @@ def _live(
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force, plain=request.plain)
-        page = stack.enter_context(
-            request.page.open(estimator.columns, estimator.rig, connected.port, console.say, on_mark=connected.mark)
-        )
         head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
-        view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
-        if view.is_shown:
-            stack.enter_context(console.through(view.say))
-        following = LiveEstimator(estimator, compiling.is_ready)
-        extremes = Extremes(estimator.columns)
-
-        def write(rows: Floats) -> None:
-            if len(rows):
-                sink.write(rows)
-                extremes.add(rows)
+        keys = stack.enter_context(Keys(console.shows_progress))
+        run = stack.enter_context(_LiveRun(connected, estimator, compiling, sink, request, console, keys))
 
         def handle(block: Measurements) -> None:
-            rows, newest = following.process(block)
-            write(rows)
-            if len(block):
-                view.show(newest, lambda: connected.health, compiling.progress)
-            else:
-                view.redraw(lambda: connected.health, compiling.progress)
-            if page is not None:
-                page.show(
-                    newest if len(block) else newest[:0],
-                    lambda: Status(connected.health, estimator.found_j2s, compiling.progress),
-                )
-                page.raise_if_stopped()
+            run.process(block)
+            run.follow_keys()
 
         ended = live.run_board(connected, duration, handle)
-        view.close()
-        if compiling.waiting:
-            console.say("The estimates of filters that are still being compiled follow.")
-            compiling.wait(lambda text: console.progress(lambda: text))
-        write(following.finish())
-        health = connected.health
-        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
-        for remark in sink.dropped:
-            console.say(remark)
-        if console.shows_progress:
-            for line in final_table(extremes.summary()):
-                console.say(line)
-        _report_j2s(estimator, console)
-        _report_mice(estimator, console)
-        live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        run.finish(ended)
+        live.show_summary(console, connected.health, request.json_lines, options.written(request.output))
         if request.output:
-            console.say(f"next: linkpose plot {request.output}")
+            options.show_next(console.is_quiet, f"plot {request.output}")
         connected.check_usable()
+
+
+class _LiveRun:
+    """Filters, outputs, view, page and keys of one live run. A context manager: leaving it clears the view."""
+
+    def __init__(
+        self,
+        board: Board,
+        estimator: Estimator,
+        compiling: Precompilation,
+        sink: _Sink,
+        request: Request,
+        console: Console,
+        keys: Keys,
+    ) -> None:
+        from linkpose.cli.view import Extremes, View
+        from linkpose.estimation import LiveEstimator
+
+        self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
+        self._console, self._keys = console, keys
+        self._marks: list[float] = []
+        self._time_s = math.nan
+        self._following = LiveEstimator(estimator, compiling.is_ready)
+        self._extremes = Extremes(estimator.columns)
+        self._exit = contextlib.ExitStack()
+        self._page = self._exit.enter_context(
+            request.page.open(estimator.columns, estimator.rig, board.port, console.say, on_mark=self._mark)
+        )
+        several = len(estimator.filters) > 1
+        legend = "m mark   " + "f next filter   " * several + "q stop"
+        self._view = View(estimator.columns, console.shows_progress, _title(board), legend if keys.are_read else "")
+        self._exit.callback(self._view.close)
+        if self._view.is_shown:
+            self._exit.enter_context(console.through(self._view.say))
+
+    def process(self, block: Measurements) -> None:
+        """Runs the filters over a block, which may be empty, and shows and writes what they give."""
+        from linkpose.page.status import Status
+
+        if len(block):
+            self._time_s = float(block.time_s[-1])
+        rows, newest = self._following.process(block)
+        self._write(rows)
+        if len(block):
+            self._view.show(newest, lambda: self._board.health, self._compiling.progress)
+        else:
+            self._view.redraw(lambda: self._board.health, self._compiling.progress)
+        if self._page is not None:
+            self._page.show(
+                newest if len(block) else newest[:0],
+                lambda: Status(self._board.health, self._estimator.found_j2s, self._compiling.progress),
+            )
+            self._page.raise_if_stopped()
+
+    def follow_keys(self) -> None:
+        """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
+        for key in self._keys.pressed().lower():
+            if key == "m" and math.isfinite(self._time_s):
+                self._mark(self._time_s)
+            elif key == "f":
+                self._view.next_filter()
+            elif key == "q":
+                raise KeyboardInterrupt
+
+    def finish(self, ended: str) -> None:
+        """Writes the rows of filters that were compiled late, the closing line and the final table."""
+        from linkpose.cli.view import final_table
+
+        self._view.close()
+        if self._compiling.waiting:
+            self._console.say("The estimates of filters that are still being compiled follow.")
+            self._compiling.wait(lambda text: self._console.progress(lambda: text))
+        self._write(self._following.finish())
+        health = self._board.health
+        closing = {"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(self._estimator)}
+        if self._marks:
+            closing["marks"] = [round(time_s, 6) for time_s in sorted(self._marks)]
+        self._sink.close(closing)
+        for remark in self._sink.dropped:
+            self._console.say(remark)
+        if self._console.shows_progress:
+            for line in final_table(self._extremes.summary()):
+                self._console.say(line)
+        _report_j2s(self._estimator, self._console)
+        _report_mice(self._estimator, self._console)
+
+    def _mark(self, time_s: float) -> None:
+        self._marks.append(time_s)
+        self._board.mark(time_s)
+        self._console.say(f"mark at {time_s:.2f} s")
+
+    def _write(self, rows: Floats) -> None:
+        if len(rows):
+            self._sink.write(rows)
+            self._extremes.add(rows)
+
+    def __enter__(self) -> _LiveRun:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
 
 
 def _title(board: Board) -> str:

@@ -31,7 +31,7 @@ class Console:
     """Lines for the user on stderr, and a progress line there when it is a terminal."""
 
     def __init__(self, quiet: bool, verbose: bool) -> None:
-        self._quiet, self._verbose = quiet, verbose
+        self.is_quiet, self._verbose = quiet, verbose
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
@@ -40,7 +40,7 @@ class Console:
     def say(self, text: str) -> None:
         """Prints a line."""
         self.clear()
-        if not self._quiet:
+        if not self.is_quiet:
             self._print(printable(text))
 
     @contextlib.contextmanager

@@ -281,11 +281,13 @@ def command(
     }
     for name, track in tracks.items():
         _require_measurements(log, name, track)
+    options.refuse_mixed_output(output, json_lines)
     if output is not None:
         write_tracks(output, tracks, log, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
-        click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
+        text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
+        click.echo(text, err=str(output) == "-")
 
 
 def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:

@@ -229,9 +229,20 @@ def next_and_quiet(function: Function) -> Function:
 
 
 def show_next(quiet: bool, following: str) -> None:
-    """What to type next, on stderr."""
-    if not quiet:
+    """What to type next, on stderr; nothing where a file that it names is the standard output."""
+    if not quiet and "-" not in following.split():
         click.echo(f"next: linkpose {following}", err=True)
+
+
+def written(path: Path | None) -> str:
+    """The end of a message that names the file that was written; empty for none and for the standard output."""
+    return "" if path is None or str(path) == "-" else f": {path}"
+
+
+def refuse_mixed_output(output: Path | None, json_lines: bool) -> None:
+    """Raises UsageError where two kinds of results would be mixed on the standard output."""
+    if json_lines and str(output) == "-":
+        raise click.UsageError("-o - and --json both write to the standard output: leave out one of them")
 
 
 def as_json(function: Function) -> Function:

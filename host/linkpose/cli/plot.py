@@ -50,6 +50,7 @@ def command(
     """
     from linkpose import plotting
     from linkpose.evaluation.motive import read_any
+    from linkpose.recording.csvfile import STDOUT
 
     page = PageOptions(has_page, view_host, view_port)
     page.check()
@@ -67,7 +68,8 @@ def command(
     for remark in [remark for table in tables for remark in table.remarks] + remarks:
         if not quiet:
             click.echo(printable(remark), err=True)
-    click.echo(output)
+    if output != STDOUT:
+        click.echo(output)
 
 
 def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
