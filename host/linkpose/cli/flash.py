@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 
 
 @click.command(name="flash")
-@click.option("--port", metavar="PORT", help="Device, such as /dev/ttyACM0 or COM3. Default: the only connected UNO.")
+@click.option(
+    "--port",
+    metavar="PORT",
+    shell_complete=options.complete_port,
+    help="Device, such as /dev/ttyACM0 or COM3. Default: the only connected UNO.",
+)
 @click.option("--prebuilt", is_flag=True, help="Upload the firmware image of this package without building it.")
 @click.option("--hex", "hex_file", type=options.FILE, metavar="FILE.hex", help="Upload this build of the firmware.")
 @click.option(

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from linkpose.cli.rendering import counted
 from linkpose.errors import LinkposeError, printable
 
 if TYPE_CHECKING:
@@ -136,10 +137,12 @@ def show_summary(console: Console, health: Health, json_lines: bool, where: str)
 
 def health_line(health: Health) -> str:
     """How it goes, in a line."""
-    text = f"{health.duration_s:.1f} s, {health.samples} samples, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    text = (
+        f"{health.duration_s:.1f} s, {counted(health.samples, 'sample')}, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    )
     text += f", {health.corrupt.total} corrupt"
     if health.gaps:
-        text += f", {len(health.gaps)} gaps"
+        text += f", {counted(len(health.gaps), 'gap')}"
     faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
     invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
     saturated = sum(of.get("saturated", 0) for of in health.sensors.values())

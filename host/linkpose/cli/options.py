@@ -100,10 +100,14 @@ def complete_filter(_ctx: click.Context, _param: click.Parameter, incomplete: st
 
 def complete_port(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
     """Names of ports for the shell's completion."""
+    return [name for name in port_names() if name.startswith(incomplete)]
+
+
+def port_names() -> list[str]:
+    """The serial ports that are connected, and the simulated boards."""
     from linkpose.device.ports import find_ports
 
-    names = [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
-    return [name for name in names if name.startswith(incomplete)]
+    return [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
 
 
 def duration(function: Function) -> Function:
@@ -223,8 +227,8 @@ def simulated_outputs(what: str) -> Callable[[Function], Function]:
     return decorate
 
 
-def next_and_quiet(function: Function) -> Function:
-    """-q of a command that ends with what to type next."""
+def quiet(function: Function) -> Function:
+    """-q of a command without -v."""
     return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
 
 
@@ -260,8 +264,8 @@ def plain(function: Function) -> Function:
 
 
 def verbosity(function: Function) -> Function:
-    function = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")(function)
-    return click.option("-v", "--verbose", is_flag=True, help="Say more.")(function)
+    function = click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
+    return click.option("-v", "--verbose", is_flag=True, help="Print details.")(function)
 
 
 def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:

@@ -22,13 +22,20 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=options.FILE, metavar="FILE.png", help="PNG, SVG or PDF; default: the first file's name."
 )
-@click.option("--filter", "wanted", multiple=True, metavar="NAME", help="Draw this filter only; may be repeated.")
+@click.option(
+    "--filter",
+    "wanted",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=options.complete_filter,
+    help="Draw this filter only; may be repeated.",
+)
 @click.option("--map", "map_file", type=options.FILE, metavar="MAP.yaml", help="Draw this map under a robot's path.")
 @click.option("--beacons", type=options.FILE, metavar="BEACONS.csv", help="Draw these beacons with a robot's path.")
 @options.up
 @options.page
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
+@options.quiet
 def command(
     files: tuple[Path, ...],
     output: Path | None,

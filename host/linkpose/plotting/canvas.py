@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linkpose.errors import CannotWrite, FileError, FileExists
+from linkpose.errors import CannotWrite, FileExists, UnknownPicture
 from linkpose.recording.csvfile import STDOUT
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def check_output(path: Path | None, force: bool) -> None:
     if path is None or path == STDOUT:
         return
     if path.suffix.lower() not in FORMATS:
-        raise FileError(path, f"{path} is no picture that linkpose writes; its name must end in {', '.join(FORMATS)}")
+        raise UnknownPicture(path, FORMATS)
     if path.exists() and not force:
         raise FileExists(path)
     if not path.absolute().parent.is_dir():
