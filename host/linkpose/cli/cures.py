@@ -53,7 +53,7 @@ def _nearest_port(name: str) -> str:
 
 
 def cure(error: errors.LinkposeError) -> str:
-    """What to type against an error; empty where the error's own text says it all."""
+    """What to type against an error; empty where the error's own text suffices."""
     for kind in type(error).__mro__:
         if kind in CURES:
             return CURES[kind](error)

@@ -29,7 +29,7 @@ def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, 
     from linkpose.cli import live
 
     console = live.Console(quiet, verbose)
-    with open_session(port, console.say) as session:
+    with open_session(port, console.report) as session:
         tested = _self_test(session) if self_test else {}
         sensors = _observe(session, console)
         report = _report(session, session.health()) | {"health": sensors} | tested

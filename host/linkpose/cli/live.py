@@ -38,7 +38,7 @@ class Console:
         self._shown_at = 0.0
         self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
 
-    def say(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Prints a line."""
         self.clear()
         if not self.is_quiet:
@@ -55,7 +55,7 @@ class Console:
 
     def detail(self, text: str) -> None:
         if self._verbose:
-            self.say(text)
+            self.report(text)
 
     def progress(self, make_text: Callable[[], str]) -> None:
         """Shows a line that replaces the one before, a few times a second."""
@@ -74,7 +74,7 @@ class Console:
         if self.shows_progress:
             prepare(names, lambda text: self.progress(lambda: text))
         else:
-            first = iter([self.say])
+            first = iter([self.report])
             prepare(names, lambda text: next(first, str)(text))
         self.clear()
 
@@ -130,7 +130,7 @@ def show_summary(console: Console, health: Health, json_lines: bool, where: str)
     """The summary on stderr, and as the last line of stdout with --json."""
     from linkpose.device.session import summary
 
-    console.say(f"{health_line(health)}{where}")
+    console.report(f"{health_line(health)}{where}")
     if json_lines:
         click.echo(json.dumps(summary(health)))
 

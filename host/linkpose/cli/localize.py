@@ -141,7 +141,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     type=options.FiniteRange(min=0),
     default=0.02,
     show_default=True,
-    help="k of --noise affine (m/m).",
+    help="Growth k of the range's standard deviation with --noise affine (m/m).",
 )
 @click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
 @click.option("--bearing-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a bearing (rad).")

@@ -111,9 +111,9 @@ def port_names() -> list[str]:
 
 
 def duration(function: Function) -> Function:
-    return click.option("--duration", type=SecondsType(), help="Stop after so many seconds. Default: Ctrl-C ends.")(
-        function
-    )
+    return click.option(
+        "--duration", type=SecondsType(), help="Stop after this time (s). Default: Ctrl-C ends the run."
+    )(function)
 
 
 def page(function: Function) -> Function:
@@ -128,7 +128,10 @@ def page(function: Function) -> Function:
         "--view-host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Serve the page at this address."
     )(function)
     return click.option(
-        "--view", "has_page", is_flag=True, help="Show it in the browser: link or robot in 3-D, charts."
+        "--view",
+        "has_page",
+        is_flag=True,
+        help="Show the estimates in the browser: link or robot in 3-D, charts, sensor health.",
     )(function)
 
 
@@ -137,13 +140,13 @@ def rig_and_j2s(function: Function) -> Function:
         "--j2s-std",
         type=FiniteRange(min=0, min_open=True),
         metavar="METRES",
-        help="How well --j2s is known, each axis: joint-inertial refines it. Default: 0.0001.",
+        help="Standard deviation of --j2s, each axis (m); joint-inertial refines J2S within it. Default: 0.0001.",
     )(function)
     function = click.option(
         "--j2s",
         "joint",
         type=JointType(),
-        help="Vector from the joint centre to the sensor, in its axes (m); auto: estimate it.",
+        help="J2S, the vector from the joint centre to the sensor, in the sensor's axes (m); auto: estimate it.",
     )(function)
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
 
@@ -156,11 +159,11 @@ def rig_to_write(what: str) -> Callable[[Function], Function]:
 
 
 def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
-    """What --j2s and --j2s-std say together."""
+    """The joint that --j2s and --j2s-std describe. Raises UsageError for --j2s-std without a vector."""
     if j2s_std_m is None:
         return joint
     if joint is None or joint is UNKNOWN_JOINT:
-        raise click.UsageError("--j2s-std is of a J2S that is given: add --j2s X,Y,Z")
+        raise click.UsageError("--j2s-std is the uncertainty of --j2s X,Y,Z: add --j2s X,Y,Z")
     return replace(joint, j2s_std_m=j2s_std_m)
 
 
@@ -275,7 +278,7 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
 
 
 def load_recordings(paths: Sequence[Path]) -> list[Recording]:
-    """The recordings, their remarks said on stderr."""
+    """The recordings; their remarks go to stderr."""
     from linkpose.recording.reader import load_recording
 
     loaded = [load_recording(path) for path in paths]

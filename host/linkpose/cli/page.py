@@ -38,12 +38,12 @@ class PageOptions:
         columns: Sequence[str],
         rig: Rig,
         title: str,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         *,
         on_mark: Callable[[float], None] | None = None,
         replay: Replay | None = None,
     ) -> Iterator[Page | None]:
-        """The page if it is wanted; `say` prints its address, and a warning where it is open to the network."""
+        """The page if it is wanted; `report` prints its address, and a warning where it is open to the network."""
         if not self.is_wanted:
             yield None
             return
@@ -53,8 +53,8 @@ class PageOptions:
             columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay
         ) as page:  # fmt: skip
             if not is_loopback(self.host):
-                say(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
-            say(f"page: {page.url}")
+                report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
+            report(f"page: {page.url}")
             yield page
 
     @contextlib.contextmanager
@@ -75,7 +75,7 @@ class PageOptions:
         estimator = Estimator.for_board((), board)
         with (
             Precompilation([f.name for f in estimator.filters]) as compiling,
-            self.open(estimator.columns, estimator.rig, board.port, console.say, on_mark=on_mark) as page,
+            self.open(estimator.columns, estimator.rig, board.port, console.report, on_mark=on_mark) as page,
         ):
             following = LiveEstimator(estimator, compiling.is_ready)
 

@@ -106,7 +106,7 @@ def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, qu
         ending_well(),
         page_options.open(columns, rig, title, lambda text: click.echo(text, err=True), replay=Replay(values)) as page,
     ):
-        console.say("Ctrl-C ends")
+        console.report("Ctrl-C ends")
         with contextlib.suppress(KeyboardInterrupt):
             while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
                 pass

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @click.argument("out", type=options.FILE, required=False)
 @options.port
 @options.duration
-@click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Also keep every byte as it came.")
+@click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Also write every received byte to this file.")
 @click.option("--rig", "rig_file", type=options.FILE, help="Rig file to store with the recording.")
 @board_settings
 @options.page
@@ -65,7 +65,7 @@ def command(
     console = live.Console(quiet, verbose)
     with contextlib.ExitStack() as stack:
         connected = stack.enter_context(
-            Board(port, settings=board, rig=rig_file, raw=raw, force=force, notify=console.say)
+            Board(port, settings=board, rig=rig_file, raw=raw, force=force, notify=console.report)
         )
         connected.record(path, force=force, plain=plain)
         console.detail(f"firmware {connected.hello}")
@@ -73,7 +73,7 @@ def command(
         show = stack.enter_context(page.follow(connected, console, run.mark))
         keys = stack.enter_context(Keys(console.shows_progress))
         end = "q or Ctrl-C ends, m marks an instant" if keys.are_read else "Ctrl-C ends"
-        console.say(f"recording{options.written(path)}" + ("" if duration else f", {end}"))
+        console.report(f"recording{options.written(path)}" + ("" if duration else f", {end}"))
 
         def handle(block: Measurements) -> None:
             run.follow(keys.pressed(), block)
@@ -108,4 +108,4 @@ class _Run:
     def mark(self, time_s: float) -> None:
         """Notes an instant (s) in the recording."""
         self._board.mark(time_s)
-        self._console.say(f"mark at {time_s:.2f} s")
+        self._console.report(f"mark at {time_s:.2f} s")

@@ -75,7 +75,7 @@ class View:
         """Whether the view is on the screen."""
         return self._live is not None
 
-    def say(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""
         if self._live is None:
             click.echo(text, err=True)
@@ -322,7 +322,7 @@ class Extremes:
                 self._count[name] += int(known.sum())
 
     def summary(self) -> dict[str, tuple[float, float, float]]:
-        """Filter -> (lowest, highest, RMS of σ), of filters that knew a height."""
+        """Filter -> (lowest, highest, RMS of σ), of filters that estimated a height."""
         return {
             name: (
                 low,

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".svg", ".pdf")
 DPI = 130
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart: one colour per filter, in every plot.
+# Okabe and Ito's palette, whose colours colour-blind readers can distinguish: one colour per filter, in every plot.
 _BLUE, _PURPLE, _RED, _ORANGE, _GREEN, _SKY = "#0072B2", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#56B4E9"
 _GREY = "#8A8A8A"
 COLOURS = {
