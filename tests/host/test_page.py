@@ -12,11 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.page import Page, Status, geometry
 from linkpose.page.history import PATH_POINTS, SPAN_S, History, Replay
+from linkpose.page.origin import is_own
 from linkpose.sensors.rig import Rig
 
 J2S_M = (-0.09, -0.04, 1.65)
@@ -119,6 +123,35 @@ def test_no_file_of_the_machine_is_served() -> None:
             connection.request("GET", path)
             assert connection.getresponse().status == 404, path
             connection.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "allowed"),
+    [
+        ("127.0.0.1:8080", None, True),  # a program
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", True),
+        ("localhost:8080", "http://localhost:8080", True),
+        ("[::1]:8080", "http://[::1]:8080", True),
+        ("127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:9000", False),  # another program's page on this machine
+        ("127.0.0.1:8080", "null", False),  # a file, a sandboxed frame
+        ("evil.example:8080", "http://evil.example:8080", False),  # DNS rebinding
+        ("evil.example:8080", None, False),
+    ],
+)
+def test_only_the_page_itself_may_connect(host: str, origin: str | None, allowed: bool) -> None:
+    headers = {"Host": host} | ({"Origin": origin} if origin is not None else {})
+    assert is_own(headers, "127.0.0.1") == allowed
+
+
+def test_another_page_cannot_connect() -> None:
+    with Page(LINK, Rig(), "sim://link") as page:
+        url = page.url.replace("http:", "ws:")
+        with connect(url, origin=Origin(page.url), subprotocols=[Subprotocol("viser-v0")]):
+            pass
+        with pytest.raises(InvalidStatus) as refused, connect(url, origin=Origin("http://evil.example")):
+            pass
+        assert refused.value.response.status_code == 403
 
 
 def test_addresses_that_cannot_be_used_are_refused() -> None:

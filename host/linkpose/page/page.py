@@ -15,6 +15,7 @@ import numpy as np
 from linkpose import quantities
 from linkpose.errors import LinkposeError
 from linkpose.page.history import History, Replay
+from linkpose.page.origin import own_requests_only
 from linkpose.page.status import Status
 from linkpose.presentation import Exclusions, RowReader, best_filter, fault_lines, working_sensors
 from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, X, Y
@@ -294,9 +295,7 @@ def _try_to_bind(host: str, port: int) -> None:
 
 def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
     """The server. It prints nothing: stdout is for results."""
-    if (
-        is_named
-    ):  # viser itself would take the next free port, and never return for an address that is not this machine's
+    if is_named:  # viser itself would take the next free port, and wait forever for an address of another machine
         try:
             _try_to_bind(host, port)
         except OSError as reason:
@@ -311,4 +310,5 @@ def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
             return None
 
     rich.reconfigure(quiet=True)  # the global console, with which viser prints; linkpose has its own
-    return Server(host, port, label="linkpose", verbose=False)
+    with own_requests_only(host):  # returns when the server listens
+        return Server(host, port, label="linkpose", verbose=False)
