@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from linkpose.cli.live import Console
     from linkpose.page import Page
     from linkpose.page.history import Replay
+    from linkpose.page.scene import Surroundings
     from linkpose.sensors.measurements import Measurements
     from linkpose.sensors.rig import Rig
 
@@ -42,6 +43,7 @@ class PageOptions:
         *,
         on_mark: Callable[[float], None] | None = None,
         replay: Replay | None = None,
+        surroundings: Surroundings | None = None,
     ) -> Iterator[Page | None]:
         """The page if it is wanted; `report` prints its address, and a warning where it is open to the network."""
         if not self.is_wanted:
@@ -50,7 +52,8 @@ class PageOptions:
         from linkpose.page import Page
 
         with Page(
-            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay
+            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay,
+            surroundings=surroundings,
         ) as page:  # fmt: skip
             if not is_loopback(self.host):
                 report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")

@@ -62,9 +62,10 @@ def command(
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     if has_page:
-        if output or map_file or beacons:
-            raise click.UsageError("--view shows a page; leave out --output, --map and --beacons")
-        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, quiet)
+        if output:
+            raise click.UsageError("--view shows a page; leave out --output")
+        scene = _scene(map_file, beacons)
+        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, scene, quiet)
         return
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force)
@@ -92,10 +93,11 @@ def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
     return Scene(grid, {str(name): place for name, place in places.items()})
 
 
-def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, quiet: bool) -> None:
+def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, scene: Scene | None, quiet: bool) -> None:
     """Plays the first estimate, with the reference if there is one, until Ctrl-C or "stop"."""
     from linkpose.cli.live import Console, ending_well
     from linkpose.page.history import Replay
+    from linkpose.page.scene import Surroundings
     from linkpose.page.tables import rig_of, rows_of
 
     console = Console(quiet, verbose=False)
@@ -104,7 +106,14 @@ def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, qu
     title = "  ".join(table.path.name for table in tables)
     with (
         ending_well(),
-        page_options.open(columns, rig, title, lambda text: click.echo(text, err=True), replay=Replay(values)) as page,
+        page_options.open(
+            columns,
+            rig,
+            title,
+            lambda text: click.echo(text, err=True),
+            replay=Replay(values),
+            surroundings=Surroundings(scene.grid, scene.beacons) if scene is not None else None,
+        ) as page,
     ):
         console.report("Ctrl-C ends")
         with contextlib.suppress(KeyboardInterrupt):
