@@ -223,7 +223,7 @@ def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
         _config.CACHE_DIR = asked
 
 
-compiled = _decorator(True)
+compiled = _decorator(True, nogil=True)  # filters run in parallel over long recordings
 inlined = _decorator(False, inline="always")
 # Without wrappers for Python and without a file of its own: both cost half of the time to compile.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
