@@ -200,6 +200,18 @@ def check_the_gyro_bias_at_rest(rng):
     np.testing.assert_allclose(s.nominal[V:PSI], (nominal + change)[V:PSI], rtol=0, atol=1e-9)
 
 
+def check_the_heading(rng):
+    """ψ = h Zᵀδω, applied to X, gives the X of a sensor whose rate was known to be off by δω along Z."""
+    _, s = random_state(rng)
+    off = 1e-6 * s.tilt
+    _, true = random_state(rng)
+    true.tilt[:], true.north[:] = s.tilt, s.north
+    propagate.rotate_attitude(true, tuple(off))
+    s.nominal[PSI] = s.tilt @ off
+    update.constrain_attitude(s)
+    np.testing.assert_allclose(s.north, true.north, rtol=0, atol=1e-9)
+
+
 def check_the_alignment_to_gravity(rng):
     """δZ = (I − ZZᵀ)(δf + a)/g, with δf from the accelerometer's errors."""
     _, s = random_state(rng)

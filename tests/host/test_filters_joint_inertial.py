@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from functools import lru_cache
 
@@ -68,6 +69,21 @@ def test_its_standard_deviation_is_true(test, errors):
         estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(block)
         nees.append(np.mean(((estimate[:, 0] - truth.height_m) / estimate[:, 1]) ** 2))
     assert 0.5 <= np.mean(nees) <= 2
+
+
+@pytest.mark.parametrize(("errors", "most_deg"), [("calibrated", 1.0), ("datasheet", 2.0)])
+def test_the_heading_since_the_start_and_its_standard_deviation(errors, most_deg):
+    """The gyro bias turns the heading before it is known (by up to 10°); the first updates must turn it back."""
+    rms, nees = [], []
+    for test, seed in itertools.product((1, 2, 3), range(5)):
+        block, truth = recorded(test, seed, errors)
+        estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(block)
+        error = np.unwrap(np.radians(estimate[:, 4])) - np.unwrap(np.radians(truth.yaw_deg))
+        error = np.degrees(error - error[0])[500:]
+        rms.append(np.sqrt(np.mean(error**2)))
+        nees.append(np.mean((error / estimate[500:, 5]) ** 2))
+    assert np.mean(rms) < most_deg
+    assert np.mean(nees) < 2
 
 
 def test_scale_and_alignment_of_the_sensors_are_found():

@@ -78,7 +78,7 @@ def update_scalar(s: Record, k: int, innovation: float, variance: float) -> None
 def constrain_attitude(s: Record) -> None:
     """After an update: ‖Z‖ = 1, X turned by ψ and across Z; and ‖Z‖ = 1 into the covariance of a well-known Z."""
     p, tilt, north = s.covariance, vec.unit(vec.load(s.tilt)), vec.load(s.north)
-    north = vec.axpy(s.nominal[PSI], vec.cross(tilt, north), north)
+    north = vec.axpy(-s.nominal[PSI], vec.cross(tilt, north), north)
     s.nominal[PSI] = 0.0
     vec.store(s.tilt, tilt)
     vec.store(s.north, vec.unit(vec.axpy(-vec.dot(north, tilt), tilt, north)))

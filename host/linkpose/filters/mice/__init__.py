@@ -21,6 +21,7 @@ import numpy as np
 from linkpose.compiling import compiled, inner
 from linkpose.errors import CannotRun
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
+from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
 from linkpose.filters.mice.reading import (
     BIAS_STD,
     HOLD_S,
@@ -31,7 +32,6 @@ from linkpose.filters.mice.reading import (
     follow_gyro,
     read_counts,
 )
-from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
 from linkpose.filters.mice.state import (
     Floats,
     MiceParameters,

@@ -77,7 +77,7 @@ def _cost(state: Record, mice: Records, candidates: int, left_out: int, span: fl
         angular, (before_turn * rotation + by_gyro * turn) / angular,
     )  # fmt: skip
     v, w = state.fit, state.fit_turn
-    cost = before * square(v - motion) + before_turn * (w - rotation) ** 2 + by_gyro * (w - turn) ** 2
+    cost: float = before * square(v - motion) + before_turn * (w - rotation) ** 2 + by_gyro * (w - turn) ** 2
     for i in range(state.count):
         m = mice[i]
         if candidates & left_out & 1 << i:
@@ -96,7 +96,8 @@ def number(mask: int) -> int:
 @inner
 def trusted(state: Record) -> int:
     """Bit mask of the mice that have counts and are not excluded."""
-    return state.sound & ~state.excluded
+    members: int = state.sound & ~state.excluded
+    return members
 
 
 @inner
@@ -141,7 +142,9 @@ def _load(state: Record, mice: Records, is_step: bool, noise_m_s: float, mismatc
         m.weight = 1.0 / (ROUNDING * m.metres_per_count * m.metres_per_count + lasting + noise)
     if not math.isfinite(state.mean_rate):
         return math.nan
-    return (state.mean_rate - state.bias) * span if is_step else state.window_turn - state.bias * span
+    turn: float = state.mean_rate * span if is_step else state.window_turn
+    turn -= state.bias * span
+    return turn
 
 
 @inner

@@ -87,7 +87,7 @@ def end_step(state: Record) -> None:
 @inner
 def variance(m: Record, step: float, speed2: float, scatter: float, noise_m_s: float) -> float:
     """σ_i² of one mouse's velocity over a step ((m/s)²)."""
-    count = m.metres_per_count / step
+    count: float = m.metres_per_count / step
     return ROUNDING * count * count + scatter * scatter * speed2 + noise_m_s * noise_m_s
 
 

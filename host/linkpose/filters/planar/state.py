@@ -68,7 +68,7 @@ _FIELDS = [
     ("floors", "i8"),  # how often the floor has changed
     ("chi2", "f8"),  # of the last innovation
     ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
-    # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, and x and y of each mouse in `seen_by`.
+    # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
     ("seen_by", "i8"),  # bit mask
@@ -89,7 +89,7 @@ def _with_alias(fields: list[Any], whole: str, name: str, dtype: Any) -> np.dtyp
     """A record in which the memory of a field has a second name and type."""
     plain = np.dtype(fields, align=True)
     names = list(plain.names or ())
-    places = plain.fields or {}
+    places: Any = plain.fields
     return np.dtype(
         {
             "names": [*names, name],
