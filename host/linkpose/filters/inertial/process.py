@@ -267,12 +267,13 @@ def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu
 def _bias_walk(s: Record, q: Record) -> float:
     """Random walk of the gyro bias ((rad/s)/√s); more where the joint's constraint leaves over more than its floor.
 
-    Play, bending and the sensor's nonlinearity then act as a bias that follows the motion.
+    Play, bending and the sensor's nonlinearity then act as a bias that follows the motion, and a bias that drifts fast
+    shows there too. The third power makes the change steep: twice the floor allows eight times the walk.
     """
     if not q.has_joint:
         return q.gyro_bias_walk_rad_s
     share = math.sqrt(max(s.residual_square / s.reach_square, q.least_residual**2)) / q.least_residual
-    return min(q.gyro_bias_walk_rad_s * share, q.most_bias_walk_rad_s)
+    return min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s)
 
 
 @inner
