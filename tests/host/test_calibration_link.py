@@ -384,3 +384,25 @@ def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
     assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)
     with pytest.raises(LinkposeError, match="six rests do not fit 10 s: simulate 23 s or more"):
         LinkRun(1, 0, 10.0, rests=True)
+
+
+def test_the_sigma_of_bias_and_offset_reach_the_filters(tmp_path):
+    """`calibrate imu` writes its own figures; filters start from them."""
+    found = calibrate_imu([turned_over(np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]))])
+    assert np.abs(found.gyro_bias_rad_s - BIAS).max() < 3 * found.gyro_bias_std_rad_s < 0.006
+    assert np.abs(found.accel_offset_m_s2 - OFFSET).max() < 3 * found.accel_offset_std_m_s2 < 0.1
+    with_calibration(Rig(), found).save(tmp_path / "rig.toml")
+    rig = Rig.load(tmp_path / "rig.toml").with_j2s((0.0, 0.0, 1.0))
+    gyro, accel = rig.imu.gyro_bias_std_rad_s, rig.imu.accel_offset_std_m_s2
+    assert (gyro, accel) == pytest.approx((found.gyro_bias_std_rad_s, found.accel_offset_std_m_s2), rel=0.01)
+    states = [*filters.create("joint-inertial", rig).states, filters.create("tilt-inertial", rig).state]
+    for state in states:
+        assert state.prior[6:9] == pytest.approx(gyro**2) and state.prior[9:12] == pytest.approx(accel**2)
+    undeclared = filters.create("tilt-inertial", Rig().with_j2s((0.0, 0.0, 1.0))).state
+    assert undeclared.prior[6] > 0.01
+
+
+@pytest.mark.parametrize("key", ["gyro_bias_std_rad_s", "accel_offset_std_m_s2"])
+def test_a_sigma_of_zero_is_refused(key):
+    with pytest.raises(LinkposeError, match=f"imu.{key} is 0; it must be above 0"):
+        Rig.from_dict({"imu": {key: 0}}, "rig.toml")

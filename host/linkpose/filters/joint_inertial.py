@@ -19,10 +19,22 @@ import numpy as np
 from linkpose.filters._imu import ImuCalibration
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
-from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, PSI, D, Floats, fresh_state, record_of, roll_pitch_deg
+from linkpose.filters.inertial.state import (
+    BA,
+    BG,
+    ESTIMATE,
+    MA,
+    PSI,
+    D,
+    Floats,
+    SensorErrors,
+    fresh_state,
+    record_of,
+    roll_pitch_deg,
+)  # fmt: skip
 from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
-from linkpose.sensors.rig import Rig
+from linkpose.sensors.rig import Imu, Rig
 
 _HYPOTHESES = (CALIBRATED, DATA_SHEET)
 
@@ -66,6 +78,15 @@ class InertialParameters(NamedTuple):
     least_turn_rad_s: float = 0.001  # σ of the rate of a sensor that is held still
 
 
+def declared(errors: SensorErrors, imu: Imu) -> SensorErrors:
+    """The errors with the standard deviations of bias and offset that a rig file declares; others as they were."""
+    gyro, accel = imu.gyro_bias_std_rad_s, imu.accel_offset_std_m_s2
+    return errors._replace(
+        gyro_bias_rad_s=errors.gyro_bias_rad_s if gyro is None else gyro,
+        accel_bias_m_s2=errors.accel_bias_m_s2 if accel is None else accel,
+    )
+
+
 class JointInertialFilter:
     """The filter over blocks of samples. J2S is known to the rig's standard deviation and refined from there."""
 
@@ -88,7 +109,9 @@ class JointInertialFilter:
             raise ValueError("joint-inertial needs J2S, at least as a guess")
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
-        self._states = [fresh_state(errors, rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES]
+        self._states = [
+            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
+        ]
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 

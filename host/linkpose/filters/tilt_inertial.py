@@ -27,7 +27,7 @@ from linkpose.filters.inertial.state import (
     record_of,
     roll_pitch_deg,
 )
-from linkpose.filters.joint_inertial import InertialParameters
+from linkpose.filters.joint_inertial import InertialParameters, declared
 from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -59,7 +59,9 @@ class TiltInertialFilter:
         self._record = record_of(self.parameters)
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
-        self._states = fresh_state(_ERRORS, j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE)
+        self._states = fresh_state(
+            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
+        )
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 
