@@ -271,9 +271,9 @@ def _bias_walk(s: Record, q: Record) -> float:
     shows there too. The third power makes the change steep: twice the floor allows eight times the walk.
     """
     if not q.has_joint:
-        return q.gyro_bias_walk_rad_s
+        return float(q.gyro_bias_walk_rad_s)
     share = math.sqrt(max(s.residual_square / s.reach_square, q.least_residual**2)) / q.least_residual
-    return min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s)
+    return float(min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s))
 
 
 @inner
