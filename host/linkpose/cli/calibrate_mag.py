@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @options.rig_to_write("Rig file to write the magnetometer's calibration into.")
 @click.option("--force", is_flag=True, help="Write the rig file even if the field is not the earth's.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate hard iron, soft iron and the axes of the magnetometer, and write them into the rig file.
 
