@@ -13,10 +13,10 @@ import click
 import pytest
 
 from linkpose.cli import group
-from linkpose.cli.rendering import counted
 from linkpose.device import ports
 from linkpose.device.ports import PortInfo
 from linkpose.plotting.canvas import FORMATS
+from linkpose.presentation import counted
 
 HOST = Path(__file__).parents[2] / "host"
 

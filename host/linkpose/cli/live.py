@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.cli.rendering import counted
 from linkpose.errors import LinkposeError, printable
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.board import Board
