@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import sys
+from collections.abc import Callable, Mapping
 from typing import Any
 
 
@@ -26,6 +27,16 @@ class Keys:
     def pressed(self) -> str:
         """The characters since the last call, empty where there are none. Never waits."""
         return self._read() if self._is_open else ""
+
+    def follow(self, actions: Mapping[str, Callable[[], object]]) -> None:
+        """Runs the action of each key pressed since the last call.
+
+        Raises KeyboardInterrupt for q, which ends a run as Ctrl-C does.
+        """
+        for key in self.pressed().lower():
+            if key == "q":
+                raise KeyboardInterrupt
+            actions.get(key, lambda: None)()
 
     if sys.platform == "win32":
 

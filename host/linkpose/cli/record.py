@@ -16,6 +16,7 @@ from linkpose.cli.page import PageOptions
 
 if TYPE_CHECKING:
     from linkpose.board import Board
+    from linkpose.cli.keys import Keys
     from linkpose.cli.live import Console
     from linkpose.sensors.measurements import Measurements
 
@@ -76,7 +77,7 @@ def command(
         console.report(f"recording{options.written(path)}" + ("" if duration else f", {end}"))
 
         def handle(block: Measurements) -> None:
-            run.follow(keys.pressed(), block)
+            run.follow(keys, block)
             show(block)
 
         live.run_board(connected, duration, handle)
@@ -92,18 +93,14 @@ class _Run:
         self._board, self._console = board, console
         self._time_s = math.nan
 
-    def follow(self, keys: str, block: Measurements) -> None:
+    def follow(self, keys: Keys, block: Measurements) -> None:
         """Shows the progress and does what the keys ask for. Raises KeyboardInterrupt to end the recording."""
         from linkpose.cli.live import health_line
 
         if len(block):
             self._time_s = float(block.time_s[-1])
         self._console.progress(lambda: health_line(self._board.health))
-        for key in keys.lower():
-            if key == "m" and math.isfinite(self._time_s):
-                self.mark(self._time_s)
-            elif key == "q":
-                raise KeyboardInterrupt
+        keys.follow({"m": lambda: self.mark(self._time_s)} if math.isfinite(self._time_s) else {})
 
     def mark(self, time_s: float) -> None:
         """Notes an instant (s) in the recording."""

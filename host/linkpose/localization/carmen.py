@@ -20,10 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import Event, Log, LogFile, Scan, in_order, read_number
+from linkpose.localization.events import Event, Log, LogFile, Scan, count, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
-from linkpose.presentation import counted
 
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams
@@ -92,10 +91,10 @@ def read_carmen(path: Path) -> LogFile:
             f"{path} holds no {', '.join(KEYWORDS[:-1])} or {KEYWORDS[-1]} lines; give a CARMEN log or a CSV log"
         )
     if len(timed) < len(readings):
-        remarks.append(f"{path}: {counted(len(readings) - len(timed), 'line')} without a time left out")
+        remarks.append(f"{path}: {count(len(readings) - len(timed), 'line')} without a time left out")
     ordered, moved = in_order(timed)
     if moved:
-        remarks.append(f"{path}: {counted(moved, 'line')} moved into the order of time")
+        remarks.append(f"{path}: {count(moved, 'line')} moved into the order of time")
     return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks))
 
 

@@ -13,7 +13,6 @@ from typing import ClassVar, Protocol, TypeVar
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
-from linkpose.presentation import counted
 from linkpose.recording.csvfile import create, write_all
 
 HEADER = ("time_s", "kind", "a", "b", "c")
@@ -76,6 +75,11 @@ class LogFile:
     remarks: tuple[str, ...]
 
 
+def count(number: int, noun: str) -> str:
+    """1 line, 2 lines."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def in_order(items: list[Timed]) -> tuple[list[Timed], int]:
     """The items in order of time (a stable sort), and how many had an earlier time than one before."""
     latest, moved = -math.inf, 0
@@ -105,10 +109,10 @@ def read_events(path: Path) -> LogFile:
         )
     remarks = []
     if len(kept) < len(events):
-        remarks.append(f"{path}: {counted(len(events) - len(kept), 'negative range')} left out")
+        remarks.append(f"{path}: {count(len(events) - len(kept), 'negative range')} left out")
     ordered, moved = in_order(kept)
     if moved:
-        remarks.append(f"{path}: {counted(moved, 'row')} moved into the order of time")
+        remarks.append(f"{path}: {count(moved, 'row')} moved into the order of time")
     return LogFile(list(ordered), None, tuple(remarks))
 
 
