@@ -394,10 +394,7 @@ def test_kill_9_at_any_moment_leaves_a_readable_file(tmp_path):
 def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
     path = tmp_path / "r.csv"
     command = [*CLI, "record", path, "--port", "sim://link", "--json"]
-    # A shell starts its background jobs with SIGINT ignored, and a child inherits that: the terminal's is restored.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 20
     while not (path.exists() and path.read_bytes().count(b"\n") > 20):
         assert time.monotonic() < deadline
