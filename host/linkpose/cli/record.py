@@ -74,7 +74,8 @@ def command(
         show = stack.enter_context(page.follow(connected, console, run.mark))
         keys = stack.enter_context(Keys(console.shows_progress))
         end = "q or Ctrl-C ends, m marks an instant" if keys.are_read else "Ctrl-C ends"
-        console.report(f"recording{options.written(path)}" + ("" if duration else f", {end}"))
+        to = "" if str(path) == "-" else f" to {path}"
+        console.report(f"recording{to}" + ("" if duration else f", {end}"))
 
         def handle(block: Measurements) -> None:
             run.follow(keys, block)
