@@ -6,7 +6,6 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -244,13 +243,14 @@ class _LiveRun:
         console: Console,
         keys: Keys,
     ) -> None:
+        from linkpose.cli.keys import Marker
         from linkpose.cli.view import Extremes, View
         from linkpose.estimation import LiveEstimator
 
         self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
         self._console, self._keys = console, keys
         self._marks: list[float] = []
-        self._time_s = math.nan
+        self._marker = Marker(self._mark)
         self._following = LiveEstimator(estimator, compiling.is_ready)
         self._extremes = Extremes(estimator.columns)
         self._exit = contextlib.ExitStack()
@@ -266,8 +266,7 @@ class _LiveRun:
 
     def process(self, block: Measurements) -> None:
         """Runs the filters over a block, which may be empty, and shows and writes what they give."""
-        if len(block):
-            self._time_s = float(block.time_s[-1])
+        self._marker.advance(block)
         rows, newest = self._following.process(block)
         self._write(rows)
         if len(block):
@@ -279,10 +278,7 @@ class _LiveRun:
 
     def follow_keys(self) -> None:
         """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
-        actions: dict[str, Callable[[], object]] = {"f": self._view.next_filter}
-        if math.isfinite(self._time_s):
-            actions["m"] = lambda: self._mark(self._time_s)
-        self._keys.follow(actions)
+        self._keys.follow({"m": self._marker, "f": self._view.next_filter})
 
     def finish(self, ended: str) -> None:
         """Writes the rows of filters that were compiled late, the closing line and the final table."""

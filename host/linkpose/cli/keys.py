@@ -2,11 +2,37 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from linkpose.sensors.measurements import Measurements
+
+
+class Marker:
+    """Marks the newest sample's instant each time it is called, or the first sample's if there is none yet."""
+
+    def __init__(self, mark: Callable[[float], object]) -> None:
+        """`mark` is called with the time (s) of each mark."""
+        self._mark = mark
+        self._time_s = math.nan
+        self._is_due = False
+
+    def advance(self, block: Measurements) -> None:
+        """Takes the samples that arrived, which may be none."""
+        if len(block):
+            self._time_s = float(block.time_s[-1])
+            if self._is_due:
+                self()
+
+    def __call__(self) -> None:
+        self._is_due = not math.isfinite(self._time_s)
+        if not self._is_due:
+            self._mark(self._time_s)
 
 
 class Keys:

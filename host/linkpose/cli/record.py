@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -91,17 +90,18 @@ class _Run:
     """The progress line and the keys of a recording."""
 
     def __init__(self, board: Board, console: Console) -> None:
+        from linkpose.cli.keys import Marker
+
         self._board, self._console = board, console
-        self._time_s = math.nan
+        self._marker = Marker(self.mark)
 
     def follow(self, keys: Keys, block: Measurements) -> None:
         """Shows the progress and does what the keys ask for. Raises KeyboardInterrupt to end the recording."""
         from linkpose.cli.live import health_line
 
-        if len(block):
-            self._time_s = float(block.time_s[-1])
+        self._marker.advance(block)
         self._console.progress(lambda: health_line(self._board.health))
-        keys.follow({"m": lambda: self.mark(self._time_s)} if math.isfinite(self._time_s) else {})
+        keys.follow({"m": self._marker})
 
     def mark(self, time_s: float) -> None:
         """Notes an instant (s) in the recording."""
