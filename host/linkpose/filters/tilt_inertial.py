@@ -37,7 +37,10 @@ from linkpose.sensors.rig import Rig
 _ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
 # Half the χ² of 21 sensor errors: 3.8σ of all of them at once.
 _LARGEST_DISTANCE = 150.0
-PARAMETERS = InertialParameters(has_joint=0.0, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5)
+# Without a joint, what the models leave over shows in the bias only: its walk is that of a joint with much play.
+PARAMETERS = InertialParameters(
+    has_joint=0.0, gyro_bias_walk_rad_s=3e-4, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5
+)
 
 
 class TiltInertialFilter:
@@ -85,11 +88,11 @@ class TiltInertialFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.recarray(len(block), ESTIMATE)
+        estimates = np.empty(len(block), ESTIMATE)
         process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
             self._imu, self._record, self._states, estimates,
         )  # fmt: skip
         if not self._has_height:
-            estimates.height = estimates.height_std = np.nan
-        return np.column_stack([estimates.height, estimates.height_std, *roll_pitch_deg(estimates.tilt)])
+            estimates["height"] = estimates["height_std"] = np.nan
+        return np.column_stack([estimates["height"], estimates["height_std"], *roll_pitch_deg(estimates["tilt"])])
