@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write J2S into.")
 @click.option("--imu", "with_imu", is_flag=True, help="Write the sensor's bias, offset and scale as well.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate J2S, the vector from the joint centre to the sensor in its axes, and write it into the rig file.
 

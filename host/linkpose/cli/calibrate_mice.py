@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     help="Length of the straight line (m). Without it the scale comes from the turn and from where the mice sit.",
 )
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, json_lines: bool, quiet: bool) -> None:
     """Estimate counts per metre and mounting angle of each mouse, and write them into the rig file.
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.rig_to_write("Rig file to write the noise into.")
 @click.option("--force", is_flag=True, help="Write the rig file even if the sensor was not at rest.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate white noise, bias instability, random walk and temperature drift from a long rest.
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from linkpose.cli.rendering import counted
 from linkpose.errors import LinkposeError, printable
 
 if TYPE_CHECKING:
@@ -31,16 +32,16 @@ class Console:
     """Lines for the user on stderr, and a progress line there when it is a terminal."""
 
     def __init__(self, quiet: bool, verbose: bool) -> None:
-        self._quiet, self._verbose = quiet, verbose
+        self.is_quiet, self._verbose = quiet, verbose
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
         self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
 
-    def say(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Prints a line."""
         self.clear()
-        if not self._quiet:
+        if not self.is_quiet:
             self._print(printable(text))
 
     @contextlib.contextmanager
@@ -54,7 +55,7 @@ class Console:
 
     def detail(self, text: str) -> None:
         if self._verbose:
-            self.say(text)
+            self.report(text)
 
     def progress(self, make_text: Callable[[], str]) -> None:
         """Shows a line that replaces the one before, a few times a second."""
@@ -73,7 +74,7 @@ class Console:
         if self.shows_progress:
             prepare(names, lambda text: self.progress(lambda: text))
         else:
-            first = iter([self.say])
+            first = iter([self.report])
             prepare(names, lambda text: next(first, str)(text))
         self.clear()
 
@@ -129,17 +130,19 @@ def show_summary(console: Console, health: Health, json_lines: bool, where: str)
     """The summary on stderr, and as the last line of stdout with --json."""
     from linkpose.device.session import summary
 
-    console.say(f"{health_line(health)}{where}")
+    console.report(f"{health_line(health)}{where}")
     if json_lines:
         click.echo(json.dumps(summary(health)))
 
 
 def health_line(health: Health) -> str:
     """How it goes, in a line."""
-    text = f"{health.duration_s:.1f} s, {health.samples} samples, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    text = (
+        f"{health.duration_s:.1f} s, {counted(health.samples, 'sample')}, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    )
     text += f", {health.corrupt.total} corrupt"
     if health.gaps:
-        text += f", {len(health.gaps)} gaps"
+        text += f", {counted(len(health.gaps), 'gap')}"
     faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
     invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
     saturated = sum(of.get("saturated", 0) for of in health.sensors.values())

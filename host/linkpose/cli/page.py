@@ -1,4 +1,4 @@
-"""The page of `estimate --live` and `plot` with `--view`."""
+"""The page of `estimate --live`, `record` and `plot` with `--view`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
+    from linkpose.board import Board
+    from linkpose.cli.live import Console
     from linkpose.page import Page
     from linkpose.page.history import Replay
+    from linkpose.page.scene import Surroundings
+    from linkpose.sensors.measurements import Measurements
     from linkpose.sensors.rig import Rig
 
 
@@ -35,24 +39,59 @@ class PageOptions:
         columns: Sequence[str],
         rig: Rig,
         title: str,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         *,
         on_mark: Callable[[float], None] | None = None,
         replay: Replay | None = None,
+        surroundings: Surroundings | None = None,
     ) -> Iterator[Page | None]:
-        """The page if it is wanted; `say` prints its address, and a warning where it is open to the network."""
+        """The page if it is wanted; `report` prints its address, and a warning where it is open to the network."""
         if not self.is_wanted:
             yield None
             return
         from linkpose.page import Page
 
         with Page(
-            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay
+            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay,
+            surroundings=surroundings,
         ) as page:  # fmt: skip
             if not is_loopback(self.host):
-                say(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
-            say(f"page: {page.url}")
+                report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
+            report(f"page: {page.url}")
             yield page
+
+    @contextlib.contextmanager
+    def follow(
+        self, board: Board, console: Console, on_mark: Callable[[float], None]
+    ) -> Iterator[Callable[[Measurements], None]]:
+        """A function that takes the board's blocks, runs all filters that can run, and shows the estimates on the page.
+
+        Without --view it does nothing. It raises KeyboardInterrupt once the user has pressed "stop".
+        """
+        if not self.is_wanted:
+            yield lambda _: None
+            return
+        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.page.status import Status
+        from linkpose.precompile import Precompilation
+
+        estimator = Estimator.for_board((), board)
+        with (
+            Precompilation([f.name for f in estimator.filters]) as compiling,
+            self.open(estimator.columns, estimator.rig, board.port, console.report, on_mark=on_mark) as page,
+        ):
+            following = LiveEstimator(estimator, compiling.is_ready)
+
+            def show(block: Measurements) -> None:
+                _, newest = following.process(block)
+                if page is not None:
+                    page.show(
+                        newest if len(block) else newest[:0],
+                        lambda: Status(board.health, estimator.found_j2s, compiling.progress),
+                    )
+                    page.raise_if_stopped()
+
+            yield show
 
 
 def is_loopback(host: str) -> bool:
