@@ -29,10 +29,11 @@ from typing import Any, TypeVar, cast
 # Numba tries several types for each operation and formats an error for each that does not fit. Colours took 4 % of the
 # time to compile. Numba reads this when it is imported.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
-import numba  # noqa: E402
-from numba.core.caching import FunctionCache, IndexDataCacheFile  # noqa: E402
+import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.runtime.nrt import rtsys
 
-from linkpose.lean_compiler import Inner, Outer  # noqa: E402
+from linkpose.lean_compiler import Inner, Outer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -181,9 +182,14 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
         self._cache_file: Any = _CheckedFiles(self._cache_path, self._impl.filename_base, source_stamp)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled function for these types of arguments, None if it is not cached."""
+        """The compiled function for these types of arguments, None if it is not cached.
+
+        Numba's own method first registers all that it can compile (0.6 s of CPU and an import of scipy). Loading needs
+        the runtime's symbols alone, and compiling registers the rest anyway.
+        """
         try:
-            loaded = super().load_overload(sig, target_context)
+            rtsys.initialize(target_context)
+            loaded = self._load_overload(sig, target_context)
             if loaded is None or tuple(loaded.signature.args) == tuple(sig):
                 return loaded
         except Exception:  # code of another numba or LLVM raises anything
@@ -225,7 +231,7 @@ def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
         _config.CACHE_DIR = asked
 
 
-compiled = _decorator(True, no_cfunc_wrapper=True, pipeline_class=Outer)
+compiled = _decorator(True, no_cfunc_wrapper=True, nogil=True, pipeline_class=Outer)  # filters run in parallel
 # Without a wrapper for Python and without a file of its own.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=Inner)
 

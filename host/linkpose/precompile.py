@@ -1,7 +1,7 @@
-"""Compiles filters in separate processes, so that a board can be read at once.
+"""Compiles filters in separate processes, so that a board can be read at once and both cores are used.
 
-numba holds Python's global interpreter lock while it compiles: in this process, samples would wait. The other process
-(`python -m linkpose.precompile NAME...`) keeps the machine code on disk, from where this process loads it in a moment.
+numba holds Python's global interpreter lock while it compiles: in this process, samples would wait. The other processes
+(`python -m linkpose.precompile NAME...`) store the machine code on disk, from where this process loads it in a moment.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from typing import cast
 
 from linkpose import compiling, filters
 
 # The name of what writes estimates as text: every run needs it, whatever its filters.
 TEXT = "text"
+POLL_S = 0.05  # between two looks at what the other processes have compiled
 
 
 class Precompilation:
@@ -23,14 +26,15 @@ class Precompilation:
     def __init__(self, names: Sequence[str]) -> None:
         """Starts to compile those of `names` that are not compiled yet, in two processes.
 
-        One compiles the inertial filters, which share their steps and take longest. The other compiles the rest, those
-        that take least first, so that a first estimate appears soon.
+        One compiles the inertial filters, which share their steps and take longest. The other compiles the rest: first
+        the last, which takes least, so that a first estimate appears soon; the writer of text after it.
         """
-        self._names = [*names, TEXT]
+        self._names = list(names)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter
         if not compiling.can_keep_code():
             return
-        missing = [name for name in reversed(self._names) if not compiling.is_compiled(name)]
+        order = list(reversed(self._names))
+        missing = [name for name in [*order[:1], TEXT, *order[1:]] if not compiling.is_compiled(name)]
         inertial = [name for name in missing if name.endswith("-inertial")]
         for group in (inertial, [name for name in missing if name not in inertial]):
             if not group:
@@ -47,8 +51,8 @@ class Precompilation:
 
     @property
     def waiting(self) -> list[str]:
-        """The filters that are not ready."""
-        return [name for name in self._names if not self.is_ready(name)]
+        """The filters, and TEXT, that are not ready."""
+        return [name for name in [*self._names, TEXT] if not self.is_ready(name)]
 
     @property
     def progress(self) -> str:
@@ -56,13 +60,19 @@ class Precompilation:
         waiting = self.waiting
         if not waiting:
             return ""
-        done = len(self._names) - len(waiting)
-        return f"Compiling filters (first run only) {done + 1}/{len(self._names)} {waiting[0]}"
+        total = len(self._names)
+        done = sum(map(self.is_ready, self._names))
+        what = waiting[0] if waiting[0] != TEXT else "the CSV writer"
+        return f"Compiling filters (first run only) {min(done + 1, total)}/{total} {what}"
 
-    def wait(self) -> None:
-        """Waits until the other processes have ended."""
-        for process in self._processes.values():
-            process.wait()
+    def wait(self, report: Callable[[str], object]) -> None:
+        """Waits until the other processes have ended; `report` receives each new line of progress."""
+        before = ""
+        while (text := self.progress) or any(process.poll() is None for process in self._processes.values()):
+            if text and text != before:
+                report(text)
+                before = text
+            time.sleep(POLL_S)
 
     def __enter__(self) -> Precompilation:
         return self
@@ -74,16 +84,34 @@ class Precompilation:
                 process.wait()
 
 
+def prepare(names: Sequence[str], report: Callable[[str], object]) -> None:
+    """Returns when the filters, or methods of localisation, are compiled. Does nothing where all are.
+
+    `report` receives lines such as "Compiling filters (first run only) 3/6 joint-inertial".
+    """
+    if all(map(compiling.is_compiled, [*names, TEXT])):
+        return
+    if not compiling.can_keep_code():
+        report("Compiling filters (in each run, because no folder for the machine code is writable)")
+        return
+    with Precompilation(names) as compilation:
+        compilation.wait(report)
+
+
 def compile_here(name: str) -> None:
-    """Compiles a filter, or the writer of text, in this process, or loads it; notes that its code is kept."""
+    """Compiles a filter, a method of localisation or the writer of text in this process, and marks it as stored."""
     if name == TEXT:
         import numpy as np
 
         from linkpose.recording.fixedpoint import format_rows
 
         format_rows(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))
-    else:
+    elif name in filters.NAMES:
         filters.warm_up([name])
+    else:
+        from linkpose.localization import localizer
+
+        localizer.warm_up([cast(localizer.Method, name)])
     compiling.mark_compiled(name)
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import pytest
 from hypothesis import settings
 
-from linkpose.cli import main, patience
+from linkpose.cli import main
 from linkpose.device.ports import register_scheme
 
 # The first example may wait for a compiler.
@@ -55,19 +54,3 @@ def refused(linkpose: Callable[..., Result]) -> Callable[..., str]:
         return sentence
 
     return run
-
-
-@pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """From its call on, any wait for the compiler is one to be wondered at."""
-
-    class OutOfPatience:
-        """A timer that is up at once."""
-
-        def __init__(self, _seconds: float, say: Callable[[str], object], words: list[str]) -> None:
-            self.start = lambda: say(*words)
-
-        def cancel(self) -> None:
-            """Too late."""
-
-    return lambda: monkeypatch.setattr(patience, "threading", SimpleNamespace(Timer=OutOfPatience))

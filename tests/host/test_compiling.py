@@ -225,3 +225,24 @@ def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, t
     elsewhere = {**place, "XDG_CACHE_HOME": tmp_path / "mine"}
     assert run(HEIGHT, host, **elsewhere) == "1.5 0"
     assert list((tmp_path / "mine").rglob("*.nbc"))
+
+
+PREPARE = """
+from linkpose.precompile import prepare
+lines = []
+prepare(["tilt", "baro"], lines.append)
+print(lines)
+"""
+
+
+def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
+    place = {"NUMBA_CACHE_DIR": tmp_path / "cache", "NUMBA_DISABLE_JIT": 1}
+    first = eval(run(PREPARE, HOST, **place))
+    assert first and first[0] == "Compiling filters (first run only) 1/2 tilt"
+    assert len(first) == len(set(first))
+    assert run(PREPARE, HOST, **place) == "[]"
+    (tmp_path / "file").touch()
+    places = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "LOCALAPPDATA", "USERPROFILE")
+    nowhere = dict.fromkeys(places, tmp_path / "file" / "below")
+    code = "import linkpose.compiling as c\nc._the_folder = lambda: None\n" + PREPARE
+    assert "in each run" in run(code, HOST, NUMBA_DISABLE_JIT=1, **nowhere)

@@ -16,7 +16,6 @@ from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.page import PageOptions
-from linkpose.cli.patience import while_compiling
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
@@ -130,33 +129,37 @@ def command(
 
 
 def _replay(path: Path, request: Request, console: Console) -> None:
-    """Estimates over a recording, as fast as it goes."""
+    """Estimates over a recording, block by block."""
     from linkpose.estimation import Estimator
-    from linkpose.recording.reader import load_recording
+    from linkpose.recording.ahead import ahead
+    from linkpose.recording.reader import RecordingFile
 
-    recording = load_recording(path)
-    for remark in recording.remarks:
+    recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    for remark in [*recording.remarks, *recording.contradictions(rig)]:
         console.say(remark)
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
-    with while_compiling(console.say):
-        measurements = recording.measurements
-        estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
-        _check(estimator, request, console)
-        if request.smooth:
-            _smooth(estimator)
-        estimator.warm_up()
-    estimates = estimator.process(measurements)
+    estimator = Estimator.for_recording(request.filter_names, rig, recording)
+    _check(estimator, request, console)
+    if request.smooth:
+        _smooth(estimator)
+    console.compile([f.name for f in estimator.filters])
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "rig": rig.as_dict()}
+    rows = 0
     with _Sink(estimator, request, head) as sink:
-        sink.write(estimates)
-        sink.close({"rows": len(estimates), **_outcome(estimator)})
+        blocks = iter([recording.load()]) if request.smooth else recording.blocks()
+        for estimates in ahead(map(estimator.process, blocks)):
+            sink.write(estimates)
+            rows += len(estimates)
+            share = rows / recording.survey.rows
+            console.progress(lambda share=share: f"estimating {path} {share:.0%}")  # type: ignore[misc]
+        sink.close({"rows": rows, **_outcome(estimator)})
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     if request.output:
-        console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
+        console.say(f"{rows} rows of {', '.join(head['filters'])}: {request.output}")
 
 
 def _smooth(estimator: Estimator) -> None:
@@ -231,8 +234,8 @@ def _live(
         ended = live.run_board(connected, duration, handle)
         view.close()
         if compiling.waiting:
-            console.say(f"{compiling.progress}; its estimates follow")
-            compiling.wait()
+            console.say("The estimates of filters that are still being compiled follow.")
+            compiling.wait(lambda text: console.progress(lambda: text))
         write(following.finish())
         health = connected.health
         sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})

@@ -8,7 +8,7 @@ import json
 import signal
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, TypeVar
@@ -66,8 +66,19 @@ class Console:
             sys.stderr.flush()
             self._width = len(text)
 
+    def compile(self, names: Sequence[str]) -> None:
+        """Compiles filters that are not compiled yet. Shows the progress; without a terminal, its first line only."""
+        from linkpose.precompile import prepare
+
+        if self.shows_progress:
+            prepare(names, lambda text: self.progress(lambda: text))
+        else:
+            first = iter([self.say])
+            prepare(names, lambda text: next(first, str)(text))
+        self.clear()
+
     def clear(self) -> None:
-        """Takes the progress line off the screen."""
+        """Removes the progress line from the screen."""
         if self._width:
             sys.stderr.write("\r" + " " * self._width + "\r")
             self._width = 0

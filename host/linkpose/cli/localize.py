@@ -10,7 +10,7 @@ import click
 
 from linkpose import __version__
 from linkpose.cli import options
-from linkpose.cli.patience import while_compiling
+from linkpose.cli.live import Console
 from linkpose.errors import LinkposeError
 
 if TYPE_CHECKING:
@@ -238,7 +238,7 @@ def command(
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
     from linkpose.localization.carmen import is_carmen, read_carmen
     from linkpose.localization.events import read_events
-    from linkpose.localization.localizer import check, localize, most_at_once, warm_up
+    from linkpose.localization.localizer import check, localize, most_at_once
     from linkpose.localization.maps import load_map
     from linkpose.localization.plausibility import check_units
     from linkpose.localization.tables import read_beacons, read_truth, score_track
@@ -275,8 +275,7 @@ def command(
             "at the mean height of the beacons",
             err=True,
         )
-    with while_compiling():
-        warm_up(names)
+    Console(quiet=False, verbose=False).compile(names)
     tracks: dict[str, Track] = {
         method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
     }

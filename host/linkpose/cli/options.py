@@ -20,6 +20,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 LONGEST_LINK_M = 10.0
+ERROR_LEVELS = ("calibrated", "datasheet", "none")
 
 
 class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
@@ -143,6 +144,13 @@ def rig_and_j2s(function: Function) -> Function:
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
 
 
+def rig_to_write(what: str) -> Callable[[Function], Function]:
+    """--rig of a command that writes its part of a rig file."""
+    return click.option(
+        "--rig", "rig_file", type=FILE, default=Path("rig.toml"), show_default=True, metavar="RIG.toml", help=what
+    )
+
+
 def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
     """What --j2s and --j2s-std say together."""
     if j2s_std_m is None:
@@ -155,16 +163,41 @@ def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
 def sensor_errors(function: Function) -> Function:
     return click.option(
         "--errors",
-        type=click.Choice(["calibrated", "datasheet", "none"]),
+        type=click.Choice(ERROR_LEVELS),
         default="calibrated",
         show_default=True,
         help="What the sensors get wrong.",
     )(function)
 
 
+class ErrorsType(click.ParamType):  # type: ignore[type-arg]
+    """Sensor errors of a simulation: a level by name, or a rig file whose noise the sensors have."""
+
+    name = "calibrated|datasheet|none|RIG.toml"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str | Rig:
+        if isinstance(value, Rig) or value in ERROR_LEVELS:
+            return value  # type: ignore[no-any-return]
+        if Path(value).suffix == ".toml":
+            return Rig.load(value)
+        return self.fail(f"{value!r} is neither {', '.join(ERROR_LEVELS)} nor a rig file (.toml)", param, ctx)
+
+
+def sensor_errors_or_rig(function: Function) -> Function:
+    return click.option(
+        "--errors",
+        type=ErrorsType(),
+        default="calibrated",
+        show_default=True,
+        help="Errors of the simulated sensors: a level, or a rig file with the noise that `calibrate noise` measured.",
+    )(function)
+
+
 def up(function: Function) -> Function:
     return click.option(
-        "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Upward axis of a Motive export."
+        "--up",
+        type=click.Choice(["y", "z"]),
+        help="Upward axis of a motion-capture take. Default: y; z for C3D, unless the file states another.",
     )(function)
 
 

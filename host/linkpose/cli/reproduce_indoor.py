@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
-from linkpose.cli.patience import while_compiling
+from linkpose.cli.live import Console
 
 
 @click.command("indoor")
@@ -24,11 +24,9 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
     from linkpose import plotting
     from linkpose.cli.rendering import as_table, progress
     from linkpose.experiments import indoor
-    from linkpose.localization.localizer import warm_up
 
     plotting.check_output(plot_path, force)
-    with while_compiling():
-        warm_up(indoor.FILTERS)
+    Console(quiet=False, verbose=False).compile(indoor.FILTERS)
     variants = indoor.compare(seeds, progress("drives"))
     rows = [variant.as_row() for variant in variants]
     if json_lines:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
-from linkpose.cli.patience import while_compiling
+from linkpose.cli.live import Console
 
 if TYPE_CHECKING:
     from linkpose.experiments.link import Entry
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 @options.as_json
 def command(seeds: int, errors: str, plot_path: Path | None, force: bool, json_lines: bool) -> None:
     """Run Methods A to D and joint-inertial on Tests 1 to 3, and compare with the paper's Tables 1 and 2."""
-    from linkpose import filters, plotting
+    from linkpose import plotting
     from linkpose.experiments.link import METHODS, reproduce, traces
 
     plotting.check_output(plot_path, force)
-    with while_compiling():
-        filters.warm_up(METHODS)
+    Console(quiet=False, verbose=False).compile(METHODS)
     entries = [entry for test in (1, 2, 3) for entry in reproduce(test, seeds, errors)]
     if json_lines:
         for entry in entries:

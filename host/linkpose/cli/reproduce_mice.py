@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
-from linkpose.cli.patience import while_compiling
+from linkpose.cli.live import Console
 
 if TYPE_CHECKING:
     from linkpose.experiments.mice import Redundancy
@@ -26,12 +26,11 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
 
     The robot drives at (1, 1) cm/s, and each mouse's velocity has an error within ±0.25 cm/s, as in the paper.
     """
-    from linkpose import filters, plotting
+    from linkpose import plotting
     from linkpose.experiments.mice import paper_run, redundancy
 
     plotting.check_output(plot_path, force)
-    with while_compiling():
-        filters.warm_up(["mice"])
+    Console(quiet=False, verbose=False).compile(["mice"])
     rows = [row for mice in (2, 3) for row in redundancy(mice, seeds)]
     if json_lines:
         for row in rows:

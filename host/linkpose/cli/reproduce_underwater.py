@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
-from linkpose.cli.patience import while_compiling
+from linkpose.cli.live import Console
 
 
 @click.command("underwater")
@@ -25,11 +25,9 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
     from linkpose import plotting
     from linkpose.cli.rendering import as_table, progress
     from linkpose.experiments import underwater
-    from linkpose.localization.localizer import warm_up
 
     plotting.check_output(plot_path, force)
-    with while_compiling():
-        warm_up(underwater.FILTERS)
+    Console(quiet=False, verbose=False).compile(underwater.FILTERS)
     checks = underwater.check_simulator(seeds)
     cases = underwater.compare(seeds, progress("dives"))
     rows = [row for case in cases for row in case.rows()]

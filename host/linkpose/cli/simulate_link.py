@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
-from linkpose.sensors.rig import Vector
+from linkpose.sensors.rig import Rig, Vector
 
 
 @click.command("link")
@@ -16,7 +16,7 @@ from linkpose.sensors.rig import Vector
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Motion, errors and noise.")
 @click.option("--duration", type=options.SecondsType(), default=65.0, show_default=True, help="Length in seconds.")
 @click.option("--rate", type=click.IntRange(50, 500), default=100, show_default=True, help="Samples per second.")
-@options.sensor_errors
+@options.sensor_errors_or_rig
 @click.option(
     "--j2s",
     type=options.VectorType(),
@@ -36,7 +36,7 @@ def command(
     seed: int,
     duration: float,
     rate: int,
-    errors: str,
+    errors: str | Rig,
     j2s: Vector,
     rests: bool,
     imu2: bool,
@@ -50,6 +50,8 @@ def command(
 
     check_outputs((output, truth), force)
     check_length(duration, rate)
-    write_link(LinkRun(test, seed, duration, rate, errors, j2s, rests=rests, imu2=imu2, mag=mag), output, truth, force)
+    level, noise_of = ("calibrated", errors) if isinstance(errors, Rig) else (errors, None)
+    run = LinkRun(test, seed, duration, rate, level, j2s, rests=rests, imu2=imu2, mag=mag, noise_of=noise_of)
+    write_link(run, output, truth, force)
     following = f"calibrate imu {output} --rig rig.toml" if rests else f"estimate {output} -o estimate.csv"
     options.show_next(quiet, following)

@@ -83,7 +83,7 @@ class JointInertialFilter:
             raise ValueError("joint-inertial needs J2S, at least as a guess")
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
-        self._states = [fresh_state(errors, rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES]
+        self._states = [fresh_state(errors, rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES]
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 

@@ -56,7 +56,7 @@ class TiltInertialFilter:
         self._record = record_of(self.parameters)
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
-        self._states = fresh_state(_ERRORS, j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE)
+        self._states = fresh_state(_ERRORS, j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE)
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 

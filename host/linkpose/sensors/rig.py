@@ -19,6 +19,11 @@ from linkpose.errors import CannotRead, CannotWrite, FileFormatError
 
 Vector = tuple[float, float, float]
 
+# Endings of keys whose values must be above 0.
+_POSITIVE = (
+    "_noise_rad_s", "_noise_m_s2", "_noise_Pa", "_std_m", "_std_rad_s", "_std_m_s2", "counts_per_m", "field_uT",
+    "residual_uT",
+)  # fmt: skip
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
 # A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
@@ -30,12 +35,17 @@ class Joint:
     """The joint of the link. J2S is the vector from the joint centre to the sensor."""
 
     j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None if unknown
-    j2s_std_m: float = 0.0001  # its standard deviation, each axis (m)
+    j2s_std_m: float | Vector = 0.0001  # its standard deviation (m), one for all axes or one for each
 
     @property
     def known_j2s_m(self) -> Vector | None:
         """J2S; None if it is unknown or only a first guess."""
-        return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
+        return self.j2s_m if self.largest_std_m <= _GUESS_M else None
+
+    @property
+    def largest_std_m(self) -> float:
+        """Standard deviation along the axis that is known least (m)."""
+        return max(self.j2s_std_m) if isinstance(self.j2s_std_m, tuple) else self.j2s_std_m
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
@@ -47,10 +57,13 @@ class Imu:
     """Calibration of the MPU-6050: acceleration = (measured - offset) / scale, rate = measured - bias.
 
     The noises are the standard deviations of one sample at rest. The defaults are typical figures of [MPU-6050].
+    Without standard deviations of bias and offset, the filters assume that the sensor may be uncalibrated.
     """
 
     gyro_bias_rad_s: Vector = (0.0, 0.0, 0.0)
+    gyro_bias_std_rad_s: float | None = None  # 1σ of the bias that remains, each axis
     accel_offset_m_s2: Vector = (0.0, 0.0, 0.0)
+    accel_offset_std_m_s2: float | None = None  # 1σ of the offset that remains, each axis
     accel_scale: Vector = (1.0, 1.0, 1.0)
     gyro_noise_rad_s: float = math.radians(0.05)
     accel_noise_m_s2: float = 0.04
@@ -60,6 +73,40 @@ class Imu:
     def known_delay_s(self) -> float:
         """The delay (s); 0 if it is unknown."""
         return self.delay_s or 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise of the inertial sensor as `calibrate noise` measures it, by axis; None if it is unknown.
+
+    Coefficients of [IEEE-952]: density of the white noise N, bias instability B, rate (or acceleration) random walk K,
+    and the change of the bias with the temperature of the chip. B is the least Allan deviation / 0.664.
+    """
+
+    gyro_density_rad_s_sqrtHz: Vector | None = None
+    gyro_instability_rad_s: Vector | None = None
+    gyro_walk_rad_s_sqrts: Vector | None = None
+    gyro_drift_rad_s_degC: Vector | None = None
+    accel_density_m_s2_sqrtHz: Vector | None = None
+    accel_instability_m_s2: Vector | None = None
+    accel_walk_m_s2_sqrts: Vector | None = None
+    accel_drift_m_s2_degC: Vector | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Mag:
+    """Calibration of the magnetometer: field in the inertial sensor's axes = matrix (measured − hard iron).
+
+    `matrix` holds the rows of the soft-iron correction and of the rotation into the inertial sensor's axes.
+    """
+
+    hard_iron_uT: Vector | None = None  # None: the magnetometer is not calibrated
+    matrix_x: Vector = (1.0, 0.0, 0.0)
+    matrix_y: Vector = (0.0, 1.0, 0.0)
+    matrix_z: Vector = (0.0, 0.0, 1.0)
+    field_uT: float = 50.0  # strength of the earth's field where the calibration was recorded
+    residual_uT: float = 1.0  # rms of what the calibration leaves of each reading
+    dip_deg: float | None = None  # angle of the field below the horizon; None if it is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +132,8 @@ class Rig:
 
     joint: Joint = field(default_factory=Joint)
     imu: Imu = field(default_factory=Imu)
+    noise: Noise = field(default_factory=Noise)
+    mag: Mag = field(default_factory=Mag)
     baro: Baro = field(default_factory=Baro)
     mouse: tuple[Mouse, ...] = ()
 
@@ -106,8 +155,13 @@ class Rig:
         tables["mouse"] = list(tables["mouse"])
         if self.joint.j2s_m is None:
             del tables["joint"]
-        if self.imu.delay_s is None:
-            del tables["imu"]["delay_s"]
+        if self.mag.hard_iron_uT is None:
+            del tables["mag"]
+        for name in ("imu", "noise", "mag"):
+            if name in tables:
+                tables[name] = {key: value for key, value in tables[name].items() if value is not None}
+        if not tables["noise"]:
+            del tables["noise"]
         return tables
 
     @staticmethod
@@ -115,7 +169,7 @@ class Rig:
         """The inverse of `as_dict`; `origin` names the file. Raises FileFormatError for an invalid key or value."""
         _refuse_unknown(tables, [f.name for f in fields(Rig)], origin, "")
         parts: dict[str, Any] = {}
-        for name, cls in (("joint", Joint), ("imu", Imu), ("baro", Baro)):
+        for name, cls in (("joint", Joint), ("imu", Imu), ("noise", Noise), ("mag", Mag), ("baro", Baro)):
             if name in tables:
                 parts[name] = _read_table(cls, tables[name], origin, name)
         mice = tables.get("mouse", [])
@@ -177,12 +231,15 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     _refuse_unknown(table, list(known), origin, f"{name}.")
     values: dict[str, Any] = {}
     for key, value in table.items():
-        is_vector = "Vector" in str(known[key].type)
+        kind = str(known[key].type)
+        is_vector = "Vector" in kind and ("float |" not in kind or isinstance(value, list | tuple))
         values[key] = (
             _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
         )
-        if key.endswith(("_noise_rad_s", "_noise_m_s2", "_noise_Pa", "_std_m", "counts_per_m")) and values[key] <= 0:
+        if key.endswith(_POSITIVE) and _least(values[key]) <= 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be above 0")
+        if name == "noise" and not key.endswith("degC") and min(values[key]) < 0:
+            raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; no axis may be below 0")
         if key == "delay_s" and not 0.0 <= values[key] <= 0.1:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be between 0 and 0.1 s")
         if key == "accel_scale" and min(values[key]) <= 0:
@@ -194,6 +251,10 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         raise FileFormatError(
             origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
+
+
+def _least(value: float | Vector) -> float:
+    return min(value) if isinstance(value, tuple) else value
 
 
 def _read_number(value: Any, origin: str, where: str) -> float:

@@ -20,7 +20,7 @@ from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Rig, Vector
+from linkpose.sensors.rig import Imu, Joint, Noise, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
@@ -45,7 +45,9 @@ class PaperTest(NamedTuple):
 TESTS = {1: PaperTest(6.8, 1.0), 2: PaperTest(10.7, 1.12), 3: PaperTest(12.5, 1.2)}
 
 # Streams of random numbers, apart from each other so that a setting changes only what it is about.
-_MOTION, _ERRORS, _WEATHER, _IMU_NOISE, _BARO_NOISE, _IMU2_NOISE, _IMU2_ERRORS, _MAG_NOISE, _MAG_ERRORS = range(9)
+_MOTION, _ERRORS, _WEATHER, _IMU_NOISE, _BARO_NOISE, _IMU2_NOISE, _IMU2_ERRORS, _MAG_NOISE, _MAG_ERRORS, _DRIFT = range(
+    10
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,11 +133,13 @@ class LinkRun:
         rests: bool = False,
         imu2: bool = False,
         mag: bool = False,
+        noise_of: Rig | None = None,
     ) -> None:
         """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer.
 
         `duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
-        swinging the link, as `calibrate imu` asks for. Raises LinkposeError for a value that cannot be.
+        swinging the link, as `calibrate imu` asks for. `noise_of` is a rig whose noise and remaining biases the sensors
+        have, in place of those of `errors`. Raises LinkposeError for a value that cannot be.
         """
         _check(test, seed, duration_s, rate_hz, errors, j2s_m)
         self.test, self.seed, self.duration_s = test, seed, duration_s
@@ -152,8 +156,13 @@ class LinkRun:
         else:
             self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
             self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
-        self.imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS, test]))
-        self.imu2_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _IMU2_ERRORS, test]))
+        rngs = [np.random.default_rng([seed, stream, test]) for stream in (_ERRORS, _IMU2_ERRORS)]
+        if noise_of is None:
+            self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw(errors, rng) for rng in rngs)
+        else:
+            self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw_from(noise_of, rng, rate_hz) for rng in rngs)
+        noise = noise_of.noise if noise_of is not None else Noise()
+        self._drifts = {s: imu.BiasDrift(noise, (seed, s, _DRIFT, test)) for s in (_IMU_NOISE, _IMU2_NOISE)}
         self._hard_iron_uT = mag_model.hard_iron(errors, np.random.default_rng([seed, _MAG_ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
@@ -234,9 +243,11 @@ class LinkRun:
         noise = imu.white((self.seed, stream, self.test), first, len(time_s), 7)
         accel = force @ errors.accel_matrix.T + errors.accel_bias_m_s2 + errors.accel_noise_m_s2 * noise[:, :3]
         rate = moving.rate_rad_s @ errors.gyro_matrix.T + errors.gyro_bias_rad_s
-        rate = rate + errors.gyro_noise_rad_s * noise[:, 4:]
-        disturbed = self.errors != "none"
-        temp = _temperature(time_s) + 2.0 + 0.02 * disturbed * noise[:, 3]  # the chip warms itself
+        chip_degC = _temperature(time_s) + 2.0  # the chip warms itself
+        gyro_drift, accel_drift = self._drifts[stream].at(time_s, chip_degC)
+        rate = rate + errors.gyro_noise_rad_s * noise[:, 4:] + gyro_drift
+        accel = accel + accel_drift
+        temp = chip_degC + 0.02 * (self.errors != "none") * noise[:, 3]
         return np.column_stack(
             [
                 imu.accel_counts(accel, self.accel_range_g),
