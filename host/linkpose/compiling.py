@@ -8,8 +8,7 @@ beside this file: the first place that can be written is used. If none can be wr
 Machine code and its pickled index run with the user's rights. They are loaded only from a folder and files that the
 user owns and that nobody else can write, and each file carries a checksum: a damaged file is recompiled.
 
-Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls; `inlined` for a
-long part of a step that the compiler would otherwise leave as a call.
+Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls.
 """
 
 from __future__ import annotations
@@ -27,9 +26,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+# Numba tries several types for each operation and formats an error for each that does not fit. Colours took 4 % of the
+# time to compile. Numba reads this when it is imported.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.runtime.nrt import rtsys
+
+from linkpose.lean_compiler import Inner, Outer
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -39,6 +43,7 @@ _SOURCES = (
     "__init__.py",
     "compiling.py",
     "errors.py",
+    "lean_compiler.py",
     "filters/**/*.py",
     "localization/**/*.py",
     "recording/**/*.py",
@@ -46,6 +51,8 @@ _SOURCES = (
     "wire/**/*.py",
 )
 _config: Any = numba.config  # its attributes are made as it is imported
+# The steps of filters work in place. Without reference counts they compile in 10 % less time.
+_ALLOCATES_NOTHING = "linkpose.filters."
 _PREFIX = "compiled-"
 _OTHERS_KEPT = 2  # those last used: another version of this package may be at work beside this one
 
@@ -205,7 +212,8 @@ def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     options = {"error_model": "numpy", **options}
 
     def decorate(function: Function) -> Function:
-        made: Any = numba.njit(**options)(function)
+        counts = not function.__module__.startswith(_ALLOCATES_NOTHING)
+        made: Any = numba.njit(_nrt=counts, **options)(function)
         folder = _the_folder() if keep else None
         if folder is not None:
             made._cache = _kept(function, folder)
@@ -223,10 +231,9 @@ def _kept(function: Callable[..., Any], folder: Path) -> _KeptCode:
         _config.CACHE_DIR = asked
 
 
-compiled = _decorator(True, nogil=True)  # filters run in parallel over long recordings
-inlined = _decorator(False, inline="always")
-# Without wrappers for Python and without a file of its own: both cost half of the time to compile.
-inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+compiled = _decorator(True, no_cfunc_wrapper=True, nogil=True, pipeline_class=Outer)  # filters run in parallel
+# Without a wrapper for Python and without a file of its own.
+inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=Inner)
 
 
 def mark_compiled(name: str) -> None:
