@@ -26,6 +26,7 @@ _PASSES = (
     untyped_passes.TranslateByteCode,
     untyped_passes.FixupArgs,
     untyped_passes.IRProcessing,
+    untyped_passes.DeadBranchPrune,  # of arguments that are None
     untyped_passes.GenericRewrites,  # constant indices of tuples
     untyped_passes.ReconstructSSA,
     typed_passes.NopythonTypeInference,
