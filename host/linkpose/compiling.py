@@ -52,7 +52,7 @@ _SOURCES = (
 )
 _config: Any = numba.config  # its attributes are made as it is imported
 # The steps of filters work in place. Without reference counts they compile in 10 % less time.
-_ALLOCATES_NOTHING = "linkpose.filters."
+_ALLOCATE_NOTHING = "filters"  # the part of the package
 _PREFIX = "compiled-"
 _OTHERS_KEPT = 2  # those last used: another version of this package may be at work beside this one
 
@@ -212,7 +212,7 @@ def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     options = {"error_model": "numpy", **options}
 
     def decorate(function: Function) -> Function:
-        counts = not function.__module__.startswith(_ALLOCATES_NOTHING)
+        counts = function.__module__.split(".")[1:2] != [_ALLOCATE_NOTHING]
         made: Any = numba.njit(_nrt=counts, **options)(function)
         folder = _the_folder() if keep else None
         if folder is not None:
