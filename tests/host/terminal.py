@@ -29,7 +29,9 @@ class Terminal:
         self._stream = pyte.ByteStream(self._screen)
         self._leader, follower = pty.openpty()
         self._set_size(columns, rows)
-        environment = {**os.environ, "PYTHONPATH": str(HOST), "TERM": "xterm"}
+        # pytest's workers set COLUMNS and LINES, which would hide the terminal's own size.
+        inherited = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        environment = {**inherited, "PYTHONPATH": str(HOST), "TERM": "xterm"}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "linkpose", *map(str, command)],
             stdin=follower,

@@ -15,11 +15,12 @@ from terminal import Terminal
 import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
-from linkpose.cli.keys import Keys
+from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.view import Extremes, Screen
 from linkpose.estimation import Estimator, LiveEstimator
 from linkpose.presentation import with_std
 from linkpose.sensors.devices import Sensors
+from linkpose.simulation.link import LinkRun
 
 OK = {"imu": {"state": "ok"}, "baro": {"state": "ok"}}
 
@@ -161,6 +162,18 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
     assert len(data_rows(rows)) == len(data_rows(recording)) > 20
     closing = json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))
     assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
+
+
+def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
+    marks: list[float] = []
+    marker, block = Marker(marks.append), LinkRun(1, 0, 1.0).measurements()
+    marker()
+    marker.advance(block[:0])
+    assert marks == []
+    marker.advance(block[:3])
+    marker.advance(block[3:5])
+    marker()
+    assert marks == pytest.approx([0.02, 0.04])
 
 
 def test_a_recording_is_marked_and_ended_by_ctrl_c(tmp_path: Path) -> None:

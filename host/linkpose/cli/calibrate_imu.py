@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
-from linkpose.cli.rendering import counted
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.calibration.imu import ImuCalibration
@@ -28,8 +28,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_imu(loaded)
     with_calibration(rig, found).save(rig_file)
     if json_lines:
@@ -42,9 +41,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
             f"{FEWEST_ATTITUDES} needed.",
             err=True,
         )
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"calibrate joint SWING.csv --rig {rig_file}")
+    options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
 
 
 def _show(found: ImuCalibration) -> None:

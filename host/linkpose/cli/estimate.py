@@ -15,7 +15,7 @@ import click
 from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
-from linkpose.cli.page import PageOptions
+from linkpose.cli.page import PageOptions, show_newest
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
@@ -243,13 +243,14 @@ class _LiveRun:
         console: Console,
         keys: Keys,
     ) -> None:
+        from linkpose.cli.keys import Marker
         from linkpose.cli.view import Extremes, View
         from linkpose.estimation import LiveEstimator
 
         self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
         self._console, self._keys = console, keys
         self._marks: list[float] = []
-        self._time_s = math.nan
+        self._marker = Marker(self._mark)
         self._following = LiveEstimator(estimator, compiling.is_ready)
         self._extremes = Extremes(estimator.columns)
         self._exit = contextlib.ExitStack()
@@ -265,32 +266,19 @@ class _LiveRun:
 
     def process(self, block: Measurements) -> None:
         """Runs the filters over a block, which may be empty, and shows and writes what they give."""
-        from linkpose.page.status import Status
-
-        if len(block):
-            self._time_s = float(block.time_s[-1])
+        self._marker.advance(block)
         rows, newest = self._following.process(block)
         self._write(rows)
         if len(block):
             self._view.show(newest, lambda: self._board.health, self._compiling.progress)
         else:
             self._view.redraw(lambda: self._board.health, self._compiling.progress)
-        if self._page is not None:
-            self._page.show(
-                newest if len(block) else newest[:0],
-                lambda: Status(self._board.health, self._estimator.found_j2s, self._compiling.progress),
-            )
-            self._page.raise_if_stopped()
+        shown = newest if len(block) else newest[:0]
+        show_newest(self._page, shown, self._board, self._estimator, self._compiling)
 
     def follow_keys(self) -> None:
         """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
-        for key in self._keys.pressed().lower():
-            if key == "m" and math.isfinite(self._time_s):
-                self._mark(self._time_s)
-            elif key == "f":
-                self._view.next_filter()
-            elif key == "q":
-                raise KeyboardInterrupt
+        self._keys.follow({"m": self._marker, "f": self._view.next_filter})
 
     def finish(self, ended: str) -> None:
         """Writes the rows of filters that were compiled late, the closing line and the final table."""

@@ -2,10 +2,37 @@
 
 from __future__ import annotations
 
+import math
 import os
 import select
 import sys
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from linkpose.sensors.measurements import Measurements
+
+
+class Marker:
+    """Marks the newest sample's instant each time it is called, or the first sample's if there is none yet."""
+
+    def __init__(self, mark: Callable[[float], object]) -> None:
+        """`mark` is called with the time (s) of each mark."""
+        self._mark = mark
+        self._time_s = math.nan
+        self._is_due = False
+
+    def advance(self, block: Measurements) -> None:
+        """Takes the samples that arrived, which may be none."""
+        if len(block):
+            self._time_s = float(block.time_s[-1])
+            if self._is_due:
+                self()
+
+    def __call__(self) -> None:
+        self._is_due = not math.isfinite(self._time_s)
+        if not self._is_due:
+            self._mark(self._time_s)
 
 
 class Keys:
@@ -26,6 +53,16 @@ class Keys:
     def pressed(self) -> str:
         """The characters since the last call, empty where there are none. Never waits."""
         return self._read() if self._is_open else ""
+
+    def follow(self, actions: Mapping[str, Callable[[], object]]) -> None:
+        """Runs the action of each key pressed since the last call.
+
+        Raises KeyboardInterrupt for q, which ends a run as Ctrl-C does.
+        """
+        for key in self.pressed().lower():
+            if key == "q":
+                raise KeyboardInterrupt
+            actions.get(key, lambda: None)()
 
     if sys.platform == "win32":
 

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.cli.rendering import counted
 from linkpose.errors import LinkposeError, printable
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -88,12 +88,14 @@ class Console:
 def run(stream: Generator[Block, None, None], handle: Callable[[Block], object]) -> str:
     """Passes the blocks of a stream to `handle` until the stream or the user ends it.
 
+    The stream must yield several times a second: a signal takes effect between two blocks, a second one at once.
     Returns which of the two it was: "duration" or "interrupted".
     """
-    with ending_well(), contextlib.closing(stream):
+    with _signals_between_blocks() as raise_if_signalled, contextlib.closing(stream):
         try:
             for block in stream:
                 handle(block)
+                raise_if_signalled()
         except KeyboardInterrupt:
             return "interrupted"
     return "duration"
@@ -108,22 +110,47 @@ def run_board(board: Board, duration_s: float | None, handle: Callable[[Measurem
 
 @contextlib.contextmanager
 def ending_well() -> Iterator[None]:
-    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does.
-
-    A signal that is ignored, as `nohup` ignores SIGHUP, stays so.
-    """
+    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does."""
 
     def interrupt(*_: int | FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    names = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    with _handled_by(interrupt, "SIGTERM", "SIGHUP"):
+        yield
+
+
+@contextlib.contextmanager
+def _signals_between_blocks() -> Iterator[Callable[[], None]]:
+    """A function that raises KeyboardInterrupt once Ctrl-C, SIGTERM or SIGHUP has arrived.
+
+    Raised by the signal itself, it could part a sample's count from its row in the file.
+    """
+    arrived = False
+
+    def note(*_: int | FrameType | None) -> None:
+        nonlocal arrived
+        if arrived:
+            raise KeyboardInterrupt
+        arrived = True
+
+    def raise_if_signalled() -> None:
+        if arrived:
+            raise KeyboardInterrupt
+
+    with _handled_by(note, "SIGINT", "SIGTERM", "SIGHUP"):
+        yield raise_if_signalled
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], object], *names: str) -> Iterator[None]:
+    """These signals call the handler. One that is ignored stays so, as `nohup` ignores SIGHUP; Windows has none."""
     signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {each: signal.signal(each, interrupt) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
+    before = {each: signal.signal(each, handler) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for each, earlier in before.items():
+            signal.signal(each, earlier)
 
 
 def show_summary(console: Console, health: Health, json_lines: bool, where: str) -> None:

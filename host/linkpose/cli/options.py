@@ -279,6 +279,19 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     return replace(rig, joint=joint) if joint else rig
 
 
+def recordings_and_rig(paths: Sequence[Path], rig_file: Path) -> tuple[list[Recording], Rig]:
+    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording."""
+    loaded = load_recordings(paths)
+    return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+
+
+def show_rig_written(rig_file: Path, quiet: bool, following: str) -> None:
+    """The end of a calibration, on stderr: the rig file that was written, and what to type next."""
+    if not quiet:
+        click.echo(f"written to {rig_file}", err=True)
+    show_next(quiet, following)
+
+
 def load_recordings(paths: Sequence[Path]) -> list[Recording]:
     """The recordings; their remarks go to stderr."""
     from linkpose.recording.reader import load_recording

@@ -13,10 +13,12 @@ import click
 if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
+    from linkpose.estimation import Estimator
     from linkpose.page import Page
     from linkpose.page.history import Replay
     from linkpose.page.scene import Surroundings
-    from linkpose.sensors.measurements import Measurements
+    from linkpose.precompile import Precompilation
+    from linkpose.sensors.measurements import Floats, Measurements
     from linkpose.sensors.rig import Rig
 
 
@@ -72,7 +74,6 @@ class PageOptions:
             yield lambda _: None
             return
         from linkpose.estimation import Estimator, LiveEstimator
-        from linkpose.page.status import Status
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board((), board)
@@ -84,14 +85,20 @@ class PageOptions:
 
             def show(block: Measurements) -> None:
                 _, newest = following.process(block)
-                if page is not None:
-                    page.show(
-                        newest if len(block) else newest[:0],
-                        lambda: Status(board.health, estimator.found_j2s, compiling.progress),
-                    )
-                    page.raise_if_stopped()
+                show_newest(page, newest if len(block) else newest[:0], board, estimator, compiling)
 
             yield show
+
+
+def show_newest(
+    page: Page | None, newest: Floats, board: Board, estimator: Estimator, compiling: Precompilation
+) -> None:
+    """Shows the newest row of a live run, which may be empty. Raises KeyboardInterrupt once "stop" was pressed."""
+    from linkpose.page.status import Status
+
+    if page is not None:
+        page.show(newest, lambda: Status(board.health, estimator.found_j2s, compiling.progress))
+        page.raise_if_stopped()
 
 
 def is_loopback(host: str) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +15,7 @@ from linkpose.cli.page import PageOptions
 
 if TYPE_CHECKING:
     from linkpose.board import Board
+    from linkpose.cli.keys import Keys
     from linkpose.cli.live import Console
     from linkpose.sensors.measurements import Measurements
 
@@ -73,10 +73,11 @@ def command(
         show = stack.enter_context(page.follow(connected, console, run.mark))
         keys = stack.enter_context(Keys(console.shows_progress))
         end = "q or Ctrl-C ends, m marks an instant" if keys.are_read else "Ctrl-C ends"
-        console.report(f"recording{options.written(path)}" + ("" if duration else f", {end}"))
+        to = "" if str(path) == "-" else f" to {path}"
+        console.report(f"recording{to}" + ("" if duration else f", {end}"))
 
         def handle(block: Measurements) -> None:
-            run.follow(keys.pressed(), block)
+            run.follow(keys, block)
             show(block)
 
         live.run_board(connected, duration, handle)
@@ -89,21 +90,18 @@ class _Run:
     """The progress line and the keys of a recording."""
 
     def __init__(self, board: Board, console: Console) -> None:
-        self._board, self._console = board, console
-        self._time_s = math.nan
+        from linkpose.cli.keys import Marker
 
-    def follow(self, keys: str, block: Measurements) -> None:
+        self._board, self._console = board, console
+        self._marker = Marker(self.mark)
+
+    def follow(self, keys: Keys, block: Measurements) -> None:
         """Shows the progress and does what the keys ask for. Raises KeyboardInterrupt to end the recording."""
         from linkpose.cli.live import health_line
 
-        if len(block):
-            self._time_s = float(block.time_s[-1])
+        self._marker.advance(block)
         self._console.progress(lambda: health_line(self._board.health))
-        for key in keys.lower():
-            if key == "m" and math.isfinite(self._time_s):
-                self.mark(self._time_s)
-            elif key == "q":
-                raise KeyboardInterrupt
+        keys.follow({"m": self._marker})
 
     def mark(self, time_s: float) -> None:
         """Notes an instant (s) in the recording."""

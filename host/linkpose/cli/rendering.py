@@ -23,11 +23,6 @@ def _with_bar(label: str, is_shown: bool, items: Iterable[Any]) -> Iterator[Any]
         yield from items
 
 
-def counted(number: int, noun: str) -> str:
-    """A number with its noun: 1 gap, 2 gaps."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
 def as_table(rows: Sequence[dict[str, object]]) -> str:
     """Rows with the same keys as text in columns."""
     texts = [list(rows[0]), *([_text(name, value) for name, value in row.items()] for row in rows)]

@@ -254,6 +254,8 @@ class Screen:
                 parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
+        if len(parts[0]) > width:
+            parts[0] = f"HEIGHT {with_std(*values[quantities.HEIGHT], 'm', 4)}"
         return "   ".join(parts)
 
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
