@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from linkpose.sensors.rig import Joint
 if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
+    from linkpose.device.session import Health
     from linkpose.estimation import EstimateWriter, Estimator
 
 WORST_STD_M = 0.03  # of a J2S that the motion has told
@@ -207,6 +208,10 @@ def _live(
         following = LiveEstimator(estimator, compiling.is_ready)
         extremes = Extremes(estimator.columns)
 
+        def health() -> Health:
+            found = connected.health
+            return replace(found, sensors=estimator.excluded.added_to(found.sensors))
+
         def write(rows: Floats) -> None:
             if len(rows):
                 sink.write(rows)
@@ -216,13 +221,13 @@ def _live(
             rows, newest = following.process(block)
             write(rows)
             if len(block):
-                view.show(newest, lambda: connected.health, compiling.progress)
+                view.show(newest, health, compiling.progress)
             else:
-                view.redraw(lambda: connected.health, compiling.progress)
+                view.redraw(health, compiling.progress)
             if page is not None:
                 page.show(
                     newest if len(block) else newest[:0],
-                    lambda: Status(connected.health, estimator.found_j2s, compiling.progress),
+                    lambda: Status(health(), estimator.found_j2s, compiling.progress),
                 )
                 page.raise_if_stopped()
 
@@ -232,8 +237,8 @@ def _live(
             console.say("The estimates of filters that are still being compiled follow.")
             compiling.wait(lambda text: console.progress(lambda: text))
         write(following.finish())
-        health = connected.health
-        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
+        found = health()
+        sink.close({"rows": found.samples, "lost": found.lost, "ended": ended, **_outcome(estimator)})
         for remark in sink.dropped:
             console.say(remark)
         if console.shows_progress:
@@ -241,7 +246,7 @@ def _live(
                 console.say(line)
         _report_j2s(estimator, console)
         _report_mice(estimator, console)
-        live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        live.show_summary(console, found, request.json_lines, f": {request.output}" if request.output else "")
         if request.output:
             console.say(f"next: linkpose plot {request.output}")
         connected.check_usable()
@@ -278,6 +283,8 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     found = estimator.found_j2s
     if found:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    if estimator.excluded.samples:
+        outcome["excluded_mice"] = estimator.excluded.samples
     if estimator.mice_scale:
         outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     return outcome

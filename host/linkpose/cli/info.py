@@ -30,6 +30,7 @@ def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, 
 
     console = live.Console(quiet, verbose)
     with open_session(port, console.say) as session:
+        session.wait_for_mice(0)
         tested = _self_test(session) if self_test else {}
         sensors = _observe(session, console)
         report = _report(session, session.health()) | {"health": sensors} | tested
@@ -171,6 +172,7 @@ def _health_line(sensor: str, of: dict[str, Any]) -> str:
     counts = [f"{of['valid']} of {of['samples']} samples valid"] if "valid" in of else []
     counts += [f"{count} {cause}" for cause, count in of.get("invalid", {}).items()]
     counts += [f"{of['saturated']} saturated"] if of.get("saturated") else []
+    counts += [f"{of['left_out']} left out"] if of.get("left_out") else []
     return f"{sensor} {of['state']}" + (f": {', '.join(counts)}" if counts else "")
 
 
