@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -15,7 +17,7 @@ from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeEr
 from linkpose.precompile import TEXT
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
-from linkpose.recording.reader import Recording, load_recording
+from linkpose.recording.reader import Recording, RecordingFile, load_recording
 from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.health import LEFT_OUT
@@ -91,6 +93,9 @@ class ExcludedMice:
         return merged
 
 
+# Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Twice of it changes nothing
+# that can be measured.
+_LONG_BLOCK = 1000
 # A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
 _SCALE_Z, _SCALE_LEAST = 3.0, 0.01
 
@@ -128,6 +133,13 @@ class Estimator:
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
+    def for_recording(names: Sequence[str], rig: Rig, recording: RecordingFile) -> Estimator:
+        """An estimator for the sensors and mice that gave values in a recording. Raises as the constructor does."""
+        survey = recording.survey
+        sensors = Sensors.MPU6050 if survey.has_gyro else Sensors(0)
+        return Estimator(names, rig, sensors | (Sensors.BMP180 if survey.has_pressure else Sensors(0)), survey.mice)
+
+    @staticmethod
     def for_measurements(names: Sequence[str], rig: Rig, measurements: Measurements) -> Estimator:
         """An estimator for the sensors and mice that gave values. Raises as the constructor does."""
         return Estimator(names, rig, sensors_of(measurements), mice_of(measurements))
@@ -155,8 +167,13 @@ class Estimator:
         self.text(np.zeros((1, len(self.columns))))
 
     def process(self, block: Measurements) -> Floats:
-        """The estimates (N, columns) at the next N samples."""
-        estimates = np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+        """The estimates (N, columns) at the next N samples. The filters run in parallel over a long block."""
+        workers = min(os.cpu_count() or 1, len(self.filters))
+        if len(block) < _LONG_BLOCK or workers < 2:
+            estimates = np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                estimates = np.column_stack([block.time_s, *pool.map(lambda f: f.process(block), self.filters)])
         self.excluded.count(block, estimates)
         return estimates
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 from linkpose.cli.evaluate import command
 from linkpose.cli.plot import command as plot
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.motive import read_any, read_motive
+from linkpose.evaluation.motive import read_motive
+from linkpose.evaluation.references import read_any
 from linkpose.simulation.link import LinkRun
 
 T = np.arange(0, 30, 0.01)

@@ -130,32 +130,37 @@ def command(
 
 
 def _replay(path: Path, request: Request, console: Console) -> None:
-    """Estimates over a recording, as fast as it goes."""
+    """Estimates over a recording, block by block."""
     from linkpose.estimation import Estimator
-    from linkpose.recording.reader import load_recording
+    from linkpose.recording.ahead import ahead
+    from linkpose.recording.reader import RecordingFile
 
-    recording = load_recording(path)
-    for remark in recording.remarks:
+    recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    for remark in [*recording.remarks, *recording.contradictions(rig)]:
         console.say(remark)
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
-    measurements = recording.measurements
-    estimator = Estimator.for_measurements(request.filter_names, rig, measurements)
+    estimator = Estimator.for_recording(request.filter_names, rig, recording)
     _check(estimator, request, console)
     if request.smooth:
         _smooth(estimator)
     console.compile([f.name for f in estimator.filters])
-    estimates = estimator.process(measurements)
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "rig": rig.as_dict()}
+    rows = 0
     with _Sink(estimator, request, head) as sink:
-        sink.write(estimates)
-        sink.close({"rows": len(estimates), **_outcome(estimator)})
+        blocks = iter([recording.load()]) if request.smooth else recording.blocks()
+        for estimates in ahead(map(estimator.process, blocks)):
+            sink.write(estimates)
+            rows += len(estimates)
+            share = rows / recording.survey.rows
+            console.progress(lambda share=share: f"estimating {path} {share:.0%}")  # type: ignore[misc]
+        sink.close({"rows": rows, **_outcome(estimator)})
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     if request.output:
-        console.say(f"{len(estimates)} rows of {', '.join(head['filters'])}: {request.output}")
+        console.say(f"{rows} rows of {', '.join(head['filters'])}: {request.output}")
 
 
 def _smooth(estimator: Estimator) -> None:

@@ -30,24 +30,25 @@ def command(
     reference: Path,
     from_s: float | None,
     to_s: float | None,
-    up: str,
+    up: str | None,
     plot_path: Path | None,
     force: bool,
     json_lines: bool,
     quiet: bool,
 ) -> None:
-    """Compare each filter in ESTIMATE.csv with REFERENCE.csv.
+    """Compare each filter in ESTIMATE with REFERENCE.
 
     Prints root mean square, mean, worst and 95 % error of each quantity. Where the estimate has a standard deviation σ,
     it also prints NEES (the mean of (error/σ)², 1 where σ is right) and the share of errors within ±2σ. Rows without an
     estimate yet are left out.
 
     The two files are aligned in time by cross-correlation where that fits clearly better than their stamps. The
-    reference is a truth of `linkpose simulate`, any CSV with such columns, or OptiTrack Motive's export of three
-    markers: the first at the sensor, the second along its x axis, the third on the side of its y axis.
+    reference is a truth of `linkpose simulate`, any table with such columns, or a motion-capture take (C3D, TRC, CSV of
+    OptiTrack Motive) of three markers: the first at the sensor, the second along its x axis, the third on the side of
+    its y axis.
     """
     from linkpose import plotting
-    from linkpose.evaluation.motive import read_any
+    from linkpose.evaluation.references import read_any
     from linkpose.evaluation.scores import evaluate
     from linkpose.recording.table import read_table
 

@@ -1,9 +1,10 @@
-"""linkpose info"""
+"""`linkpose info`: the board, or a recording."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -19,27 +20,54 @@ OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of th
 
 
 @click.command(name="info")
+@click.argument("recording", type=options.FILE, required=False)
 @options.port
 @click.option("--self-test", is_flag=True, help="Also run the MPU-6050's self-test; keep the board still.")
 @options.as_json
 @options.verbosity
-def command(port: str | None, self_test: bool, json_lines: bool, verbose: bool, quiet: bool) -> None:
-    """Show the board's versions, sensors, settings and data health. Takes about three seconds."""
-    from linkpose.board import open_session
+def command(
+    recording: Path | None, port: str | None, self_test: bool, json_lines: bool, verbose: bool, quiet: bool
+) -> None:
+    """Show the board's versions, sensors, settings and data health, which takes about three seconds, or summarise
+    RECORDING: duration, rate, gaps, losses, invalid samples by cause, settings and noise at rest.
+    """
     from linkpose.cli import live
 
     console = live.Console(quiet, verbose)
-    with open_session(port, console.say) as session:
-        session.wait_for_mice(0)
-        tested = _self_test(session) if self_test else {}
-        sensors = _observe(session, console)
-        report = _report(session, session.health()) | {"health": sensors} | tested
+    if recording is not None:
+        if port or self_test:
+            raise click.UsageError(f"--port and --self-test ask the board: leave them out, or leave out {recording}")
+        report = _summarise(recording, console)
+    else:
+        report = _ask_board(port, self_test, console)
     if json_lines:
         click.echo(json.dumps(report))
     else:
         console.clear()
         for line in _lines(report):
             click.echo(line)
+
+
+def _summarise(path: Path, console: Console) -> dict[str, Any]:
+    """The summary of a recording; its remarks go to stderr."""
+    from linkpose.recording.reader import RecordingFile
+    from linkpose.recording.summary import summarise
+
+    file = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
+    for remark in file.remarks:
+        console.say(remark)
+    return summarise(file)
+
+
+def _ask_board(port: str | None, self_test: bool, console: Console) -> dict[str, Any]:
+    """What the board reports, and the health of its sensors' data."""
+    from linkpose.board import open_session
+
+    with open_session(port, console.say) as session:
+        session.wait_for_mice(0)
+        tested = _self_test(session) if self_test else {}
+        sensors = _observe(session, console)
+        return _report(session, session.health()) | {"health": sensors} | tested
 
 
 def _observe(session: Session, console: Console) -> dict[str, Any]:
@@ -122,7 +150,10 @@ def _rounded(value: float | None) -> float | None:
 
 
 # Units at the end of a report's keys, as a person reads them.
-_UNITS = {"_hz": "Hz", "_g": "g", "_deg_s": "°/s", "_ppm": "ppm", "_percent": "%", "_us": "µs", "_mv": "mV"}
+_UNITS = {
+    "_hz": "Hz", "_g": "g", "_rad_s": "rad/s", "_deg_s": "°/s", "_ppm": "ppm", "_percent": "%", "_us": "µs",
+    "_mv": "mV", "_m_s2": "m/s²", "_Pa": "Pa", "_s": "s", "_m": "m",
+}  # fmt: skip
 
 
 def _lines(report: dict[str, Any]) -> Iterator[str]:
@@ -137,10 +168,12 @@ def _lines(report: dict[str, Any]) -> Iterator[str]:
             yield from _block(
                 "data health", [_health_line(sensor, of) for sensor, of in shown.items()] or ["no sensor"]
             )
+        elif name == "remarks":
+            continue  # they are on stderr
         elif isinstance(value, dict):
             yield from _block(label, [" ".join(filter(None, (*_item(key, item),))) for key, item in value.items()])
-        elif isinstance(value, list):
-            yield from _block(label, [_text(item) for item in value] or ["none"])
+        elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
+            yield from _block(label, [_text(item) for item in value])
         else:
             yield f"{label:20} {_text(value)}" + (f" {unit}" if unit and value is not None else "")
 
@@ -179,4 +212,8 @@ def _health_line(sensor: str, of: dict[str, Any]) -> str:
 def _text(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key.replace('_', ' ')} {_text(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, list):
+        return ", ".join(map(_text, value)) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return "not known" if value is None else str(value)

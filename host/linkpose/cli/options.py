@@ -195,7 +195,9 @@ def sensor_errors_or_rig(function: Function) -> Function:
 
 def up(function: Function) -> Function:
     return click.option(
-        "--up", type=click.Choice(["y", "z"]), default="y", show_default=True, help="Upward axis of a Motive export."
+        "--up",
+        type=click.Choice(["y", "z"]),
+        help="Upward axis of a motion-capture take. Default: y; z for C3D, unless the file states another.",
     )(function)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from linkpose.cli.page import PageOptions
 from linkpose.errors import printable
 
 if TYPE_CHECKING:
+    from linkpose.cli.live import Console
     from linkpose.plotting import Scene
     from linkpose.recording.table import Table
 
@@ -35,7 +37,7 @@ def command(
     wanted: tuple[str, ...],
     map_file: Path | None,
     beacons: Path | None,
-    up: str,
+    up: str | None,
     has_page: bool,
     view_host: str,
     view_port: int | None,
@@ -49,7 +51,8 @@ def command(
     browser until Ctrl-C, and no picture is written.
     """
     from linkpose import plotting
-    from linkpose.evaluation.motive import read_any
+    from linkpose.cli.live import Console
+    from linkpose.evaluation.references import read_any, read_for_picture
 
     page = PageOptions(has_page, view_host, view_port)
     page.check()
@@ -60,7 +63,11 @@ def command(
         return
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force)
-    tables = [read_any(path, up) for path in files]
+    console = Console(quiet, verbose=False)
+    tables = []
+    for path in files:
+        tables.append(read_for_picture(path, up, _show_progress(console, path)))
+        console.clear()
     scene = _scene(map_file, beacons)
     figure, remarks = plotting.plot_tables(tables, [name.replace("_", "-") for name in wanted], scene)
     plotting.save(figure, output, force)
@@ -68,6 +75,10 @@ def command(
         if not quiet:
             click.echo(printable(remark), err=True)
     click.echo(output)
+
+
+def _show_progress(console: Console, path: Path) -> Callable[[float], None]:
+    return lambda share: console.progress(lambda: f"reading {path} {share:.0%}")
 
 
 def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:

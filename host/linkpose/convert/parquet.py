@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 from linkpose.convert import libraries
-from linkpose.recording.table import PARQUET_KEY, Table
+from linkpose.recording.parquet import PARQUET_KEY
+from linkpose.recording.table import Table
 
 
 def write(path: Path, table: Table) -> None:

@@ -1,8 +1,6 @@
 """References from OptiTrack: the CSV that Motive exports, with three markers on the sensor's plate or its rigid body.
 
-Marker 1 is at the sensor, marker 2 lies in the direction of its x axis and marker 3 on the side of its y axis, as on
-the set square of [Link]. They define the sensor's axes, and with the upward direction the tilt Z. Marker 1 moves on a
-sphere about the joint centre. The sphere is fitted, and the height is counted from its centre, wherever the origin is.
+Marker 1 is at the sensor, marker 2 lies in the direction of its x axis and marker 3 on the side of its y axis.
 
 A take without three markers is read by its rigid body: the pivot replaces marker 1, and the quaternion gives the axes.
 Motive aligns the axes of a new rigid body with the room's. The body must therefore be created while the sensor's x axis
@@ -20,8 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.evaluation.takes import Take, reference_of, take_of_markers
+from linkpose.recording.chunks import read_bytes
 from linkpose.recording.delimited import to_utf8
-from linkpose.recording.table import Table, check_times, read_bytes, read_table
+from linkpose.recording.table import Table, check_times
 from linkpose.sensors.measurements import Floats
 
 _SIGNATURE = re.compile(rb'"?Format Version"?([,;\t])')
@@ -31,21 +31,13 @@ _SENSOR_IN_BODY = {
     "z": np.eye(3),
 }
 _METRES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
-_WORST_SPHERE_M = 0.02  # rms distance from the sphere on which a link's marker moves
-_WORST_HEIGHT_STD_M = 0.005  # of the joint; the estimates to be scored are better than a centimetre
-_LEAST_NOISE_M = 5e-5  # of a camera system, however well a file fits
 _QUATERNION_TOLERANCE = 0.01  # of its norm; Motive prints six decimals
-_STILL = 10.0  # radius over noise: noise alone also fits a sphere, with a radius of about 2.5 times its deviation
-_CLEARLY_WIDER_DEG = 15.0
 _FARTHEST = 1e9  # in any unit
-_LONGEST_LINK_M = 10.0
-_MOST_STEPS = 50
 
 
-def read_any(path: Path, up: str) -> Table:
-    """A Motive export by `read_motive`, any other CSV by `read_table`, with their errors."""
-    is_motive = _SIGNATURE.match(to_utf8(read_bytes(path)[:64]))
-    return read_motive(path, up) if is_motive else read_table(path)
+def is_motive(start: bytes) -> bool:
+    """Whether a file begins as Motive's exports do."""
+    return bool(_SIGNATURE.match(to_utf8(start)))
 
 
 def read_motive(path: Path, up: str = "y") -> Table:
@@ -54,32 +46,10 @@ def read_motive(path: Path, up: str = "y") -> Table:
     `up` is the axis of the room that points upwards: "y" unless Motive exports with Z up.
     Raises LinkposeError naming the file and what is missing in it.
     """
-    take = _read_take(path, up)
-    axis = "xyz".index(up)
-    tilt = take.axes[:, :, axis]
-    columns = {
-        "time_s": take.time_s,
-        "height_m": take.position_m[:, axis] - _joint_height(path, take, axis),
-        "roll_deg": np.degrees(np.arctan2(tilt[:, 1], tilt[:, 2])),
-        "pitch_deg": np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))),
-    }
-    columns["height_m"][np.isnan(tilt[:, 0])] = np.nan
-    return Table(path, "motive", columns, {}, None, take.first_line, tuple(take.remarks))
+    return reference_of(path, _read_take(path, up), up)
 
 
-@dataclass(frozen=True, slots=True)
-class _Take:
-    """The plate over time, NaN where it is hidden."""
-
-    time_s: Floats  # (N,)
-    position_m: Floats  # (N, 3) of the sensor in the room
-    axes: Floats  # (N, 3 axes, 3): the sensor's axes in the room
-    what: str  # what is at the sensor
-    first_line: int
-    remarks: list[str]
-
-
-def _read_take(path: Path, up: str) -> _Take:
+def _read_take(path: Path, up: str) -> Take:
     rows = _read_rows(path)
     header = next((i for i, row in enumerate(rows) if row[:1] == ["Frame"] and _time_column(row)), None)
     if header is None:
@@ -96,15 +66,12 @@ def _read_take(path: Path, up: str) -> _Take:
     fields = [start + axis for start in starts[:3] for axis in range(3)] if len(starts) >= 3 else bodies[0].columns
     used = [_time_column(rows[header]), *fields]
     table = np.array([[_number(path, row, j, first_line + i) for j in used] for i, row in enumerate(body)])
+    unit = _unit(path, rows[0])
+    if len(starts) >= 3:
+        return take_of_markers(path, table[:, 0], unit * table[:, 1:].reshape(-1, 3, 3), remarks, first_line)
     check_times(path, table[:, 0], first_line)
-    has_markers, unit = len(starts) >= 3, _unit(path, rows[0])
     if not np.isfinite(table).all(axis=1).any():
-        missing = "all three markers: fill their gaps" if has_markers else "the rigid body: reconstruct and solve it"
-        raise LinkposeError(f"{path} has no frame with {missing} in Motive")
-    if has_markers:
-        markers = unit * table[:, 1:].reshape(-1, 3, 3)
-        remarks += _order_remarks(path, markers)
-        return _Take(table[:, 0], markers[:, 0], _axes_of_markers(markers), "marker 1", first_line, remarks)
+        raise LinkposeError(f"{path} has no frame with the rigid body: reconstruct and solve it in Motive")
     remarks.append(
         f"{path}: the rigid body {bodies[0].name} is the reference: its pivot must be at the sensor, and its axes were "
         "the room's when the sensor's x axis pointed along X and its z axis up"
@@ -112,7 +79,7 @@ def _read_take(path: Path, up: str) -> _Take:
     if len(bodies) > 1:
         remarks.append(f"{path}: rigid bodies left out: {', '.join(body.name for body in bodies[1:])}")
     axes = _axes_of_body(path, table[:, 1:5], up)
-    return _Take(table[:, 0], unit * table[:, 5:], axes, "the rigid body", first_line, remarks)
+    return Take(table[:, 0], unit * table[:, 5:], axes, "the rigid body", first_line, remarks)
 
 
 def _read_rows(path: Path) -> list[list[str]]:
@@ -212,86 +179,3 @@ def _number(path: Path, row: list[str], column: int, line: int) -> float:
     if not abs(value) < _FARTHEST:
         raise LinkposeError(f"{path}, line {line}: {text[:30]!r} is not a number that a camera system gives")
     return value
-
-
-def _order_remarks(path: Path, markers: Floats) -> list[str]:
-    """A remark where the plate's corner seems to be at another marker than the first."""
-    angles = []
-    for corner in range(3):
-        one, two = (markers[:, (corner + i) % 3] - markers[:, corner] for i in (1, 2))
-        angle = np.arctan2(np.linalg.norm(np.cross(one, two), axis=1), (one * two).sum(axis=1))
-        angles.append(float(np.degrees(np.nanmedian(angle))))
-    widest = int(np.argmax(angles))
-    if angles[widest] < angles[0] + _CLEARLY_WIDER_DEG:
-        return []
-    return [
-        f"{path}: the markers' widest angle is at marker {widest + 1} ({angles[widest]:.0f}°) rather than marker 1 "
-        f"({angles[0]:.0f}°), which must be at the sensor: order them in Motive, if it is not"
-    ]
-
-
-def _axes_of_markers(markers: Floats) -> Floats:
-    """The sensor's axes (N, 3 axes, 3) in the room, from markers (N, 3 markers, 3)."""
-    x = markers[:, 1] - markers[:, 0]
-    z = np.cross(x, markers[:, 2] - markers[:, 0])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        x = x / np.linalg.norm(x, axis=1, keepdims=True)
-        z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=1)
-
-
-def _joint_height(path: Path, take: _Take, up: int) -> float:
-    """Height (m) of the centre of the sphere on which the sensor moves; raises LinkposeError unless it does."""
-    positions, what = take.position_m, take.what
-    seen = positions[np.isfinite(positions).all(axis=1)]
-    if len(seen) < 10:
-        raise LinkposeError(f"{path}: {what} is seen in {len(seen)} frames only; no joint can be fitted to that")
-    middle = seen.mean(axis=0)
-    centre, radius, noise, std = _fit_sphere(seen - middle)
-    if radius < _STILL * noise:
-        raise LinkposeError(
-            f"{path}: {what} hardly moves, so the joint cannot be located: tilt the link to all sides in the take"
-        )
-    if noise > _WORST_SPHERE_M:
-        raise LinkposeError(
-            f"{path}: {what} is {100 * noise:.1f} cm rms off any sphere: is the joint fixed to the ground?"
-        )
-    if std[up] > _WORST_HEIGHT_STD_M:
-        raise LinkposeError(
-            f"{path}: the motion of {what} locates the joint's height to ±{100 * std[up]:.1f} cm only: "
-            "tilt the link further; turning about the vertical does not help"
-        )
-    return float(middle[up] + centre[up])
-
-
-def _fit_sphere(p: Floats) -> tuple[Floats, float, float, Floats]:
-    """Centre (3,), radius, rms distance from the sphere, and the centre's standard deviations (3,), all in metres.
-
-    Least squares of the distances by Gauss and Newton. |p|² = 2 p·c + (r² − |c|²), linear in both, is the start only:
-    the markers' noise pulls its centre towards the positions, by decimetres where they cover a small cap.
-    """
-    design = np.column_stack([2 * p, np.ones(len(p))])
-    centre = np.linalg.lstsq(design, (p**2).sum(axis=1), rcond=1e-6)[0][:3]
-    state = np.append(centre, np.linalg.norm(p - centre, axis=1).mean())
-    for _ in range(_MOST_STEPS):
-        away = p - state[:3]
-        distance = np.linalg.norm(away, axis=1)
-        jacobian = np.column_stack([away / np.maximum(distance, 1e-9)[:, None], np.ones(len(p))])
-        off = distance - state[3]
-        information = jacobian.T @ jacobian
-        step = _solve(information, jacobian.T @ off, 1e-12 * len(p))
-        state = state + step / max(1.0, float(np.linalg.norm(step)))
-        if np.linalg.norm(step) < 1e-6:
-            break
-    noise = max(float(np.sqrt(np.mean(off**2))), _LEAST_NOISE_M)
-    radius = max(float(state[3]), noise)
-    # Noise across the radius turns the rows of the Jacobian. That looks like motion, but holds no information.
-    information[:3, :3] -= (noise / radius) ** 2 * (len(p) * np.eye(3) - information[:3, :3])
-    covariance = noise**2 * _solve(information, np.eye(4), (noise / _LONGEST_LINK_M) ** 2)
-    return state[:3], radius, noise, np.sqrt(np.diag(covariance))[:3]
-
-
-def _solve(information: Floats, right: Floats, least: float) -> Floats:
-    """information⁻¹ · right, with the eigenvalues of the information raised to at least `least`."""
-    eigenvalues, directions = np.linalg.eigh(information)
-    return np.asarray(directions / np.maximum(eigenvalues, least) @ (directions.T @ right))

@@ -12,6 +12,7 @@ from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, Errors, errors_of, scored, yaw_drift_deg_per_min
 from linkpose.evaluation.series import Series, find_offset, is_sparser, paired
 from linkpose.evaluation.statistics import Statistics
+from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.quantities import (
     ANGLE,
     CHAIN_ROTATION,
@@ -223,7 +224,7 @@ def _mismatches(
     if apart > _SAME_TILT_DEG:
         cure = (
             "try the other axis with --up y or z, and check the order of the markers"
-            if reference.kind == "motive"
+            if reference.kind == MOTION_CAPTURE
             else "are they of the same run, and of the same axes?"
         )
         return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]

@@ -12,8 +12,9 @@ from linkpose.errors import LinkposeError
 from linkpose.localization.events import beacon_name, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.track import Track
+from linkpose.recording.chunks import read_bytes
 from linkpose.recording.delimited import split_cells, to_utf8
-from linkpose.recording.table import Table, read_bytes, read_table
+from linkpose.recording.table import Table, read_table
 
 Beacons = dict[str, tuple[float, float, float]]
 LONGEST_TRUTH_GAP_S = 1.0  # between two true poses: an estimate inside a longer gap has nothing to be compared with

@@ -11,11 +11,14 @@ from linkpose import filters
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import Score, evaluate
 from linkpose.evaluation.series import interval
+from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
 from linkpose.quantities import Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
+
+_THINNED = "the picture shows the extremes of each part, and figures beside lines are of the rows shown"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,7 @@ def is_recording(table: Table) -> bool:
 
 def is_reference(table: Table) -> bool:
     """Whether it holds quantities of no filter."""
-    return table.kind in ("truth", "motive") or not by_filter(table.columns)
+    return table.kind in ("truth", MOTION_CAPTURE) or not by_filter(table.columns)
 
 
 def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
@@ -81,6 +84,7 @@ def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     ]
     tracks.sort(key=lambda track: (_rank(track.name), track.file))
     scores, offset_s, remarks = _scores(estimates, references[0]) if references else ({}, 0.0, [])
+    remarks += [f"{table.path} has {table.whole.rows} rows: {_THINNED}" for table in tables if table.whole]
     reference = _reference(references[0], offset_s) if references else None
     hidden = [name for name in dict.fromkeys(found) if name not in shown]
     return Sources(tracks, reference, scores, hidden, remarks)
@@ -129,6 +133,9 @@ def _scores(estimates: Sequence[Table], reference: Table) -> tuple[dict[tuple[in
     """Scores of all estimates, the reference's offset to the first one's clock, and why there are none."""
     found: dict[tuple[int, str], Score] = {}
     offset_s, remarks = 0.0, []
+    if any(table.whole for table in (*estimates, reference)):
+        names = f"{estimates[0].path} {reference.path}" if estimates else "ESTIMATE REFERENCE"
+        return {}, 0.0, [f"no errors are drawn of files of this length: type linkpose evaluate {names}"]
     for i, table in enumerate(estimates):
         try:
             scores = evaluate(table, reference).scores
@@ -147,14 +154,15 @@ def title(tables: Sequence[Table]) -> str:
 
 
 def _describe(table: Table) -> str:
-    time_s = table.columns["time_s"]
-    step = interval(time_s)
+    time_s, whole = table.columns["time_s"], table.whole
+    step = whole.interval_s if whole else interval(time_s)
     length = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
     words = [table.path.name, _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
-    holes = len(gaps(time_s))
+    holes = whole.gaps if whole else len(gaps(time_s))
     closing = table.closing or {}
     lost = closing.get("lost")
-    lost = lost if isinstance(lost, int) else lost_samples(time_s)
+    if not isinstance(lost, int):
+        lost = whole.lost if whole else lost_samples(time_s)
     words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {_gaps(holes)}")
     return "   ·   ".join(word for word in words if word)
 

@@ -8,8 +8,10 @@ lines (`# ...`) which a spreadsheet split into cells, quoted or padded with sepa
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,6 +46,14 @@ class Comment:
         return content if isinstance(content, dict) else None
 
 
+@dataclass(slots=True)
+class DecimalMark:
+    """The first number with a decimal comma and the first with a point in a file; "" where there is none yet."""
+
+    comma: str = ""
+    point: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class Cells:
     """The cells of a table: column names, rows of as many texts, the line number of each row, and the comments."""
@@ -54,11 +64,15 @@ class Cells:
     lines: list[int]
     head: list[Comment]  # before the names
     tail: list[Comment]  # after the last row
+    header_lines: int  # lines up to the names
 
-    def number_columns(self) -> dict[str, Floats]:
-        """The columns as numbers, NaN for a missing one; raises FileFormatError for a cell that is no number."""
-        has_decimal_comma = self._has_decimal_comma()
-        return {name: self._numbers(column, has_decimal_comma) for column, name in enumerate(self.names)}
+    def number_columns(self, mark: DecimalMark) -> dict[str, Floats]:
+        """The columns as numbers, NaN for a missing one; raises FileFormatError for a cell that is no number.
+
+        `mark` is shared by all parts of a file.
+        """
+        self._find_decimal_mark(mark)
+        return {name: self._numbers(column, mark.comma != "") for column, name in enumerate(self.names)}
 
     def _numbers(self, column: int, has_decimal_comma: bool) -> Floats:
         values = np.empty(len(self.rows))
@@ -79,47 +93,63 @@ class Cells:
                 values[i] = np.nan
         return values
 
-    def _has_decimal_comma(self) -> bool:
-        """Whether numbers have decimal commas; raises FileFormatError when some have commas and others points."""
+    def _find_decimal_mark(self, mark: DecimalMark) -> None:
+        """Adds to `mark` what these rows show; raises FileFormatError when numbers can be read in two ways."""
         comma = next(((i, cell) for i, row in enumerate(self.rows) for cell in row if "," in cell), None)
-        if comma is None:
-            return False
-        line, text = self.lines[comma[0]], comma[1].strip()
-        point = next((cell.strip() for row in self.rows for cell in row if "." in cell), None)
-        if point is not None or not _DECIMAL_COMMA.fullmatch(text):
-            both = f"{text[:30]!r} and {point[:30]!r}" if point is not None else repr(text[:30])
+        mark.point = mark.point or next((cell.strip() for row in self.rows for cell in row if "." in cell), "")
+        if comma is not None:
+            mark.comma, line = comma[1].strip(), self.lines[comma[0]]
+        else:
+            line = self.lines[0]
+        if mark.comma and (mark.point or not _DECIMAL_COMMA.fullmatch(mark.comma)):
+            both = f"{mark.comma[:30]!r} and {mark.point[:30]!r}" if mark.point else repr(mark.comma[:30])
             raise FileFormatError(
                 self.path,
                 f"{self.path}, line {line}: {both} can be read in two ways: "
                 "save the table with one decimal mark and without separators of thousands",
                 line,
             )
-        return True
+
+
+def codec_of(data: bytes) -> str:
+    """The encoding of a file that begins with these bytes, as far as they show it."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
+    for nul_at, codec in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if data[nul_at : nul_at + 4 : 2] == b"\0\0":
+            return codec
+    return "utf-8-sig"
 
 
 def to_utf8(data: bytes) -> bytes:
     """The same text in UTF-8 without a byte order mark."""
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return data.decode("utf-16", "replace").encode("utf-8", "replace")
-    for nul_at, codec in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if data[nul_at : nul_at + 4 : 2] == b"\0\0":
-            return data.decode(codec, "replace").encode("utf-8", "replace")
+    codec = codec_of(data)
+    if codec != "utf-8-sig":
+        return data.decode(codec, "replace").encode("utf-8", "replace")
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-def split_cells(path: Path, data: bytes) -> Cells:
-    """Splits `data`, in UTF-8, into cells. Raises FileFormatError naming the line where rows and names do not match.
-
-    An unterminated last line of a file which linkpose wrote is left out: a killed program leaves one.
-    """
+def text_lines(data: bytes) -> list[str]:
+    """The lines of a text in UTF-8, or else in the encoding of Windows; the last one ends without a line end."""
     try:
         text = data.decode()
     except UnicodeDecodeError:
         text = data.decode("cp1252", "replace")
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    if lines[0].startswith("# linkpose ") and lines[0][-1] not in _PADDING:
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def split_cells(path: Path, data: bytes, before: Sequence[str] = (), first_line: int = 1) -> Cells:
+    """Splits `data`, in UTF-8, into cells. Raises FileFormatError naming the line where rows and names do not match.
+
+    For a later part of a file, `before` holds the lines up to the names, and `first_line` is the number of the part's
+    first line. An unterminated last line of a file which linkpose wrote is left out: a killed program leaves one.
+    """
+    lines = text_lines(data)
+    first = before[0] if before else lines[0]
+    if first.startswith("# linkpose ") and first[-1] not in _PADDING:
         lines.pop()
-    numbered = [(i, line) for i, line in enumerate(lines, 1) if line.strip(_PADDING)]
+    all_lines = itertools.chain(enumerate(before, 1), enumerate(lines, first_line))
+    numbered = [(i, line) for i, line in all_lines if line.strip(_PADDING)]
     if numbered and numbered[0][1].lower().startswith("sep="):  # Excel's own first line
         del numbered[0]
     table = [(i, line) for i, line in numbered if not _is_comment(line)]
@@ -134,7 +164,18 @@ def split_cells(path: Path, data: bytes) -> Cells:
     names, body = _match(path, rows, numbers, separator)
     head = [comment for comment in comments if comment.line < numbers[0]]
     tail = [comment for comment in comments if comment.line > numbers[-1]]
-    return Cells(path, names, body, numbers[1:], head, tail)
+    return Cells(path, names, body, numbers[1:], head, tail, numbers[0])
+
+
+def has_rows(lines: Sequence[str]) -> bool:
+    """Whether any of these lines, which come after the names, is a row."""
+    return any(line.strip(_PADDING) and not _is_comment(line) for line in lines)
+
+
+def last_comment(lines: Sequence[str], before: Sequence[str]) -> dict[str, Any] | None:
+    """The JSON object in the last of these comment lines; the names are in the last line of `before`."""
+    comments = [line for line in lines if _is_comment(line)]
+    return _comment(0, comments[-1], _separator(before[-1])).as_object() if comments else None
 
 
 def _is_comment(line: str) -> bool:

@@ -17,11 +17,16 @@ _ACCEL_UNITS = (
     ("mm/s²", "0.001"),
 )
 _GRAVITY_TOLERANCE = 0.2  # the MPU-6050's offset and scale error at the worst: 0.08 g, 3 % (data sheet)
-_STILL_RAD_S = 0.3
-_FEWEST_STILL = 50  # samples
+_STILL_RAD_S = (
+    0.3  # a hand that holds the sensor; a link that swings through its turning point is slower for 0.1 s only
+)
+_STILL_M_S2 = 0.5  # deviation within _STILL_S: five times the MPU-6050's noise at its widest bandwidth (data sheet)
+_STILL_S = 0.5
+_FEWEST_STILL = 2  # stretches of that length
 _MMHG = (600.0, 800.0)  # at sea level; as hPa, an altitude of 2 to 4 km
 _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
+_MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _LONGEST_STEP_S = 0.5
@@ -35,7 +40,7 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
     unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     found = [
-        unit or _gravity(force_m_s2, measurements.gyro_rad_s),
+        unit or _gravity(measurements, force_m_s2),
         _rate(measurements.gyro_rad_s) or _turning(measurements),
         _time(_median(np.diff(measurements.time_s)), rate_hz),
         _pressure(_median(measurements.pressure_Pa)),
@@ -43,12 +48,41 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
     return [f"{path}: {suspicion}" for suspicion in found if suspicion]
 
 
-def _gravity(force_m_s2: Floats, gyro_rad_s: Floats) -> str:
+def is_negated(measurements: Measurements, j2s_m: Sequence[float]) -> bool:
+    """Whether the specific force fits the motion about the joint only with its sign reversed.
+
+    At `j2s_m` from a fixed joint, the specific force is the reaction to gravity plus ω × (ω × J2S) + dω/dt × J2S
+    ([Link]). Without this second part, it has the size of gravity.
+    """
+    step_s = _usual_step(measurements)
+    size = max(1, round(_BLOCK_S / step_s)) if np.isfinite(step_s) else 1
+    if len(measurements) // size < _FEWEST_BLOCKS or step_s * size > 2 * _BLOCK_S:
+        return False
+    accel, gyro = _averaged(measurements, size)
+    joint = np.asarray(j2s_m, dtype=np.float64)
+    change = np.gradient(gyro, size * step_s, axis=0)
+    motion = np.cross(gyro, np.cross(gyro, joint)) + np.cross(change, joint)
+    as_is, reversed_ = (np.linalg.norm(accel - sign * motion, axis=1) - STANDARD_GRAVITY for sign in (1, -1))
+    known = np.isfinite(as_is) & np.isfinite(reversed_)
+    if np.count_nonzero(known) < _FEWEST_BLOCKS or _rms(motion[known]) < _MOVES_M_S2:
+        return False
+    return _rms(reversed_[known]) < 0.5 * _rms(as_is[known])
+
+
+def _gravity(measurements: Measurements, force_m_s2: Floats) -> str:
     """A remark if the specific force at rest is not gravity. A factor of two means that another range was in force."""
-    still = (np.linalg.norm(gyro_rad_s, axis=1) < _STILL_RAD_S) & np.isfinite(force_m_s2)
+    step_s = _usual_step(measurements)
+    size = round(_STILL_S / step_s) if step_s > 0 else 0
+    if size < 2:
+        return ""
+    stretches = len(force_m_s2) // size
+    turning = np.linalg.norm(measurements.gyro_rad_s, axis=1)[: stretches * size].reshape(stretches, size)
+    forces = force_m_s2[: stretches * size].reshape(stretches, size)
+    scale = np.median(forces, axis=1, keepdims=True) / STANDARD_GRAVITY  # a wrong range scales the noise too
+    still = (turning.max(axis=1) < _STILL_RAD_S) & (forces.std(axis=1) < _STILL_M_S2 * np.maximum(scale[:, 0], 0.1))
     if np.count_nonzero(still) < _FEWEST_STILL:
         return ""
-    force = float(np.median(force_m_s2[still]))
+    force = float(np.median(forces[still]))
     if abs(force / STANDARD_GRAVITY - 1) < _GRAVITY_TOLERANCE:
         return ""
     return (
@@ -59,16 +93,11 @@ def _gravity(force_m_s2: Floats, gyro_rad_s: Floats) -> str:
 
 def _turning(measurements: Measurements) -> str:
     """A remark if the rotation of gravity in the sensor's axes, da/dt = −ω × a, contradicts the gyro's unit."""
-    steps = np.diff(measurements.time_s)
-    step_s = _median(steps[steps > 0])
+    step_s = _usual_step(measurements)
     size = max(1, round(_BLOCK_S / step_s)) if np.isfinite(step_s) else 1
-    blocks = len(measurements) // size
-    if blocks < _FEWEST_BLOCKS or step_s * size > 2 * _BLOCK_S:
+    if len(measurements) // size < _FEWEST_BLOCKS or step_s * size > 2 * _BLOCK_S:
         return ""
-    accel, gyro = (
-        values[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
-        for values in (measurements.accel_m_s2, measurements.gyro_rad_s)
-    )
+    accel, gyro = _averaged(measurements, size)
     change = np.diff(accel, axis=0)
     expected = -np.cross(gyro[1:] + gyro[:-1], accel[1:] + accel[:-1]) / 4 * size * step_s
     known = np.isfinite(change).all(axis=1) & np.isfinite(expected).all(axis=1)
@@ -80,6 +109,25 @@ def _turning(measurements: Measurements) -> str:
     if not 2 / 3 < ratio < 1.5:
         return ""
     return f"gyro_* turns gravity {180 / np.pi:.0f} times too far: is it in °/s? multiply it by {np.pi / 180:.7f}"
+
+
+def _averaged(measurements: Measurements, size: int) -> tuple[Floats, Floats]:
+    """Specific force and angular rate (blocks, 3), each the mean of `size` samples."""
+    blocks = len(measurements) // size
+    accel, gyro = (
+        values[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+        for values in (measurements.accel_m_s2, measurements.gyro_rad_s)
+    )
+    return accel, gyro
+
+
+def _usual_step(measurements: Measurements) -> float:
+    steps = np.diff(measurements.time_s)
+    return _median(steps[steps > 0])
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _pressure(median_pa: float) -> str:

@@ -62,6 +62,11 @@ class BoardSettings:
     imu_families: tuple[int, int] = (DeviceFamily.MPU6050, DeviceFamily.NONE)  # of the sensors at 0x68 and 0x69
     mag_family: int = DeviceFamily.NONE
 
+    def as_dict(self) -> dict[str, int]:
+        """The settings in the metadata of a recording."""
+        names = ("sample_rate_hz", "accel_range_g", "gyro_range_deg_s", "dlpf", "baro_oversampling")
+        return {name: getattr(self, name) for name in names}
+
     @property
     def has_imu2(self) -> bool:
         """Whether the board has, or had, a second inertial sensor."""

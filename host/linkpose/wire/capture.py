@@ -1,8 +1,10 @@
-"""Decodes a whole raw capture at once, compiled. It accepts the same frames as StreamDecoder, with the same counts."""
+"""Decodes raw captures, compiled. It accepts the same frames as StreamDecoder, with the same counts."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import io
+from collections.abc import Iterator
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +59,7 @@ def _counts_table() -> NDArray[np.int64]:
     return table
 
 
+_PIECE_BYTES = 1 << 20  # decoded at once; up to 60 times as much memory, for a piece of frames of one byte
 _CRC = _crc_table()
 _COUNTS = _counts_table()
 
@@ -155,15 +158,45 @@ def _decode(
     return sample_count, other_count
 
 
+def read_capture(file: BinaryIO) -> Iterator[Capture]:
+    """The messages from the board in a capture, in parts: one part is in memory at a time.
+
+    `others` count the samples from the capture's beginning, and `corrupt` counts all frames so far. An incomplete last
+    frame is left out, as a stream would wait for it.
+    """
+    decoder = StreamDecoder(from_board=True)
+    rest, before = b"", 0
+    while piece := file.read(_PIECE_BYTES):
+        data = rest + piece
+        end = data.rfind(b"\0") + 1
+        rest = data[end:]
+        if len(rest) > _PIECE_BYTES:  # no frame is so long: keep enough of it to see that
+            rest = rest[: 2 * MAX_FRAME]
+        if end:
+            part = _decode_part(data[:end], before, decoder)
+            before += len(part.samples)
+            yield part
+
+
 def decode_capture(data: bytes) -> Capture:
-    """All messages from the board in a capture. An incomplete last frame is left out, as a stream would wait for it."""
-    raw = np.frombuffer(data, np.uint8)
+    """All messages from the board in a capture, as `read_capture` finds them."""
+    parts = [*read_capture(io.BytesIO(data)), _decode_part(b"", 0, StreamDecoder())]
+    return Capture(
+        np.concatenate([part.samples for part in parts]),
+        np.concatenate([part.mouse_count for part in parts]),
+        [message for part in parts for message in part.others],
+        parts[0].corrupt,
+    )
+
+
+def _decode_part(data: bytes, before: int, decoder: StreamDecoder) -> Capture:
+    """Decodes whole frames, of which the first comes after `before` samples."""
     frames = data.count(b"\0")
     rows = np.empty((frames, SAMPLE_DTYPE.itemsize), np.uint8)
     mouse_count = np.empty(frames, np.uint8)
     others = np.empty((frames, 3), np.int64)
     sample_count, other_count = _decode(
-        raw,
+        np.frombuffer(data, np.uint8),
         _CRC,
         _COUNTS,
         _SAMPLE.type_id,
@@ -175,9 +208,16 @@ def decode_capture(data: bytes) -> Capture:
         others,
         MAX_FRAME,
     )
-    decoder = StreamDecoder(from_board=True)
     messages = []
-    for begin, end, before in others[:other_count].tolist():
-        messages += [(before, message) for message in decoder.feed(data[begin : end + 1])]
-    samples = rows[:sample_count].view(SAMPLE_DTYPE)[:, 0]
-    return Capture(samples, mouse_count[:sample_count], messages, decoder.corrupt)
+    for begin, end, at in _adjoining(others[:other_count]):
+        messages += [(before + at, message) for message in decoder.feed(data[begin:end])]
+    samples = rows[:sample_count].copy().view(SAMPLE_DTYPE)[:, 0]
+    return Capture(samples, mouse_count[:sample_count].copy(), messages, decoder.corrupt)
+
+
+def _adjoining(others: NDArray[np.int64]) -> list[list[int]]:
+    """Start, end and number of samples before, of frames without a sample between them."""
+    first = np.flatnonzero(np.diff(others[:, 2], prepend=-1))
+    last = np.append(first[1:], len(others))[: len(first)] - 1
+    found: list[list[int]] = np.column_stack([others[first, 0], others[last, 1] + 1, others[first, 2]]).tolist()
+    return found
