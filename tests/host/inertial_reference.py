@@ -195,8 +195,8 @@ def check_the_gyro_bias_at_rest(rng):
     s.rest_s, s.rest_rate_sum[:] = 2.0, 2.0 * 0.01 + 0.001 * rng.standard_normal(3)
     nominal, p, h = s.nominal.copy(), s.covariance.copy(), np.eye(SIZE)[BG:BA]
     innovation = s.rest_rate_sum / 2.0 - nominal[BG:BA]
-    change, _ = dense_update(p, h, 1e-6 * np.eye(3), innovation)
-    rest.update_bias_from_rest(s)
+    change, _ = dense_update(p, h, (0.04 * IMU.gyro_variance / 2.0 + (5e-4 / 2.0) ** 2) * np.eye(3), innovation)
+    rest.update_bias_from_rest(s, 0.04, IMU)
     np.testing.assert_allclose(s.nominal[V:PSI], (nominal + change)[V:PSI], rtol=0, atol=1e-9)
 
 

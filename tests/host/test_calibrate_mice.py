@@ -105,7 +105,7 @@ def broken() -> dict[str, tuple[list[Recording], Rig, str]]:
         "a mouse away": ([away, turn], run.rig, "mouse 2 is away at 5.00 s"),
         "lost samples": ([cut(line, "lost.csv", flags=flags), turn], run.rig, "samples were lost before 6.00"),
         "no gyro": ([cut(line, "blind.csv", gyro_rad_s=no_gyro), turn], run.rig, "blind.csv holds no gyro"),
-        "no places": ([line, turn], Rig(), "does not say where the mice sit"),
+        "no places": ([line, turn], Rig(), "lacks the positions of the mice"),
         "a mouse too many": ([line, turn], Rig(mouse=(*run.mice, Mouse(0.0, 0.0))), "has 3 mice, and the rig file 4"),
     }
 

@@ -224,23 +224,68 @@ def test_a_sensor_that_cannot_be_is_refused():
         calibrate_joint([recording(replace(block, accel_m_s2=1.15 * block.accel_m_s2))], Rig())
 
 
-@pytest.mark.parametrize(("axis", "others"), [("x", "y and z"), ("y", "x and z"), ("z", "x and y")])
-def test_rotation_about_one_axis_names_the_axis_it_does_not_tell(axis, others):
-    t = np.arange(4000) / 100
+def hinge(axis, seed: int = 0, seconds: float = 40.0, d=(0.3, 0.2, 1.0), vibration: float = 0.0) -> Measurements:
+    """A link on a hinge, swung to and fro. `vibration`: amplitude of a motor at 43 Hz (m/s²)."""
+    t = np.arange(int(100 * seconds)) / 100
     angle, rate, slope = 0.5 * np.sin(3 * t), 1.5 * np.cos(3 * t), -4.5 * np.sin(3 * t)
-    order = {"x": [0, 1, 2], "y": [2, 0, 1], "z": [1, 2, 0]}[axis]  # where the x, y, z of a turn about x go
-    zero = np.zeros(4000)
-    tilt = np.column_stack([zero, np.sin(angle), np.cos(angle)])[:, order]
-    omega, alpha = np.column_stack([rate, zero, zero])[:, order], np.column_stack([slope, zero, zero])[:, order]
-    d = np.array([0.3, 0.2, 1.0])
+    axis, up = np.array(axis, dtype=float), np.array([0.48, 0.6, 0.64])
+    up -= (up @ axis) * axis
+    up /= np.linalg.norm(up)
+    tilt = np.outer(np.cos(angle), up) - np.outer(np.sin(angle), np.cross(axis, up))
+    omega, alpha = np.outer(rate, axis), np.outer(slope, axis)
     force = STANDARD_GRAVITY * tilt + np.cross(alpha, d) + np.cross(omega, np.cross(omega, d))
-    noise = np.random.default_rng(0).normal(size=(2, 4000, 3))
-    block = replace(
-        LinkRun(1, 0, 40.0).measurements(), time_s=t,
-        accel_m_s2=force + 0.04 * noise[0], gyro_rad_s=omega + 0.0009 * noise[1],
-    )  # fmt: skip
-    with pytest.raises(LinkposeError, match=f"sensor's {axis} axis.*turn the link about its {others} axes"):
+    noise = np.random.default_rng(seed).normal(size=(2, len(t), 3))
+    shaken = vibration * np.sin(2 * np.pi * 43 * t[:, None] + np.array([0.0, 1.0, 2.0]))
+    return Measurements.from_imu(t, force + 0.04 * noise[0] + shaken, omega + 0.0009 * noise[1])
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 0, 1), (0.6, 0.0, 0.8)])
+def test_a_hinge_gives_two_directions_and_the_sigma_of_the_third(axis, tmp_path):
+    found = calibrate_joint([recording(hinge(axis))], Rig())
+    assert abs(found.worst_direction @ np.array(axis)) > 0.999
+    error = found.j2s_m - (0.3, 0.2, 1.0)
+    assert error @ np.linalg.solve(found.covariance_m2, error) < 16.0
+    assert found.worst_std_m > max(0.05, abs(error @ np.array(axis)) / 2)
+    assert np.sqrt(np.linalg.eigvalsh(found.covariance_m2)[1]) < 0.005
+    assert found.weak_axis == np.argmax(np.abs(axis))
+    joint = joint_with_calibration(Rig(), found, with_imu=False).joint
+    joint_with_calibration(Rig(), found, with_imu=False).save(tmp_path / "rig.toml")
+    assert Rig.load(tmp_path / "rig.toml").joint == joint
+    assert joint.j2s_std_m == pytest.approx(found.std_m, abs=1e-4)
+    assert joint.known_j2s_m is None  # only filters that estimate J2S use it
+
+
+def test_a_hinge_is_named_with_its_cure(tmp_path):
+    rig = tmp_path / "rig.toml"
+    path = saved(tmp_path / "rec.csv", hinge((0, 1, 0)))
+    done = CliRunner().invoke(joint_command.command, [path, "--rig", str(rig)], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert "J2S is not observable along the sensor's y axis (direction" in done.stderr
+    assert "Rotate the link about its x and z axes too" in done.stderr
+    shown = CliRunner().invoke(joint_command.command, [path, "--rig", str(rig), "--json"], catch_exceptions=False)
+    assert json.loads(shown.stdout)["observable"] == [True, False, True]
+
+
+def test_motion_that_is_too_slow_is_refused():
+    """A sensor on the hinge's axis that turns slowly: neither distance shows in the accelerations."""
+    still = np.zeros((6000, 3))
+    still[:, 0] = 0.21  # rad/s
+    t = np.arange(6000) / 100
+    up = np.column_stack([0 * t, np.sin(0.21 * t), np.cos(0.21 * t)])
+    noise = np.random.default_rng(1).normal(size=(2, 6000, 3))
+    block = Measurements.from_imu(t, STANDARD_GRAVITY * up + 0.04 * noise[0], still + 0.0009 * noise[1])
+    with pytest.raises(LinkposeError, match="too slow or too short"):
         calibrate_joint([recording(block)], Rig())
+
+
+def test_vibration_of_a_motor_is_no_spike():
+    """Its samples alternate by more than those of any motion; a spike among them is still left out."""
+    block = hinge((1, 0, 0), seed=3, vibration=12.0)
+    block.accel_m_s2[1000::1500] += 400.0
+    found = calibrate_joint([recording(block)], Rig())
+    error = found.j2s_m - (0.3, 0.2, 1.0)
+    assert np.abs(error[1:]).max() < 0.01
+    assert error @ np.linalg.solve(found.covariance_m2, error) < 16.0
 
 
 def test_samples_that_come_too_rarely_are_refused():
@@ -339,3 +384,25 @@ def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
     assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)
     with pytest.raises(LinkposeError, match="six rests do not fit 10 s: simulate 23 s or more"):
         LinkRun(1, 0, 10.0, rests=True)
+
+
+def test_the_sigma_of_bias_and_offset_reach_the_filters(tmp_path):
+    """`calibrate imu` writes its own figures; filters start from them."""
+    found = calibrate_imu([turned_over(np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]))])
+    assert np.abs(found.gyro_bias_rad_s - BIAS).max() < 3 * found.gyro_bias_std_rad_s < 0.006
+    assert np.abs(found.accel_offset_m_s2 - OFFSET).max() < 3 * found.accel_offset_std_m_s2 < 0.1
+    with_calibration(Rig(), found).save(tmp_path / "rig.toml")
+    rig = Rig.load(tmp_path / "rig.toml").with_j2s((0.0, 0.0, 1.0))
+    gyro, accel = rig.imu.gyro_bias_std_rad_s, rig.imu.accel_offset_std_m_s2
+    assert (gyro, accel) == pytest.approx((found.gyro_bias_std_rad_s, found.accel_offset_std_m_s2), rel=0.01)
+    states = [*filters.create("joint-inertial", rig).states, filters.create("tilt-inertial", rig).state]
+    for state in states:
+        assert state.prior[6:9] == pytest.approx(gyro**2) and state.prior[9:12] == pytest.approx(accel**2)
+    undeclared = filters.create("tilt-inertial", Rig().with_j2s((0.0, 0.0, 1.0))).state
+    assert undeclared.prior[6] > 0.01
+
+
+@pytest.mark.parametrize("key", ["gyro_bias_std_rad_s", "accel_offset_std_m_s2"])
+def test_a_sigma_of_zero_is_refused(key):
+    with pytest.raises(LinkposeError, match=f"imu.{key} is 0; it must be above 0"):
+        Rig.from_dict({"imu": {key: 0}}, "rig.toml")

@@ -267,7 +267,7 @@ def test_a_plane_motion_does_not_lean_the_link_out_of_its_plane():
     )  # fmt: skip
     f = JointInertialFilter(Rig(joint=Joint((0.0, 0.0, -0.3), 0.03)))
     estimate = f.process(block)
-    assert np.abs(f.accel_bias_m_s2).max() < 0.12
+    assert np.abs(f.accel_bias_m_s2).max() < 0.15
     assert np.abs(estimate[1000:, 3]).max() < 1.5
 
 

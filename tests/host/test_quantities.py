@@ -74,7 +74,7 @@ def test_a_filter_needs_what_its_capabilities_say():
             with pytest.raises(filters.CannotRun, match="joint-inertial is the filter that estimates it"):
                 filters.create(name, Rig(Joint((0.0, 0.0, 0.0), 1.0)))
         if needs.needs_mice:
-            with pytest.raises(filters.CannotRun, match="where the mice sit"):
+            with pytest.raises(filters.CannotRun, match="lacks the positions of the mice"):
                 filters.create(name, Rig())
 
 

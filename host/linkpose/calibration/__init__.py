@@ -1,1 +1,1 @@
-"""What a rig file says of the sensors, worked out from recordings made for it."""
+"""Calibration from recordings: each module estimates its part of a rig file."""

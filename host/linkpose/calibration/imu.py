@@ -1,7 +1,7 @@
 """Gyro bias, accelerometer offset and scale, and the sensors' noise, from rests.
 
-At rest the gyro reads its bias, and the accelerometer a vector of length g. Rests in six attitudes or more tell the
-offset o and the scale k of each axis: ‖(s_A − o) / k‖ = g at every rest, by Gauss-Newton.
+At rest the gyro reads its bias, and the accelerometer a vector of length g. Rests in six attitudes or more determine
+the offset o and the scale k of each axis: ‖(s_A − o) / k‖ = g at every rest, by Gauss-Newton.
 """
 
 from __future__ import annotations
@@ -21,21 +21,26 @@ from linkpose.sensors.rig import Rig, to_vector
 
 FEWEST_ATTITUDES = 6
 _APART_COSINE = np.cos(np.radians(20.0))  # attitudes nearer to each other than this count as one
-LARGEST_OFFSET_M_S2, LARGEST_SCALE = 2.0, 0.1  # more is no MPU-6050
+LARGEST_OFFSET_M_S2, LARGEST_SCALE = 2.0, 0.1  # beyond these the sensor is no MPU-6050
+# What a calibration leaves, however exact the fit: the zero-rate output of an MPU-6050 returns to 0.05 °/s after it was
+# switched off, its zero-g output to 1 mg. Doubled, filters start with twice the uncertainty.
+_LEAST_GYRO_STD_RAD_S, _LEAST_OFFSET_STD_M_S2 = 0.0009, 0.01
 _WORST_RESIDUAL_M_S2 = 0.1
-_PIECE_S = 2.0  # of a rest: long against the slowest low-pass filter (5 Hz), short against the warming up
+_PIECE_S = 2.0  # of a rest: long compared with the slowest low-pass filter (5 Hz), short compared with warm-up
 
 
 @dataclass(frozen=True, slots=True)
 class ImuCalibration:
-    """What was found. Vectors are by axis; None where the recordings do not tell it."""
+    """Sensor errors and noise. Vectors are by axis; None where the recordings do not show a value."""
 
     rests: int
     attitudes: int
     gyro_bias_rad_s: Floats
+    gyro_bias_std_rad_s: float  # each axis: scatter of the rests, and what a calibration leaves
     gyro_noise_rad_s: float
     accel_noise_m_s2: float
     accel_offset_m_s2: Floats | None
+    accel_offset_std_m_s2: float | None
     accel_scale: Floats | None
     accel_residual_m_s2: float | None  # rms of ‖(s_A − o) / k‖ − g over the attitudes
     pressure_noise_Pa: float | None
@@ -47,24 +52,29 @@ class ImuCalibration:
 
 
 def calibrate_imu(recordings: Sequence[Recording]) -> ImuCalibration:
-    """The calibration from all rests in the recordings. Raises LinkposeError without a rest, or for an ill fit."""
+    """The calibration from all rests in the recordings. Raises LinkposeError without a rest, or for a poor fit."""
     rests = [r.measurements[part] for r in recordings for part in find_rests(r.measurements)]
     if not rests:
         names = ", ".join(str(r.path) for r in recordings)
         raise LinkposeError(f"there is no rest of a second or more in {names}: record the sensor lying still")
     weights = np.array([len(rest) for rest in rests], dtype=np.float64)
-    bias = np.average([rest.gyro_rad_s.mean(axis=0) for rest in rests], axis=0, weights=weights)
+    means = np.array([rest.gyro_rad_s.mean(axis=0) for rest in rests])
+    bias = np.average(means, axis=0, weights=weights)
+    gyro_noise = _noise(rests, [rest.gyro_rad_s for rest in rests])
+    scatter = np.average(np.square(means - bias).mean(axis=1), weights=weights) + gyro_noise**2 / weights.sum()
     attitudes = _distinct(np.array([rest.accel_m_s2.mean(axis=0) for rest in rests]))
-    offset = scale = residual = None
+    offset = scale = residual = offset_std = None
     if len(attitudes) >= FEWEST_ATTITUDES:
-        offset, scale, residual = fit_sphere(attitudes)
+        offset, scale, residual, offset_std = fit_sphere(attitudes)
     return ImuCalibration(
         len(rests),
         len(attitudes),
         np.asarray(bias),
-        _noise(rests, [rest.gyro_rad_s for rest in rests]),
+        float(np.hypot(np.sqrt(scatter), _LEAST_GYRO_STD_RAD_S)),
+        gyro_noise,
         _noise(rests, [rest.accel_m_s2 for rest in rests]),
         offset,
+        offset_std,
         scale,
         residual,
         _pressure_noise(rests),
@@ -72,25 +82,30 @@ def calibrate_imu(recordings: Sequence[Recording]) -> ImuCalibration:
 
 
 def with_calibration(rig: Rig, found: ImuCalibration) -> Rig:
-    """The rig with what was found; the rest of it as it was."""
+    """The rig with the calibration; everything else as it was."""
     imu = replace(
         rig.imu,
         gyro_bias_rad_s=to_vector(found.gyro_bias_rad_s),
+        gyro_bias_std_rad_s=round(found.gyro_bias_std_rad_s, 6),
         gyro_noise_rad_s=found.gyro_noise_rad_s,
         accel_noise_m_s2=found.accel_noise_m_s2,
     )
     if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
         imu = replace(
-            imu, accel_offset_m_s2=to_vector(found.accel_offset_m_s2), accel_scale=to_vector(found.accel_scale)
+            imu,
+            accel_offset_m_s2=to_vector(found.accel_offset_m_s2),
+            accel_offset_std_m_s2=round(found.accel_offset_std_m_s2 or _LEAST_OFFSET_STD_M_S2, 5),
+            accel_scale=to_vector(found.accel_scale),
         )
     baro = rig.baro if found.pressure_noise_Pa is None else replace(rig.baro, pressure_noise_Pa=found.pressure_noise_Pa)
     return replace(rig, imu=imu, baro=baro)
 
 
-def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
-    """Offset and scale (3,) that put the mean forces (N, 3) of N attitudes on the sphere of radius g, and the residual.
+def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float, float]:
+    """Offset and scale (3,) that put the mean forces (N, 3) of N attitudes on the sphere of radius g.
 
-    Raises LinkposeError where the attitudes do not tell all axes apart, or what they tell cannot be.
+    The third value is the rms residual, the fourth σ of the offset, each axis (m/s²). Raises LinkposeError where the
+    attitudes do not determine all axes, or the result is impossible.
     """
     offset, scale = np.zeros(3), np.ones(3)
     for _ in range(20):
@@ -100,7 +115,7 @@ def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
         jacobian = np.hstack([-along / scale, -along * true / scale])
         if np.linalg.cond(jacobian) > 300:
             raise LinkposeError(
-                "the attitudes do not tell all axes apart: lay the sensor on each of its six sides, and record them"
+                "the attitudes do not determine all axes: lay the sensor on each of its six sides, and record them"
             )
         change = np.linalg.lstsq(jacobian, STANDARD_GRAVITY - length, rcond=None)[0]
         offset, scale = offset + change[:3], scale + change[3:]
@@ -110,13 +125,15 @@ def fit_sphere(forces: Floats) -> tuple[Floats, Floats, float]:
     if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
         raise LinkposeError(
             f"the rests give an offset of {np.round(offset, 2)} m/s² and a scale of {np.round(scale, 3)}, which no "
-            "MPU-6050 has: was it moved slowly, or is the range set wrong?"
+            "MPU-6050 has: did it move slowly, or is the range set wrong?"
         )
     if residual > _WORST_RESIDUAL_M_S2:
         raise LinkposeError(
-            f"the rests do not fit one sphere ({residual:.2f} m/s² rms are left over): keep the sensor still at each"
+            f"the rests do not fit one sphere (residual {residual:.2f} m/s² rms): keep the sensor still at each"
         )
-    return offset, scale, residual
+    freedom = max(len(forces) - 6, 1)
+    variances = np.diag(np.linalg.inv(jacobian.T @ jacobian))[:3] * residual**2 * len(forces) / freedom
+    return offset, scale, residual, float(np.sqrt(variances.mean() + _LEAST_OFFSET_STD_M_S2**2))
 
 
 def _distinct(forces: Floats) -> Floats:
@@ -133,9 +150,9 @@ def _distinct(forces: Floats) -> Floats:
 
 
 def _noise(rests: Sequence[Measurements], readings: Sequence[Floats]) -> float:
-    """Standard deviation of one sample about a line through each piece of a rest: a slow drift is not in it.
+    """Standard deviation of one sample about a line through each piece of a rest, which removes a slow drift.
 
-    Differences of neighbours would miss what the sensor's low-pass filter makes alike in both.
+    Differences of neighbours would be too small, because the sensor's low-pass filter correlates them.
     """
     squares, freedom = 0.0, 0
     for rest, values in zip(rests, readings, strict=True):

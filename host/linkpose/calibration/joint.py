@@ -1,17 +1,19 @@
-"""J2S from a recording of the link in motion, with no other reference.
+"""J2S (the vector from the joint centre to the sensor) from a recording of the link in motion, without a reference.
 
-The joint's constraint is asked of the readings themselves (`joint_constraint`), and J2S is found by least squares
-together with how the sensors err: biases, scales, alignment. A calibration leaves 0.2 % of scale, which would stretch
-J2S by as much; but gravity, whose length is known, turns in the sensor's axes by the angles that the gyro tells, and so
-shows the scales. By how much scale and alignment may err is asked of the recording as well: each group's variance is
-that of its members as they are found (empirical Bayes), within what the data sheet allows.
+The readings must satisfy the joint's constraint (`joint_constraint`). Least squares estimates J2S together with the
+sensor errors: biases, scales, alignment. A calibration leaves 0.2 % of scale error, which alone would stretch J2S by
+0.2 %. Gravity makes the scales observable, because its length is known and it turns in the sensor's axes by the angles
+that the gyro measures. The prior variance of each group of scales and alignments is the mean square of the estimated
+members (empirical Bayes), bounded by the data sheet.
 
-Gauss-Newton, with Huber's weights. Gravity's direction γ is each piece's own, and is eliminated: over some seconds
-neither the gyro's noise nor its wandering bias turns it by much. The first passes take short pieces, over which a gyro
-bias of 20 °/s leaves γ nearly in its place.
+The method is Gauss-Newton with Huber's weights. Each piece of the recording has its own direction of gravity γ, which
+is eliminated: within seconds neither the gyro's noise nor a drift of its bias turns γ by much. The first passes use
+short pieces, over which a gyro bias of 20 °/s hardly turns γ.
 
-What the residuals have in common from one to the next (a joint with play, a sensor that lags) makes them worth less
-than their number. That is measured on the gradients of blocks of a second, and the variance is widened by it.
+Residuals are correlated (play in the joint, delay of a sensor), so they contain less information than their number
+suggests. The variance of the gradients of one-second blocks measures this, and the covariance is widened accordingly.
+An error that follows the swing coherently (a support that moves along) does not average out at all; it is added to the
+covariance as a share of the residual.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from linkpose.calibration.joint_constraint import (
     Equations,
     Stretch,
     equations,
+    noise_of,
     pieces,
     stretches,
 )
@@ -41,12 +44,20 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Rig, to_vector
+from linkpose.sensors.rig import UNKNOWN_JOINT, Imu, Joint, Rig, to_vector
 
 _NO_JOINT_M_S2 = 1.0
-LARGE_RESIDUAL_M_S2 = 0.2  # what a joint that moves by centimetres leaves; one with a little play leaves 0.03
+LARGE_RESIDUAL_M_S2 = 0.2  # of a joint that moves by centimetres; one with a little play leaves 0.03
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
-_WORST_STD_M, _WORST_SHARE = 0.03, 0.05  # of an axis that the motion does not tell: metres, share of ‖d‖
+# σ of J2S along a direction from which on it counts as not observable: a share of ‖d‖, within bounds in metres.
+_WEAK_SHARE, _LEAST_WEAK_M, _MOST_WEAK_M = 0.05, 0.005, 0.03
+# Share of the residual that may follow the swing and shift J2S. Three trials of a real pendulum with residuals of 0.07
+# to 0.19 m/s² disagree by 0.05 m (rms) along the axis that 0.1 gives a σ of 0.02 to 0.05 m. Doubled, the σ of an axis
+# that the motion hardly excites doubles.
+_COHERENT_SHARE = 0.1
+_CLEAR_OF_NOISE = 2.0  # mean square of regressors, in units of that by noise, that is no motion
+_UNKNOWN_M = UNKNOWN_JOINT.largest_std_m  # σ along a direction without any motion: that of an unknown J2S
+_LEAST_EXCESS = 0.5  # share of the residual that counts even where the sensors' noise explains all of it
 _FARTHEST_M = 5.0
 _SHORT_PIECES_S, _PIECE_S = (1.0, 1.0, 3.0, 3.0), 8.0
 _MOST_PASSES, _SETTLED_M = 20, 1e-5
@@ -57,8 +68,8 @@ _LOCAL_GRAVITY = 0.0005  # share by which g differs from the standard's between 
 
 # Data sheet: zero-rate output ±20 °/s, zero-g output ±50 mg.
 _GYRO_BIAS_STD_RAD_S, _ACCEL_BIAS_STD_M_S2 = 0.35, 0.3
-# Scale and alignment: who errs alike, and the largest standard deviation (data sheet: ±3 %, ±2 %). What both sensors'
-# axes are turned by together shows nowhere: J2S is then in the axes halfway between the two sensors'.
+# Scale and alignment: groups with a common variance, and its largest standard deviation (data sheet: ±3 %, ±2 %). A
+# common rotation of both sensors' axes is not observable: J2S is in the axes halfway between the two sensors'.
 _DIAGONAL = np.arange(0, 9, 4)
 _OFF_DIAGONAL = np.setdiff1d(np.arange(9), _DIAGONAL)
 _GROUPS = (
@@ -67,32 +78,71 @@ _GROUPS = (
     (np.concatenate([ACCEL_MATRIX + _OFF_DIAGONAL, GYRO_MATRIX + _OFF_DIAGONAL]), 0.02),
 )
 _ACCEL_SCALES = _GROUPS[0][0]
-_FREE_PASSES = 2  # before the residuals tell anything of themselves
-_AS_CALIBRATED = (0.01, 0.15, 0.01)  # gyro bias (rad/s), accelerometer offset (m/s²) and scale: off by no more
+_FREE_PASSES = 2  # before the residuals are small enough to measure their correlation
+# Largest changes of a calibrated sensor's gyro bias (rad/s), accelerometer offset (m/s²) and scale.
+_AS_CALIBRATED = (0.01, 0.15, 0.01)
 _FIRST_STD = 0.01
 _USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, worth so many members
 
 
-SENSOR_ERRORS = ("gyro_bias_rad_s", "accel_offset_m_s2", "accel_scale")  # of the rig's [imu], which the fit estimates
+SENSOR_ERRORS = (
+    "gyro_bias_rad_s",
+    "accel_offset_m_s2",
+    "accel_scale",
+)  # keys of the rig's [imu] that the fit estimates
 
 
 @dataclass(frozen=True, slots=True)
 class JointCalibration:
-    """What was found. The residual of a good joint is 0.03 m/s² or less.
+    """J2S and its covariance. The residual of a good joint is 0.03 m/s² or less.
 
-    `imu` is the rig's with the sensor's bias, offset and scale as the same fit has them.
+    `imu` is the rig's with the sensor's bias, offset and scale as the same fit estimates them.
     """
 
     j2s_m: Floats  # (3,)
-    std_m: Floats  # (3,)
+    covariance_m2: Floats  # (3, 3)
     residual_m_s2: float  # rms, by axis, of the smoothed specific force that is not explained
     samples: int  # in motion
     imu: Imu
 
+    @property
+    def std_m(self) -> Floats:
+        """(3,) σ of each axis."""
+        return np.sqrt(np.diag(self.covariance_m2))
+
+    @property
+    def worst_std_m(self) -> float:
+        """σ along the direction that is known least."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance_m2)[-1]))
+
+    @property
+    def worst_direction(self) -> Floats:
+        """(3,) the direction that is known least, a unit vector in the sensor's axes: the axis of a hinge."""
+        return np.asarray(np.linalg.eigh(self.covariance_m2)[1][:, -1])
+
+    @property
+    def weak_axis(self) -> int | None:
+        """0, 1 or 2: the axis nearest to a direction along which J2S is not observable; None if all are."""
+        is_weak = self.worst_std_m > weak_std_m(float(np.linalg.norm(self.j2s_m)))
+        return int(np.argmax(np.abs(self.worst_direction))) if is_weak else None
+
     def as_dict(self) -> dict[str, Any]:
         """The object that `calibrate joint --json` prints: J2S, and the sensor errors that the same fit estimated."""
-        fit = {"j2s_m": self.j2s_m.tolist(), "std_m": self.std_m.tolist(), "residual_m_s2": self.residual_m_s2}
-        return fit | {"samples": self.samples} | {name: getattr(self.imu, name) for name in SENSOR_ERRORS}
+        limit = weak_std_m(float(np.linalg.norm(self.j2s_m)))
+        return {
+            "j2s_m": self.j2s_m.tolist(),
+            "std_m": self.std_m.tolist(),
+            "observable": (self.std_m <= limit).tolist(),
+            "worst_std_m": self.worst_std_m,
+            "worst_direction": self.worst_direction.tolist(),
+            "residual_m_s2": self.residual_m_s2,
+            "samples": self.samples,
+        } | {name: getattr(self.imu, name) for name in SENSOR_ERRORS}
+
+
+def weak_std_m(length_m: float) -> float:
+    """σ (m) from which on a direction of a J2S of this length counts as not observable."""
+    return min(max(_WEAK_SHARE * length_m, _LEAST_WEAK_M), _MOST_WEAK_M)
 
 
 class _Sums(NamedTuple):
@@ -101,17 +151,21 @@ class _Sums(NamedTuple):
     normals: Floats  # (B, UNKNOWNS, UNKNOWNS)
     gradients: Floats  # (B, UNKNOWNS), downhill
     residual: Floats  # (M, 3) m/s²
-    equations: float  # how many, less what the robust weights take
+    equations: float  # their number, weighted
 
 
 def with_calibration(rig: Rig, found: JointCalibration, with_imu: bool) -> Rig:
-    """The rig with J2S, and on request the sensor's errors, as they were found; the rest of it as it was."""
-    joint = Joint(to_vector(found.j2s_m, 5), round(float(found.std_m.max()), 5))
+    """The rig with J2S, and on request the sensor's errors; everything else as it was.
+
+    The standard deviation is the largest of the axes, or one for each axis if J2S is not observable along all.
+    """
+    std_m = np.maximum(np.round(found.std_m, 5), 1e-5)
+    joint = Joint(to_vector(found.j2s_m, 5), float(std_m.max()) if found.weak_axis is None else to_vector(std_m))
     return replace(rig, joint=joint, imu=found.imu if with_imu else rig.imu)
 
 
 def is_calibrated(imu: Imu, found: JointCalibration) -> bool:
-    """Whether what was found of the sensor's errors is next to what was known of them."""
+    """Whether the sensor errors that the fit estimates agree with the rig's calibration."""
     before, after = (
         np.array([i.gyro_bias_rad_s, i.accel_offset_m_s2, i.accel_scale], dtype=np.float64) for i in (imu, found.imu)
     )
@@ -119,23 +173,53 @@ def is_calibrated(imu: Imu, found: JointCalibration) -> bool:
 
 
 def calibrate_joint(recordings: Sequence[Recording], rig: Rig) -> JointCalibration:
-    """J2S from all recordings together. Raises LinkposeError, naming the axis, for a motion that does not tell it."""
+    """J2S from all recordings together.
+
+    A direction that the motion does not excite has a large σ. Raises LinkposeError where more than one direction is
+    not observable, where nothing moves, or where the readings fit no joint.
+    """
     parts = [stretch for r in recordings for stretch in stretches(r.measurements, rig.imu)]
     if not any(True for part in parts for _ in pieces(part, _PIECE_S)):
         names = ", ".join(str(r.path) for r in recordings)
         raise LinkposeError(f"{names}: nowhere is a second with {1 / LONGEST_STEP_S:.0f} samples or more; record again")
-    unknowns, covariance, residual = _fit(parts)
+    unknowns, whole, residual = _fit(parts)
     samples = _samples_in_motion(parts, unknowns[GYRO_BIAS:ACCEL_BIAS])
-    d, covariance = unknowns[J2S:GYRO_BIAS], covariance[J2S:GYRO_BIAS, J2S:GYRO_BIAS]
-    covariance = covariance + _LOCAL_GRAVITY**2 * np.outer(d, d)
-    _refuse_weak_axes(d, covariance, residual)
-    found = JointCalibration(d, np.sqrt(np.diag(covariance)), residual, samples, _with_errors(rig.imu, unknowns))
+    d, covariance = unknowns[J2S:GYRO_BIAS], whole[J2S:GYRO_BIAS, J2S:GYRO_BIAS]
+    covariance = covariance + _LOCAL_GRAVITY**2 * np.outer(d, d) + _coherent_errors(parts, unknowns, residual, rig.imu)
+    found = JointCalibration(d, covariance, residual, samples, _with_errors(rig.imu, unknowns))
+    _refuse_unobservable(found)
     _refuse_impossible(found)
     return found
 
 
+def _coherent_errors(parts: Sequence[Stretch], unknowns: Floats, residual: float, imu: Imu) -> Floats:
+    """Covariance (3, 3) (m²) of J2S by a share of the residual that is proportional to its regressors.
+
+    The rms of the regressors along a direction, s (1/s²), divides an error of r (m/s²) that follows them: r / s. The
+    part of r that the sensors' noise explains does not follow them. The part of s that the gyro's noise explains is no
+    motion: along a direction without any other, J2S is unknown.
+    """
+    squares, count, by_force, by_rate = np.zeros((3, 3)), 0, 0.0, 0.0
+    for piece in (piece for part in parts for piece in pieces(part, _PIECE_S)):
+        jacobian = equations(piece, unknowns).jacobian[:, :, J2S:GYRO_BIAS]
+        centred = jacobian - jacobian.mean(axis=0)
+        squares += np.einsum("nip,niq->pq", centred, centred)
+        force, rate = noise_of(piece, imu)
+        by_force, by_rate, count = (
+            by_force + len(jacobian) * force,
+            by_rate + len(jacobian) * rate,
+            count + len(jacobian),
+        )
+    d = unknowns[J2S:GYRO_BIAS]
+    excess = max(residual**2 - (by_force + by_rate * float(d @ d)) / count, (_LEAST_EXCESS * residual) ** 2)
+    coherent = _COHERENT_SHARE**2 * excess
+    values, vectors = np.linalg.eigh(squares / (3 * count))
+    clear = np.maximum(values - _CLEAR_OF_NOISE * by_rate / count, coherent / _UNKNOWN_M**2)
+    return np.asarray(vectors @ np.diag(coherent / clear) @ vectors.T)
+
+
 def _with_errors(imu: Imu, unknowns: Floats) -> Imu:
-    """The sensor's calibration with what the readings that it gave still err by."""
+    """The rig's calibration, corrected by the errors that the fit estimates of the calibrated readings."""
     scale = np.array(imu.accel_scale)
     return replace(
         imu,
@@ -146,7 +230,7 @@ def _with_errors(imu: Imu, unknowns: Floats) -> Imu:
 
 
 def _samples_in_motion(parts: Iterable[Stretch], gyro_bias: Floats) -> int:
-    """How many; raises LinkposeError where they are too few."""
+    """Number of samples in motion. Raises LinkposeError where they are too few."""
     samples, seconds = 0, 0.0
     for part in parts:
         moving = np.linalg.norm(part.rate - gyro_bias, axis=1) > _MOVING_RAD_S
@@ -159,18 +243,16 @@ def _samples_in_motion(parts: Iterable[Stretch], gyro_bias: Floats) -> int:
     return samples
 
 
-def _refuse_weak_axes(d: Floats, covariance: Floats, residual: float) -> None:
-    values, vectors = np.linalg.eigh(covariance)
-    std, length = float(np.sqrt(values[-1])), float(np.linalg.norm(d))
-    if std <= min(_WORST_STD_M, _WORST_SHARE * length):
+def _refuse_unobservable(found: JointCalibration) -> None:
+    """A rotation about one axis leaves J2S unknown along this axis alone; two unknown directions are no result."""
+    std = float(np.sqrt(np.linalg.eigvalsh(found.covariance_m2)[1]))
+    if std <= _MOST_WEAK_M:
         return
-    if residual > LARGE_RESIDUAL_M_S2:
-        raise _no_joint(residual)
-    axis = int(np.argmax(np.abs(vectors[:, -1])))
-    others = " and ".join(name for i, name in enumerate("xyz") if i != axis)
+    if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
+        raise _no_joint(found.residual_m_s2)
     raise LinkposeError(
-        f"the motion does not tell J2S along the sensor's {'xyz'[axis]} axis (to {std:.3f} m only, of a J2S of "
-        f"{length:.2f} m): turn the link about its {others} axes too, and faster"
+        f"the motion is too slow or too short to find J2S: two of its three directions are known to {std:.2f} m or "
+        "worse; swing the link faster and in all directions"
     )
 
 
@@ -200,7 +282,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
         normal, prior = sums.normals.sum(axis=0), _prior(spread)
         first = number < _FREE_PASSES
         worth = 1.0 if first else _correlation(sums, normal + worth * np.diag(prior))
-        # The readings' density: a fit that shrinks them would shrink its residuals, and be none the better for it.
+        # The readings' density: without it, a fit could reduce its residuals by shrinking the readings.
         volume = np.zeros(UNKNOWNS)
         volume[_ACCEL_SCALES] = sums.equations / (1 - unknowns[_ACCEL_SCALES])
         curvature = volume**2 / max(sums.equations, 1.0)
@@ -217,7 +299,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
 def _normal_equations(parts: Sequence[Equations], scale: float) -> _Sums:
     """Sums over the pieces, `scale` (m/s²) being the usual residual.
 
-    To let γ be what fits a piece best is to take its means off, and leaves one equation on the length of the mean.
+    Eliminating γ removes the means of a piece, and leaves one equation for the length of the mean.
     """
     block_normals, gradients, residuals, number = [], [], [], 0.0
     for gravity, jacobian, apart_s in parts:
@@ -240,7 +322,7 @@ def _normal_equations(parts: Sequence[Equations], scale: float) -> _Sums:
 
 
 def _mean_gravity(gravity: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
-    """Of a piece: the robust mean (3,) of γ (M, 3), the residuals (M, 3), and their weights (M,), up to 1."""
+    """The robust mean (3,) of γ (M, 3) in a piece, the residuals (M, 3), and their weights (M,), up to 1."""
     mean = np.median(gravity, axis=0)
     for _ in range(5):
         residual = gravity - mean
@@ -261,23 +343,22 @@ def _prior(spread: Floats) -> Floats:
 
 
 def _spreads(unknowns: Floats, covariance: Floats, spread: Floats) -> Floats:
-    """Variance of each group's members, as they are found; those that are not told do not count (MacKay's update)."""
+    """Variance of each group's members as estimated; members without information do not count (MacKay's update)."""
     found = []
     for (members, largest), variance in zip(_GROUPS, spread, strict=True):
-        told = len(members) - float(np.diag(covariance)[members].sum()) / variance
+        informed = len(members) - float(np.diag(covariance)[members].sum()) / variance
         squares = float((unknowns[members] ** 2).sum())
-        found.append(min((_USUAL_WEIGHT * _USUAL_STD**2 + squares) / (_USUAL_WEIGHT + told), largest**2))
+        found.append(min((_USUAL_WEIGHT * _USUAL_STD**2 + squares) / (_USUAL_WEIGHT + informed), largest**2))
     return np.array(found)
 
 
 def _correlation(sums: _Sums, information: Floats) -> float:
-    """By how much the gradients of blocks vary more than those of independent residuals would; 1 or more.
+    """Variance of the blocks' gradients over the variance with independent residuals; 1 or more.
 
-    Σ sᵀ N⁻¹ s over the blocks' gradients s, over what it is expected to be: a block's own normal matrix, less its part
-    in what was fitted.
+    Σ sᵀ N⁻¹ s over the blocks' gradients s, over its expectation: a block's normal matrix less its share in the fit.
     """
     inverse = np.linalg.inv(information)
     measured = np.einsum("bp,pq,bq->", sums.gradients, inverse, sums.gradients)
-    told = inverse @ sums.normals
-    expected = np.einsum("bpp->", told) - np.einsum("bpq,bqp->", told, told)
+    shares = inverse @ sums.normals
+    expected = np.einsum("bpp->", shares) - np.einsum("bpq,bqp->", shares, shares)
     return max(1.0, float(measured / expected))

@@ -1,20 +1,20 @@
-"""What a fixed joint says of the sensors' readings, as residuals that are linear in them, with their Jacobian.
+"""The constraint of a fixed joint as equations in J2S and the sensor errors, with their Jacobian.
 
-Within a piece of a recording let C turn the sensor's axes into those at the piece's first sample: the gyro, integrated.
-There gravity stands still, and the joint's constraint on the velocity, C(ω×d), reads
+Within a piece of a recording, the rotation C from the sensor's axes to those at the piece's first sample is the
+integral of the gyro. In these axes gravity is constant, and the joint's constraint on the velocity, C(ω×d), is
 
     d/dt C(ω×d) = C f − γ,        γ = C g Z, constant, ‖γ‖ = g
 
-f being the specific force. Multiplied by a smooth weight w that is zero at both ends of a fraction of a second, and
-integrated by parts, nothing is left to differentiate:
+where f is the specific force. Multiplied by a smooth weight w that is zero at both ends of a fraction of a second, and
+integrated by parts, the equation contains no derivative of a reading:
 
     γ = ∫ w C f dt + ∫ ẇ C(ω×d) dt,        ∫ w dt = 1
 
-Three equations every fraction of a second, in d and in how the sensors err: ω = (I − M_g)(s_G − b_g),
-f = (I − M_a)(s_A − b_a). How ω errs turns C more and more: its column holds the angle that was gathered since the
-piece's start.
+These are three equations for each weight, in d and in the sensor errors: ω = (I − M_g)(s_G − b_g),
+f = (I − M_a)(s_A − b_a). An error of ω accumulates in C: its column of the Jacobian holds the angle since the start of
+the piece.
 
-Source: the constraint is (9) of the link paper; the weights are M. Shinbrot's "method functions", NACA TN 3288, 1954.
+Source: the constraint is (9) of [Link]; the weights are the "method functions" of M. Shinbrot, NACA TN 3288, 1954.
 """
 
 from __future__ import annotations
@@ -33,10 +33,14 @@ from linkpose.wire.messages import SampleFlags
 # Where each unknown begins: d, biases of gyro and accelerometer, and by rows M_a and M_g.
 J2S, GYRO_BIAS, ACCEL_BIAS, ACCEL_MATRIX, GYRO_MATRIX, UNKNOWNS = 0, 3, 6, 9, 18, 27
 
-_WEIGHT_S = 0.3  # over which a weight w reaches; half of it weighs little
+_WEIGHT_S = 0.3  # length of a weight w; the outer half of it contributes little
 _FEWEST_READINGS = 8  # within a weight
-LONGEST_STEP_S = 0.051  # that a trapezoid bridges: of 20 samples a second, or over lost ones
-_SPIKE_RAD_S, _SPIKE_M_S2 = 1.0, 10.0  # away from the neighbours on both sides: no motion of a link
+LONGEST_STEP_S = 0.051  # between samples that a trapezoid joins: 20 samples a second, or some lost ones
+# A spike is away from both neighbours, to the same side, by more than a link moves within a sample, and by more than
+# this many times the local median of such distances: a motor's vibration moves every sample, a spike only its own.
+_SPIKE_RAD_S, _SPIKE_M_S2 = 1.0, 10.0
+_SPIKE_MEDIANS = 10.0  # a normal distribution exceeds 5 medians of |x| in one of 1000 samples; doubled, it keeps more
+_SPREAD_SAMPLES = 32  # over which the median is taken, and over the same before and after
 _OF_GYRO = [*range(GYRO_BIAS, ACCEL_BIAS), *range(GYRO_MATRIX, UNKNOWNS)]
 _SATURATED = int(SampleFlags.ACCEL_SATURATED | SampleFlags.GYRO_SATURATED)
 
@@ -50,7 +54,7 @@ class Stretch(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """What a piece of a recording says, M times over."""
+    """The M equations of a piece of a recording."""
 
     gravity: Floats  # (M, 3) γ, m/s²
     jacobian: Floats  # (M, 3, UNKNOWNS) of γ
@@ -70,9 +74,9 @@ def stretches(block: Measurements, imu: Imu) -> list[Stretch]:
 
 
 def pieces(stretch: Stretch, longest_s: float) -> Iterator[Stretch]:
-    """The stretch in pieces of equal length, none where it is too short for equations.
+    """The stretch in pieces of equal length; none where it is too short for equations.
 
-    A piece is longer than asked where samples are so rare that a weight takes up a good part of it.
+    A piece is longer than `longest_s` where samples are so rare that a weight covers a good part of it.
     """
     time_s = stretch.time_s
     if len(time_s) < 2 * _FEWEST_READINGS:
@@ -111,12 +115,34 @@ def equations(piece: Stretch, unknowns: Floats) -> Equations:
     )
 
 
+def noise_of(piece: Stretch, imu: Imu) -> tuple[float, float]:
+    """Variance of γ on each axis by the sensor's white noise: by the force ((m/s²)²), by the rate per metre of d."""
+    _, weight, slope, _ = _weights(piece.time_s)
+    force = imu.accel_noise_m_s2**2 * np.square(weight).sum(axis=1).mean()
+    rate = imu.gyro_noise_rad_s**2 * 2 / 3 * np.square(slope).sum(axis=1).mean()
+    return float(force), float(rate)
+
+
 def _spikes(values: Floats, jump: float) -> NDArray[np.bool_]:
-    """(N,) Where a reading is off from both its neighbours, to the same side on some axis."""
-    steps = np.diff(values, axis=0)
+    """(N,) Where a reading is off from both its neighbours, to the same side on some axis, unlike the others there."""
     away = np.zeros(len(values), dtype=bool)
-    away[1:-1] = (np.minimum(np.abs(steps[:-1]), np.abs(steps[1:])) * (steps[:-1] * steps[1:] < 0) > jump).any(axis=1)
+    if len(values) < 3:
+        return away
+    steps = np.diff(values, axis=0)
+    nearer = np.minimum(np.abs(steps[:-1]), np.abs(steps[1:]))
+    distance = nearer * (steps[:-1] * steps[1:] < 0)
+    away[1:-1] = (distance > np.maximum(jump, _SPIKE_MEDIANS * _local_median(nearer))).any(axis=1)
     return away
+
+
+def _local_median(values: Floats) -> Floats:
+    """(N, 3) The largest of the medians of each value's block of samples and of the blocks beside it."""
+    blocks = max(len(values) // _SPREAD_SAMPLES, 1)
+    parts = np.array_split(np.arange(len(values)), blocks)
+    medians = np.array([np.median(values[part], axis=0) for part in parts])
+    edged = np.pad(medians, ((1, 1), (0, 0)), mode="edge")
+    largest = np.maximum(np.maximum(edged[:-2], medians), edged[2:])
+    return np.repeat(largest, [len(part) for part in parts], axis=0)
 
 
 def _weight_length(time_s: Floats) -> float:
@@ -124,10 +150,10 @@ def _weight_length(time_s: Floats) -> float:
 
 
 def _weights(time_s: Floats) -> tuple[NDArray[np.int64], Floats, Floats, float]:
-    """Of M weights: the K samples under each, w and ẇ there times a sample's share of the time, all (M, K).
+    """M weights: the K samples under each; w and ẇ there, times a sample's share of the time, all (M, K).
 
-    And how far they are apart (s). w is sin⁴: smooth enough at its ends for a sum over samples to be the integral. The
-    sums of w, of ẇ and of ẇ t are made exactly 1, 0 and −1.
+    The last value is the distance from one weight to the next (s). w is sin⁴: smooth enough at its ends for a sum over
+    samples to be the integral. The sums of w, of ẇ and of ẇ t are made exactly 1, 0 and −1.
     """
     length = _weight_length(time_s)
     apart = 0.5 * length

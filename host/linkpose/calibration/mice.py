@@ -34,7 +34,7 @@ TURN_TOLERANCE_RAD = math.radians(20)  # from a straight line, or from full turn
 GYRO_SCALE = 0.04  # of an uncalibrated gyro: 3 % (data sheet), and 1 % of cross-axis sensitivity
 MOST_TURNS = 12  # beyond which such a gyro miscounts
 FEWEST_COUNTS = 1000  # of a mouse over a line: so that a count is a tenth of a percent
-PLACE_STD_M = 0.001  # to which a ruler tells where a mouse sits
+PLACE_STD_M = 0.001  # σ of a mouse's position measured with a ruler
 LINE_STD_M = 0.001  # to which a line is driven straight
 GYRO_STD_RAD = 0.01  # of a line's small turn, by the gyro
 WORST_MISFIT = 8.0  # of these standard deviations
@@ -67,13 +67,15 @@ class _DriveSums:
 
 
 def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | None) -> list[MouseCalibration]:
-    """Each mouse of the rig. `length_m` is that of every line, None where it is not known; the rig places the mice.
+    """Calibration of each mouse that the rig places. `length_m` is the length of every line; None if unknown.
 
     Raises LinkposeError naming the drive and the cure for a rig without mice, a motion that is missing or is neither a
     line nor full turns, a recording that did not see it all, and mice that contradict their places.
     """
     if not rig.mouse:
-        raise LinkposeError("the rig file does not say where the mice sit: add [[mouse]] with x_m, y_m, port by port")
+        raise LinkposeError(
+            "the rig file lacks the positions of the mice; add one [[mouse]] table with x_m and y_m for each port"
+        )
     drives = [_sums(recording, len(rig.mouse)) for recording in recordings]
     if all(drive.turns for drive in drives):
         line = f"one of {length_m:g} m" if length_m else "one of a metre or more"
@@ -145,10 +147,10 @@ def _check_whole(name: str, m: Measurements, counts: Floats, first: int, last: i
 
 
 def _turned(name: str, m: Measurements, first: int, last: int) -> float:
-    """The turn (rad) while the mice move, by the gyro; its bias is that of the rest before."""
+    """The turn (rad) while the mice move, by the gyro less its mean over the rest before."""
     rate, time = m.gyro_rad_s[:, 2], m.time_s
     if not np.isfinite(rate).any():
-        raise LinkposeError(f"{name} holds no gyro, which tells lines from turns: check the MPU6050's wiring")
+        raise LinkposeError(f"{name} holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring")
     rest = rate[:first][np.isfinite(rate[:first])]
     if time[first] - time[0] < REST_S or not len(rest):
         raise LinkposeError(f"{name} begins in motion; stand still for a second, then drive")

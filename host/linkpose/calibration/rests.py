@@ -9,13 +9,13 @@ from linkpose.sensors.measurements import Floats, Measurements
 
 _WINDOW_S = 0.5
 _SHORTEST_S = 1.0
-# Within a window at rest the readings scatter by no more than this, which is a few times a poor part's noise.
+# Largest standard deviations within a window at rest: a few times the noise of a poor part.
 _GYRO_STD_RAD_S = 0.01
 _ACCEL_STD_M_S2 = 0.15
 
 
 def find_rests(block: Measurements) -> list[slice]:
-    """The rests of a second or more, less a window at either end, in which a hand may still have been at it."""
+    """The rests of a second or more, without a window at either end, in which a hand may still touch the sensor."""
     step = np.median(np.diff(block.time_s)) if len(block) > 1 else 0.0
     width = round(float(_WINDOW_S / step)) if step > 0 else 0
     if width < 5 or len(block) < 3 * width:
@@ -25,7 +25,7 @@ def find_rests(block: Measurements) -> list[slice]:
     edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
     found = []
     for first, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
-        # Window k covers samples k … k + width − 1; those of the first and the last window are left out.
+        # Window k covers samples k … k + width − 1; the samples of the first and the last window are left out.
         rest = slice(int(first) + width, int(end) - 1)
         if rest.stop - rest.start >= _SHORTEST_S / step:
             found.append(rest)

@@ -55,11 +55,17 @@ def _show(found: ImuCalibration) -> None:
 
     x, y, z = found.gyro_bias_rad_s
     click.echo(f"{_count(found.rests, 'rest')} in {_count(found.attitudes, 'attitude')}")
-    click.echo(f"gyro: bias {x:.5f}, {y:.5f}, {z:.5f} rad/s, noise {found.gyro_noise_rad_s:.5f} rad/s")
+    click.echo(
+        f"gyro: bias {x:.5f}, {y:.5f}, {z:.5f} ± {found.gyro_bias_std_rad_s:.5f} rad/s, "
+        f"noise {found.gyro_noise_rad_s:.5f} rad/s"
+    )
     click.echo(f"accelerometer: noise {found.accel_noise_m_s2:.4f} m/s²")
     if found.accel_offset_m_s2 is not None and found.accel_scale is not None:
         (ox, oy, oz), (kx, ky, kz) = found.accel_offset_m_s2, found.accel_scale
-        click.echo(f"accelerometer: offset {ox:.4f}, {oy:.4f}, {oz:.4f} m/s², scale {kx:.5f}, {ky:.5f}, {kz:.5f}")
+        click.echo(
+            f"accelerometer: offset {ox:.4f}, {oy:.4f}, {oz:.4f} ± {found.accel_offset_std_m_s2:.4f} m/s², "
+            f"scale {kx:.5f}, {ky:.5f}, {kz:.5f}"
+        )
         if found.attitudes > FEWEST_ATTITUDES:
             click.echo(f"accelerometer: residual {found.accel_residual_m_s2:.4f} m/s²")
         else:  # as many equations as unknowns

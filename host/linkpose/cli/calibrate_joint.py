@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
+
+if TYPE_CHECKING:
+    from linkpose.calibration.joint import JointCalibration
 
 
 @click.command("joint")
@@ -21,7 +25,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
 
     Record the link on its fixed joint, swung for half a minute or more in all directions. The calibration of the
     inertial sensor in the rig file is applied. Sensor errors that remain are estimated together with J2S; --imu writes
-    them, too.
+    them, too. A hinge rotates about one axis: J2S along this axis is not observable, and its σ is large.
     """
     from linkpose.calibration.joint import (
         LARGE_RESIDUAL_M_S2,
@@ -43,6 +47,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
         click.echo(f"residual {found.residual_m_s2:.3f} m/s² over {found.samples} samples in motion")
         for name in SENSOR_ERRORS:
             click.echo(f"{name} {', '.join(f'{value:.4f}' for value in getattr(found.imu, name))}")
+    if found.weak_axis is not None and not json_lines:
+        _show_weak(found)
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
         click.echo("The residual is large. Check that the joint is fixed and the sensor firm on the link.", err=True)
     if not with_imu:
@@ -56,3 +62,16 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
     if not quiet:
         click.echo(f"written to {rig_file}", err=True)
     options.show_next(quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
+
+
+def _show_weak(found: JointCalibration) -> None:
+    """The direction along which the motion does not show J2S, and what to do."""
+    axis = found.weak_axis
+    others = " and ".join(name for at, name in enumerate("xyz") if at != axis)
+    x, y, z = found.worst_direction
+    click.echo(
+        f"J2S is not observable along the sensor's {'xyz'[axis or 0]} axis (direction {x:.2f}, {y:.2f}, {z:.2f}): "
+        f"σ {found.worst_std_m:.3f} m. Rotate the link about its {others} axes too, and faster; on a hinge with a "
+        "horizontal axis this direction does not enter the height.",
+        err=True,
+    )

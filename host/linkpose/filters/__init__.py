@@ -139,7 +139,9 @@ def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
     if not mice:
         raise CannotRun("no mouse gives counts; if there is one, check its wiring")
     if not rig.mouse:
-        raise CannotRun("the rig file does not say where the mice sit: add [[mouse]] with x_m and y_m, port by port")
+        raise CannotRun(
+            "the rig file lacks the positions of the mice; add one [[mouse]] table with x_m and y_m for each port"
+        )
     if min(mice, len(rig.mouse)) == 1 and not sensors & Sensors.MPU6050:
         raise CannotRun("one mouse cannot tell a turn without the MPU6050's rate: add a second mouse")
 

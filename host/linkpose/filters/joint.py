@@ -79,7 +79,7 @@ class JointFilter:
         self.state = TiltState.fresh()
         self._history = History.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.j2s_std_m
+        self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.largest_std_m
 
     @property
     def rejected(self) -> int:

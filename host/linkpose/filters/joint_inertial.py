@@ -19,10 +19,22 @@ import numpy as np
 from linkpose.filters._imu import ImuCalibration
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
-from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, PSI, D, Floats, fresh_state, record_of, roll_pitch_deg
+from linkpose.filters.inertial.state import (
+    BA,
+    BG,
+    ESTIMATE,
+    MA,
+    PSI,
+    D,
+    Floats,
+    SensorErrors,
+    fresh_state,
+    record_of,
+    roll_pitch_deg,
+)  # fmt: skip
 from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
-from linkpose.sensors.rig import Rig
+from linkpose.sensors.rig import Imu, Rig
 
 _HYPOTHESES = (CALIBRATED, DATA_SHEET)
 
@@ -31,15 +43,20 @@ class InertialParameters(NamedTuple):
     """Parameters of the inertial core. Unit, meaning; origin; effect of doubling where it matters."""
 
     has_joint: float = 1.0  # 1: joint constraint; 0: small velocity
-    # (rad/s)/√s: 1 °/s in the hour in which a sensor warms up.
-    gyro_bias_walk_rad_s: float = 3e-4
+    # (rad/s)/√s: twice the rate random walk of an MPU-6050 at constant temperature (its Allan deviation is 0.003 °/s at
+    # 100 s), since it also warms up. Doubled, the heading drifts by 10 % more.
+    gyro_bias_walk_rad_s: float = 2e-5
+    # (rad/s)/√s: the most, where the constraint leaves over more than its floor. Chosen on a real pendulum: a quarter
+    # of it costs 5 % of the tilt there.
+    most_bias_walk_rad_s: float = 4e-4
     # 1/√s, share of J2S's initial σ: lets an error of the model leave J2S again. Doubled, the height's σ grows by 10 %.
     j2s_walk: float = 0.001
     # Least share of ‖ω×d‖ that the constraint leaves over: the sampling error of a trapezoid at 100 Hz.
     least_residual: float = 0.0013
     first_residual: float = 0.03  # the same share before it has been measured
     residual_time_s: float = 4.0  # over which it is measured (s): some swings
-    velocity_floor_m_s: float = 0.001  # play of the joint, bending of the link
+    # Play of the joint, bending of the link. At 1 mm/s the NEES of an uncalibrated height is 2.4, at 2.5 mm/s 1.4.
+    velocity_floor_m_s: float = 0.0025
     # Parts of rate and force that scale and misalignment in the state do not explain (nonlinearity, vibration).
     gyro_misfit: float = 0.0
     accel_misfit: float = 0.0
@@ -59,6 +76,15 @@ class InertialParameters(NamedTuple):
     steady_memory_s: float = 0.1  # over which rate and force must stay the same (s)
     swing_share: float = 3.0  # a rate that changes by so much in that time changes by this times as much in a motion
     least_turn_rad_s: float = 0.001  # σ of the rate of a sensor that is held still
+
+
+def declared(errors: SensorErrors, imu: Imu) -> SensorErrors:
+    """The errors with the standard deviations of bias and offset that a rig file declares; others as they were."""
+    gyro, accel = imu.gyro_bias_std_rad_s, imu.accel_offset_std_m_s2
+    return errors._replace(
+        gyro_bias_rad_s=errors.gyro_bias_rad_s if gyro is None else gyro,
+        accel_bias_m_s2=errors.accel_bias_m_s2 if accel is None else accel,
+    )
 
 
 class JointInertialFilter:
@@ -83,7 +109,9 @@ class JointInertialFilter:
             raise ValueError("joint-inertial needs J2S, at least as a guess")
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
-        self._states = [fresh_state(errors, rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES]
+        self._states = [
+            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
+        ]
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 

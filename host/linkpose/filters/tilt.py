@@ -110,7 +110,7 @@ class TiltFilter:
         self.state = TiltState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
         self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
-        self._j2s_std = rig.joint.j2s_std_m
+        self._j2s_std = rig.joint.largest_std_m
 
     @property
     def rejected(self) -> int:

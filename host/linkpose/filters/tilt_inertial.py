@@ -27,7 +27,7 @@ from linkpose.filters.inertial.state import (
     record_of,
     roll_pitch_deg,
 )
-from linkpose.filters.joint_inertial import InertialParameters
+from linkpose.filters.joint_inertial import InertialParameters, declared
 from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -37,7 +37,10 @@ from linkpose.sensors.rig import Rig
 _ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
 # Half the χ² of 21 sensor errors: 3.8σ of all of them at once.
 _LARGEST_DISTANCE = 150.0
-PARAMETERS = InertialParameters(has_joint=0.0, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5)
+# Without a joint, what the models leave over shows in the bias only: its walk is that of a joint with much play.
+PARAMETERS = InertialParameters(
+    has_joint=0.0, gyro_bias_walk_rad_s=3e-4, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5
+)
 
 
 class TiltInertialFilter:
@@ -56,7 +59,9 @@ class TiltInertialFilter:
         self._record = record_of(self.parameters)
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
-        self._states = fresh_state(_ERRORS, j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE)
+        self._states = fresh_state(
+            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
+        )
         self._imu = ImuCalibration.of(rig.imu)
         self._frozen = FrozenDetector()
 

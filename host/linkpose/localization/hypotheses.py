@@ -11,29 +11,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from linkpose.localization.kalman import KalmanFilter
-from linkpose.localization.linalg import wrap_angle
+from linkpose.localization.linalg import Floats, wrap_angle
 
 # Hypotheses nearer than this (m, rad) are one. It is wider than the spread of one fit, and below a door's width.
 SAME_M, SAME_RAD = 0.5, 0.35
 # A lead in log-likelihood that decides, with scans that count as ten independent beams each: odds of 10^5 to 1.
 # Doubling it doubles the time to the first pose.
 LEAD = 12.0
-INCUMBENT = (
-    10.0  # head start of the pose that was tracked so far: people around a robot are more frequent than kidnappers
-)
+INCUMBENT = 10.0  # head start of the tracked pose: people around a robot are more frequent than kidnappers
 HOPELESS = 25.0  # a hypothesis so far behind is dropped
 # Scans from one place repeat each other: a scan counts when the robot has moved this far (m) or turned (rad) since the
 # last one that counted. So many must count before one decides, as a single scan may fit two corridors that look alike.
 COUNTS_AFTER_M, COUNTS_AFTER_RAD = 0.2, 0.2
-SCANS = 4
+# Against a tracked pose more are required: in an old map, a wrong place can fit better for two metres.
+SCANS, SCANS_AGAINST_INCUMBENT = 4, 10
 
 
 @dataclass(slots=True)
 class Hypothesis:
-    """A filter and the log-likelihood of the scans that it has explained."""
+    """A filter and the log-likelihood of the scans that it has explained; `is_incumbent` if it was tracked before."""
 
     filter: KalmanFilter
     score: float = 0.0
+    is_incumbent: bool = False
 
     def is_near(self, other: Hypothesis) -> bool:
         """Whether both are one pose."""
@@ -47,16 +47,33 @@ class Contest:
 
     def __init__(self, hypotheses: list[Hypothesis]) -> None:
         self.hypotheses = hypotheses
+        self.required = SCANS_AGAINST_INCUMBENT if self.incumbent else SCANS
         self.scans = 0
         self.moved_m = self.turned_rad = 0.0
+
+    @property
+    def incumbent(self) -> KalmanFilter | None:
+        """The filter of the tracked pose, while it competes."""
+        return next((hypothesis.filter for hypothesis in self.hypotheses if hypothesis.is_incumbent), None)
+
+    def rivalry(self) -> Floats:
+        """Covariance (3, 3) that the best rival adds to the pose of the incumbent: both are equally likely."""
+        incumbent = self.incumbent
+        rivals = [hypothesis for hypothesis in self.hypotheses if not hypothesis.is_incumbent]
+        if incumbent is None or not rivals:
+            return np.zeros((3, 3))
+        rival = max(rivals, key=lambda hypothesis: hypothesis.score).filter
+        off = rival.state[rival.pose_indices] - incumbent.state[incumbent.pose_indices]
+        off[2] = wrap_angle(float(off[2]))
+        return 0.5 * np.outer(off, off)
 
     def moved(self, distance_m: float, turn_rad: float) -> None:
         """Adds a motion of the robot."""
         self.moved_m += abs(distance_m)
         self.turned_rad += abs(turn_rad)
 
-    def judge(self, log_likelihoods: list[float]) -> KalmanFilter | None:
-        """Scores, drops and merges hypotheses after a scan; returns the winner's filter, if there is one."""
+    def judge(self, log_likelihoods: list[float]) -> Hypothesis | None:
+        """Scores, drops and merges hypotheses after a scan; returns the winner, if there is one."""
         if self.scans == 0 or self.moved_m > COUNTS_AFTER_M or self.turned_rad > COUNTS_AFTER_RAD:
             self.scans, self.moved_m, self.turned_rad = self.scans + 1, 0.0, 0.0
             for hypothesis, log_likelihood in zip(self.hypotheses, log_likelihoods, strict=True):
@@ -64,9 +81,14 @@ class Contest:
         ranked = sorted(self.hypotheses, key=lambda hypothesis: -hypothesis.score)
         kept: list[Hypothesis] = []
         for hypothesis in ranked:
-            if hypothesis.score > ranked[0].score - HOPELESS and not any(map(hypothesis.is_near, kept)):
+            same = next(filter(hypothesis.is_near, kept), None)
+            if same is not None:
+                same.is_incumbent |= hypothesis.is_incumbent
+            elif hypothesis.score > ranked[0].score - HOPELESS:
                 kept.append(hypothesis)
         self.hypotheses = kept
-        if self.scans >= SCANS and (len(kept) == 1 or kept[0].score > kept[1].score + LEAD):
-            return kept[0].filter
+        if len(kept) == 1 and kept[0].is_incumbent:
+            return kept[0]
+        if self.scans >= self.required and (len(kept) == 1 or kept[0].score > kept[1].score + LEAD):
+            return kept[0]
         return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ from linkpose.localization.vehicle import (
     start_state,
     vehicle_of,
 )
+
+if TYPE_CHECKING:
+    from linkpose.localization.scan_tracking import ScanTracker
 
 Method = Literal["scan-match", "ekf", "ukf", "mcl"]
 # When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
@@ -142,7 +145,7 @@ class Localizer:
         self.consistency = Consistency()
         self.known = start is not None
         self.history = History() if settings.smooth else None
-        self.laser = None
+        self.laser: ScanTracker | None = None
         if name == "scan-match" and "scan" in kinds and grid is not None:
             from linkpose.localization.scan_tracking import ScanTracker
 
@@ -157,15 +160,15 @@ class Localizer:
         measurement = None
         if event is not self.prior and not (isinstance(event, Scan) and self.laser):
             measurement = self.sensors.measurement(events)
-        if self.laser and self.laser.contest:
-            self.laser.predict(interval, self.control, self.hold)
+        if self.laser:
+            self.laser.predict(self.filter, interval, self.control, self.hold)
         if self.history is not None:
             self.history.predict(self.filter, interval, self.control, self.hold)
             interval = 0.0
         passed = self.filter.step(interval, self.control, self.hold, measurement if self.known else None)
         self.now = event.time_s
         if isinstance(event, Scan) and self.laser:
-            self._match(event)
+            self._match(self.laser, event)
         elif measurement is not None and self.known:
             self._count(events, passed)
         if isinstance(event, Event):
@@ -225,10 +228,9 @@ class Localizer:
         elif event.kind == "attitude":
             self.control[3:5] = event.values[:2]
 
-    def _match(self, scan: Scan) -> None:
-        """Corrects with a whole scan, and follows what the tracker found of the pose."""
-        assert self.laser is not None
-        result = self.laser.correct(self.filter, scan, self.known)
+    def _match(self, laser: ScanTracker, scan: Scan) -> None:
+        """Corrects with a whole scan, and continues with the filter that the tracker returns."""
+        result = laser.correct(self.filter, scan, self.known)
         self.applied += result.hits
         self.rejected += result.beams - result.hits
         self.relocated += result.relocated

@@ -117,7 +117,7 @@ def weigh(counts: Field, geometry: Floats, points: Floats, particles: Floats, we
         for k in range(points.shape[0]):
             px, py = points[k, 0], points[k, 1]
             distance_at(counts, geometry, particles[i, 0] + c * px - s * py, particles[i, 1] + s * px + c * py, at)
-            distance = min(abs(at[0]), LONGEST_DISTANCE_M)
+            distance = min(max(at[0], 0.0), LONGEST_DISTANCE_M)
             p = Z_HIT * math.exp(-0.5 * (distance / SIGMA_HIT_M) ** 2) + Z_RAND / 80.0
             likelihood += math.log(p)
         weights[i] *= math.exp(likelihood)

@@ -15,6 +15,11 @@ from linkpose.localization.kalman import Measurement, Motion
 from linkpose.localization.settings import CONSTANTS, Settings
 from linkpose.localization.tables import Beacons
 
+# Sightings of one landmark within this time (s) share their error: the lag-one correlation of the ranges in the public
+# log MRCLAM 7 is 0.5 to 0.95. There 0.5 s takes the error from 0.17 to 0.15 m, and smoothed from 0.14 to 0.11 m; 2 s
+# gives 0.155 and 0.10 m. A sighting counts as 1/MOST_REPEATS of an independent one at the least.
+REPEATS_S, MOST_REPEATS = 0.5, 50.0
+
 
 def constant_states(estimate: Sequence[str], beacons: Sequence[str]) -> tuple[str, ...]:
     """Names of the states that `--estimate` adds: one for all beacons, or one for each."""
@@ -39,6 +44,7 @@ class Sensors:
         self.states = motion.states
         self.height = self.states.index("z_m") if "z_m" in self.states else -1
         self.last_range: dict[str, float] = {}
+        self.last_sighting_s: dict[str, float] = {}
         self._columns = {
             beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
         }
@@ -62,7 +68,7 @@ class Sensors:
             distance = np.array(event.values[:1])
             variance = settings.ranges.variances(distance, self._mean_range(event))[0]
             table = np.array([[*self.beacons[event.beacon][:2], *self._columns[event.beacon]]])
-            covariance = np.diag([variance, settings.bearing_std_rad**2])
+            covariance = np.diag([variance, settings.bearing_std_rad**2]) * self._repetition(event)
             return Measurement(models.LANDMARK, np.array(event.values), covariance, table, 2, (False, True))
         if event.kind == "depth":
             return _direct(event.values, (settings.depth_std_m,), ((2, -1.0),), (False,))
@@ -71,6 +77,12 @@ class Sensors:
         if event.kind == "pose":
             return self._pose(event)
         return None
+
+    def _repetition(self, event: Event) -> float:
+        """Factor on the covariance of a sighting that repeats the error of the one before it."""
+        interval = event.time_s - self.last_sighting_s.get(event.beacon, -np.inf)
+        self.last_sighting_s[event.beacon] = event.time_s
+        return min(max(1.0, REPEATS_S / max(interval, 1e-3)), MOST_REPEATS)
 
     def _pose(self, event: Event) -> Measurement:
         far, turned = self.settings.start_std

@@ -21,18 +21,15 @@ from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.scan_fit import fit_scan
 
-# Deviation of a beam's end from the wall that the map shows (m): half a cell of 5 cm, and a scanner's 3 cm. The
-# residuals of both buildings in tests/bench have a median of 0.03 to 0.04 m. Doubling it makes the filter follow its
-# odometry more; the error grows by a fifth.
+# Deviation of a beam's end from the wall that the map shows (m), at least: half a cell of 5 cm, and a scanner's 3 cm.
+# Doubling it makes the filter follow its odometry more; the error in two public buildings grows by a fifth. A map with
+# smeared walls has a larger one (DistanceField.wall_std_m).
 BEAM_STD_M = 0.05
-# Scale of the Cauchy loss (m). Beams that end farther than this from a wall count less than half. Results are the same
-# within 10 % from 0.07 to 0.3 m.
-LOSS_SCALE_M = 0.15
+# Scale of the Cauchy loss in units of that deviation: beams that end farther from a wall count less than half. From 1.5
+# to 6 the errors in two public buildings with good maps differ by less than 10 %; below 2 an old map does worse.
+LOSS_SCALE = 3.0
 # Scale of the first fit of each start (m), which draws a scan in from farther.
 WIDE_SCALE_M = 0.5
-# Information of one beam (1/m²). The beams count as independent here: what their ends share is the error of the map,
-# which does not average out over scans, either (scan_tracking.MAP_ERROR). Half of it makes the error a tenth larger.
-INFORMATION = 1.0 / BEAM_STD_M**2
 MOST_BEAMS = 180  # of one scan that are fitted; the rest is left out evenly
 FEWEST_BEAMS = 5  # fewer ends do not determine a pose
 # A beam that ends nearer than this (m) to a wall has hit it.
@@ -54,13 +51,15 @@ NO_WALL = 0.1  # probability that a beam meets what the map does not have
 class Fit:
     """How a scan fitted: `share` of its beams that hit a wall, log-likelihood, and the test statistic of the shift.
 
-    `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom.
+    `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `hessian` (3, 3) is Σ w J Jᵀ
+    of the beams at the fitted pose.
     """
 
     share: float
     log_likelihood: float
     d2: float
     beams: int
+    hessian: Floats
 
 
 def beam_ends(scan: Scan) -> Floats:
@@ -78,6 +77,7 @@ class ScanMatcher:
     def __init__(self, grid: GridMap) -> None:
         self.grid = grid
         self.field = DistanceField.of(grid)
+        self.beam_std_m = max(BEAM_STD_M, self.field.wall_std_m)
 
     def correct(self, run: KalmanFilter, points: Floats, expected: float = -math.inf) -> Fit:
         """Corrects the filter, in place, with beam ends (n, 2).
@@ -107,8 +107,9 @@ class ScanMatcher:
                     best, hessian, prior, lead = pose, other_hessian, loose, slipped
                     share, log_likelihood = other_share, other_likelihood
             covariance = np.asarray(np.linalg.inv(prior), dtype=np.float64)
-        d2 = _condition(run, at, best, covariance, prior + INFORMATION * hessian)
-        return Fit(share, log_likelihood, d2, len(points))
+        # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
+        d2 = _condition(run, at, best, covariance, prior + hessian / self.beam_std_m**2)
+        return Fit(share, log_likelihood, d2, len(points), hessian)
 
     def compare(self, points: Floats, pose: Floats) -> tuple[float, float]:
         """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""
@@ -126,9 +127,9 @@ class ScanMatcher:
 
     def _fit(self, points: Floats, mean: Floats, prior: Floats, start: Floats) -> tuple[Floats, Floats, float]:
         pose, hessian = start.copy(), np.empty((3, 3))
-        field = self.field
-        for scale in (WIDE_SCALE_M, LOSS_SCALE_M):
-            cost = fit_scan(field.counts, field.geometry, points, scale, INFORMATION, mean, prior, pose, hessian)
+        field, information, narrow = self.field, 1.0 / self.beam_std_m**2, LOSS_SCALE * self.beam_std_m
+        for scale in (max(WIDE_SCALE_M, narrow), narrow):
+            cost = fit_scan(field.counts, field.geometry, points, scale, information, mean, prior, pose, hessian)
         return pose, hessian, cost
 
 

@@ -1,7 +1,8 @@
-"""Follows a robot by its laser scans: finds it in the whole map at first, and again when it has been carried."""
+"""Tracks a robot by its laser scans: searches the whole map at the start, and again after a kidnap."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +12,16 @@ from linkpose.localization.grid import GridMap
 from linkpose.localization.hypotheses import INCUMBENT, Contest, Hypothesis
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.scan_matching import FEWEST_BEAMS, Fit, ScanMatcher, beam_ends
+from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beam_ends
 
-# What a map gets wrong does not average out over scans (m, m, rad): it is added to the reported covariance. The fitted
-# paths of both buildings in tests/bench differ from the reference by 0.02 m on each axis.
-MAP_ERROR = np.array([0.025, 0.025, 0.012])
+# The errors of a map do not average out over scans; they are added to the reported covariance. GRID_ERROR (m, m, rad)
+# is the part that no beam shows: the reference paths of two public buildings differ by so much. SHARED_BEAMS
+# neighbouring beams of a full scan end in one piece of wall and share its error, whose deviation (m) is at least
+# LEAST_WALL_STD_M. Where the walls do not bind a direction, the error is at most UNBOUND (m, m, rad). Twice
+# SHARED_BEAMS widens the stated deviations by 1.4.
+GRID_ERROR = np.array([0.02, 0.02, 0.012])
+SHARED_BEAMS, LEAST_WALL_STD_M = 18.0, 0.025
+UNBOUND = np.array([0.5, 0.5, 0.2])
 CANDIDATES = 60  # poses of a global search that compete
 CANDIDATE_STD = np.array([0.2, 0.2, 0.1])  # of a pose that the search found (m, m, rad)
 # What this map and robot usually reach: the log-likelihood of a scan, and how far it falls below.
@@ -51,16 +57,19 @@ class ScanTracker:
         self.was_known = False
         self.wait = BAD_SCANS
         self.usual, self.fall = -2.0, 2.0  # before the first scan: an old map
+        self.map_error = np.diag(GRID_ERROR**2)
 
     def _below(self, falls: float) -> float:
         """The log-likelihood so many falls below the usual."""
         return self.usual - falls * max(self.fall, LEAST_FALL)
 
-    def predict(self, interval_s: float, control: Floats, hold_s: Floats) -> None:
-        """Moves all hypotheses on."""
-        assert self.contest is not None
+    def predict(self, run: KalmanFilter, interval_s: float, control: Floats, hold_s: Floats) -> None:
+        """Predicts all hypotheses but `run`, which the caller predicts."""
+        if self.contest is None:
+            return
         for hypothesis in self.contest.hypotheses:
-            hypothesis.filter.step(interval_s, control, hold_s)
+            if hypothesis.filter is not run:
+                hypothesis.filter.step(interval_s, control, hold_s)
         if interval_s > 0.0:
             self.contest.moved(control[0] * interval_s, control[-1] * interval_s)
 
@@ -70,7 +79,7 @@ class ScanTracker:
         if len(points) < FEWEST_BEAMS:
             return Result(run, known)
         if self.contest is not None:
-            return self._continue(run, points)
+            return self._continue(self.contest, run, points)
         if not known:
             return self._open(run, points, [])
         fit = self.matcher.correct(run, points, self._below(DOUBTFUL))
@@ -81,6 +90,7 @@ class ScanTracker:
             if found and self.matcher.compare(points, found[0])[1] > fit.log_likelihood + BETTER:
                 return self._open(run, points, [run.copy()], found)
             self.bad, self.wait = 0, min(2 * self.wait, MOST_BAD_SCANS)
+        self._bind(fit)
         self._adapt(fit.log_likelihood)
         return Result(run, True, round(fit.share * fit.beams), fit.beams, 0, fit)
 
@@ -92,9 +102,18 @@ class ScanTracker:
             self.usual += (log_likelihood - self.usual) / FALL
 
     def add_map_error(self, run: KalmanFilter, covariance: Floats) -> None:
-        """Adds the map's own errors to a covariance, in place."""
-        at = run.pose_indices
-        covariance[at, at] += MAP_ERROR**2
+        """Adds the map's own errors, and the distance of a rival pose, to a covariance, in place."""
+        at = np.ix_(run.pose_indices, run.pose_indices)
+        covariance[at] += self.map_error
+        if self.contest is not None:
+            covariance[at] += self.contest.rivalry()
+
+    def _bind(self, fit: Fit) -> None:
+        """Estimates how the errors of the walls in this scan move the pose: the covariance of a fit to them alone."""
+        std = max(LEAST_WALL_STD_M, self.matcher.field.wall_std_m)
+        shared = SHARED_BEAMS * fit.beams / MOST_BEAMS
+        self.map_error = np.linalg.inv(fit.hessian / (shared * std**2) + np.diag(1.0 / UNBOUND**2))
+        self.map_error += np.diag(GRID_ERROR**2)
 
     def _open(
         self, run: KalmanFilter, points: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
@@ -106,26 +125,35 @@ class ScanTracker:
             candidate.place(pose, CANDIDATE_STD)
             self.matcher.correct(candidate, points)
             candidates.append(candidate)
-        scores = [INCUMBENT] * len(others) + [0.0] * len(candidates[len(others) :])
-        self.contest = Contest([Hypothesis(c, score) for c, score in zip(candidates, scores, strict=True)])
+        self.contest = Contest(
+            [Hypothesis(other, INCUMBENT, True) for other in others]
+            + [Hypothesis(candidate) for candidate in candidates[len(others) :]]
+        )
         self.contest.judge([self.matcher.compare(points, c.state[c.pose_indices])[1] for c in candidates])
-        return Result(run, False, 0, len(points))
+        return self._undecided(run, points)
 
-    def _continue(self, run: KalmanFilter, points: Floats) -> Result:
-        assert self.contest is not None
+    def _undecided(self, run: KalmanFilter, points: Floats) -> Result:
+        """The tracked pose while it competes; unknown afterwards."""
+        incumbent = self.contest.incumbent if self.contest is not None else None
+        return Result(incumbent or run, incumbent is not None, 0, len(points))
+
+    def _continue(self, contest: Contest, run: KalmanFilter, points: Floats) -> Result:
         fits = [
-            self.matcher.correct(hypothesis.filter, points, self._below(DOUBTFUL)).log_likelihood
-            for hypothesis in self.contest.hypotheses
+            # Only the tracked pose may have slipped; the others are compared where they are.
+            self.matcher.correct(h.filter, points, self._below(DOUBTFUL) if h.is_incumbent else -math.inf)
+            for h in contest.hypotheses
         ]
-        best = max(fits)
-        winner = self.contest.judge(fits)
+        likelihoods = [fit.log_likelihood for fit in fits]
+        winner = contest.judge(likelihoods)
         if winner is not None:
-            self.contest, self.bad, self.wait = None, 0, BAD_SCANS
-            relocated, self.was_known = int(self.was_known), True
-            share, _ = self.matcher.compare(points, winner.state[winner.pose_indices])
-            return Result(winner, True, round(share * len(points)), len(points), relocated)
-        self.bad = self.bad + 1 if best < self._below(BAD) else 0
+            relocated = int(self.was_known and not winner.is_incumbent)
+            # A search that found nothing better is not repeated soon.
+            self.wait = min(2 * self.wait, MOST_BAD_SCANS) if winner.is_incumbent else BAD_SCANS
+            self.contest, self.bad, self.was_known = None, 0, True
+            share, _ = self.matcher.compare(points, winner.filter.state[winner.filter.pose_indices])
+            return Result(winner.filter, True, round(share * len(points)), len(points), relocated)
+        self.bad = self.bad + 1 if max(likelihoods) < self._below(BAD) else 0
         if self.bad >= BAD_SCANS:  # none of the hypotheses is right: the robot was carried meanwhile
             self.bad = 0
             return self._open(run, points, [])
-        return Result(run, False, 0, len(points))
+        return self._undecided(run, points)

@@ -35,12 +35,17 @@ class Joint:
     """The joint of the link. J2S is the vector from the joint centre to the sensor."""
 
     j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None if unknown
-    j2s_std_m: float = 0.0001  # its standard deviation, each axis (m)
+    j2s_std_m: float | Vector = 0.0001  # its standard deviation (m), one for all axes or one for each
 
     @property
     def known_j2s_m(self) -> Vector | None:
         """J2S; None if it is unknown or only a first guess."""
-        return self.j2s_m if self.j2s_std_m <= _GUESS_M else None
+        return self.j2s_m if self.largest_std_m <= _GUESS_M else None
+
+    @property
+    def largest_std_m(self) -> float:
+        """Standard deviation along the axis that is known least (m)."""
+        return max(self.j2s_std_m) if isinstance(self.j2s_std_m, tuple) else self.j2s_std_m
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
@@ -226,11 +231,12 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     _refuse_unknown(table, list(known), origin, f"{name}.")
     values: dict[str, Any] = {}
     for key, value in table.items():
-        is_vector = "Vector" in str(known[key].type)
+        kind = str(known[key].type)
+        is_vector = "Vector" in kind and ("float |" not in kind or isinstance(value, list | tuple))
         values[key] = (
             _read_vector(value, origin, f"{name}.{key}") if is_vector else _read_number(value, origin, f"{name}.{key}")
         )
-        if key.endswith(_POSITIVE) and values[key] <= 0:
+        if key.endswith(_POSITIVE) and _least(values[key]) <= 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be above 0")
         if name == "noise" and not key.endswith("degC") and min(values[key]) < 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; no axis may be below 0")
@@ -245,6 +251,10 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         raise FileFormatError(
             origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
+
+
+def _least(value: float | Vector) -> float:
+    return min(value) if isinstance(value, tuple) else value
 
 
 def _read_number(value: Any, origin: str, where: str) -> float:

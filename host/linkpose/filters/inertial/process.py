@@ -246,13 +246,13 @@ def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu
     rotation = lasting * q.gyro_misfit**2 * vec.dot(vec.load(s.turned), vec.load(s.turned))
     velocity = lasting * q.accel_misfit**2 * vec.dot(impulse, impulse)
     force = _steady_force(s, vec.scale(1.0 / h, impulse), imu)
-    propagate_covariance(s, force, rotation, velocity, q.gyro_bias_walk_rad_s**2 * h)
+    propagate_covariance(s, force, rotation, velocity, _bias_walk(s, q) ** 2 * h)
     clear_increments(s)
     for i in range(D, PSI):
         s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[D, D] * h
     decay_to_prior(s, h)
     if q.has_joint:
-        update_bias_from_rest(s)
+        update_bias_from_rest(s, h, imu)
         if has_rate:
             taken = update_joint_velocity(s, jumped, before, rate, h, imu, q)
     else:
@@ -261,6 +261,19 @@ def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu
             update_bias_from_steadiness(s, rate, h, imu, q)
     s.distance = _distance(s)
     return taken
+
+
+@inner
+def _bias_walk(s: Record, q: Record) -> float:
+    """Random walk of the gyro bias ((rad/s)/√s); more where the joint's constraint leaves over more than its floor.
+
+    Play, bending and the sensor's nonlinearity then act as a bias that follows the motion, and a bias that drifts fast
+    shows there too. The third power makes the change steep: twice the floor allows eight times the walk.
+    """
+    if not q.has_joint:
+        return float(q.gyro_bias_walk_rad_s)
+    share = math.sqrt(max(s.residual_square / s.reach_square, q.least_residual**2)) / q.least_residual
+    return float(min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s))
 
 
 @inner

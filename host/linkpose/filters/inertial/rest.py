@@ -10,7 +10,10 @@ from linkpose.filters.inertial.state import BA, BG, Record
 from linkpose.filters.inertial.update import constrain_attitude, sub_covariance, update_scalar
 
 _REST_S = 0.5  # of stillness before the mean rate counts as the bias (s): longer than a turning point of a slow swing
-_REST_STD_RAD_S = 0.001  # rate of a link that is held still (1σ): a hand's tremor through a metre of lever
+# A link that is held still turns by no more than this in all (rad, 1σ): a hand's tremor through a metre of lever.
+# Divided by the length of the rest it bounds the mean rate. Doubling it doubles the heading's drift after a short rest.
+_SWAY_RAD = 5e-4
+_MOST_SWAY_RAD_S = _SWAY_RAD / _REST_S
 _REST_SIGMAS = 5.0  # within which the readings must stay: one sound sample in 10⁶ ends a rest
 _TURN_SIGMAS = 3.0  # a mean rate this far from the bias estimate is a turn at constant rate
 _GATE = 25.0  # χ² with one degree of freedom: five standard deviations
@@ -24,7 +27,7 @@ def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration)
     drift = vec.axpy(-1.0, vec.load(s.rest_rate_sum), vec.scale(still, rate))
     width = 3.0 * _REST_SIGMAS**2
     steady = vec.dot(change, change) < width * imu.accel_variance
-    steady = steady and vec.dot(drift, drift) < width * (imu.gyro_variance + _REST_STD_RAD_S**2) * still * still
+    steady = steady and vec.dot(drift, drift) < width * (imu.gyro_variance + _MOST_SWAY_RAD_S**2) * still * still
     if still > 0.0 and not steady:
         s.rest_s = 0.0
         return
@@ -36,17 +39,23 @@ def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration)
 
 
 @inner
-def update_bias_from_rest(s: Record) -> None:
-    """The gyro bias is the mean rate since the rest began, where that adds to what is known and is possible."""
-    p, variance = s.covariance, _REST_STD_RAD_S**2
-    if s.rest_s <= _REST_S or vec.trace(sub_covariance(p, BG)) <= 6.0 * variance:
+def update_bias_from_rest(s: Record, h: float, imu: ImuCalibration) -> None:
+    """The gyro bias is the mean rate since the rest began, where that adds to what is known and is possible.
+
+    `h`: time since the last update (s), over which the noise of the gyro counts as correlated.
+    """
+    p, rest_s = s.covariance, s.rest_s
+    if rest_s <= _REST_S:
+        return
+    variance = imu.gyro_variance * h / rest_s + (_SWAY_RAD / rest_s) ** 2
+    if vec.trace(sub_covariance(p, BG)) <= 6.0 * variance:
         return
     for j in range(3):
-        innovation = s.rest_rate_sum[j] / s.rest_s - s.nominal[BG + j]
+        innovation = s.rest_rate_sum[j] / rest_s - s.nominal[BG + j]
         if innovation * innovation > _TURN_SIGMAS**2 * (p[BG + j, BG + j] + variance):
             return
     for j in range(3):
-        update_scalar(s, BG + j, s.rest_rate_sum[j] / s.rest_s - s.nominal[BG + j], variance)
+        update_scalar(s, BG + j, s.rest_rate_sum[j] / rest_s - s.nominal[BG + j], variance)
     constrain_attitude(s)
 
 

@@ -17,17 +17,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.errors import CannotRun
-from linkpose.filters._imu import ImuCalibration, read_gyro
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
+from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
 from linkpose.filters.mice.reading import (
     BIAS_STD,
     HOLD_S,
     NEAREST_M,
-    STALE,
     begin_step,
     correct,
     end_step,
@@ -38,14 +36,20 @@ from linkpose.filters.mice.state import (
     Floats,
     MiceParameters,
     Record,
+    Records,
     fresh_state,
+    mouse_records,
     parameters_record,
-    placement_record,
+    sample_records,
 )
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 
 __all__ = ["MiceFilter", "MiceParameters", "check_placement"]
+
+ESTIMATE = np.dtype(
+    [(name, "f8") for name in ("vx", "vy", "wz", "vx_std", "vy_std", "wz_std", "x", "y", "heading", "excluded")]
+)
 
 
 class MiceFilter:
@@ -61,10 +65,8 @@ class MiceFilter:
         """The rig must place at least one mouse. Raises CannotRun for mice that all sit at one place."""
         check_placement(rig.mouse)
         self.parameters = parameters or MiceParameters()
-        self.state = fresh_state(BIAS_STD)
-        self._parameters = parameters_record(self.parameters)
-        self._placement = placement_record(rig.mouse)
-        self._imu = ImuCalibration.of(rig.imu)
+        self.state = fresh_state(len(rig.mouse), BIAS_STD)
+        self._parameters, self._mice, self._imu = parameters_record(self.parameters), mouse_records(rig.mouse), rig.imu
 
     @property
     def rejected(self) -> int:
@@ -79,12 +81,9 @@ class MiceFilter:
         starts at 0, heading in [−π, π). Excluded is a bit mask, bit 0 is mouse 1. The standard deviation covers the
         modelled noise, not the error of the mice's calibration.
         """
-        out = np.empty((len(block), len(self.columns)))
-        _process(
-            block.time_s, block.mice_counts, block.gyro_rad_s, block.flags,
-            self._placement[0], self._imu, self._parameters[0], self.state[0], out,
-        )  # fmt: skip
-        return out
+        out = np.empty(len(block), ESTIMATE).view(np.recarray)
+        _process(sample_records(block, self._imu), self._parameters, self._mice, self.state, out)
+        return out.view(np.float64).reshape(len(block), len(self.columns))
 
 
 def check_placement(mice: tuple[Mouse, ...]) -> None:
@@ -99,87 +98,74 @@ def check_placement(mice: tuple[Mouse, ...]) -> None:
 
 
 @inner
-def advance_pose(pose: Floats, velocity: Floats, step: float) -> None:
-    """The exact arc of a constant velocity in b over `step` (s)."""
-    half = 0.5 * velocity[2] * step
-    reach = step * (math.sin(half) / half if abs(half) > 1e-6 else 1.0)
-    c, s = math.cos(pose[2] + half), math.sin(pose[2] + half)
-    pose[0] += reach * (c * velocity[0] - s * velocity[1])
-    pose[1] += reach * (s * velocity[0] + c * velocity[1])
-    heading = pose[2] + 2.0 * half
-    pose[2] = heading - 2.0 * math.pi * math.floor((heading + math.pi) / (2.0 * math.pi))
+def _advance_pose(state: Record, span: float) -> None:
+    """The exact arc of a constant velocity in b over `span` (s)."""
+    turn = state.turn_rate * span
+    chord = scaled(span, turned(turned_mean(turn), state.velocity))
+    state.position += turned(unit(state.heading), chord)
+    state.heading = wrapped(state.heading + turn)
 
 
 @inner
-def _hold(state: Record, time_s: float, dt: float) -> None:
+def _hold(state: Record, time_s: float, span: float) -> None:
     """A reading without a velocity of its own: the last one stands for a while, the heading follows the gyro."""
     if time_s - state.known_time <= HOLD_S:
-        for j in range(3):
-            state.std[j] += (ACCEL_M_S2 if j < 2 else ANGULAR_RAD_S2) * dt
+        state.x_std += ACCEL_M_S2 * span
+        state.y_std += ACCEL_M_S2 * span
+        state.turn_std += ANGULAR_RAD_S2 * span
     else:
-        state.velocity[0] = state.velocity[1] = 0.0
+        state.velocity = 0j
         if not math.isfinite(state.mean_rate):
-            state.velocity[2] = 0.0
+            state.turn_rate = 0.0
         state.known_time = math.nan
-    advance_pose(state.pose, state.velocity, dt)
+    _advance_pose(state, span)
 
 
 @inner
-def _advance(state: Record, place: Record, p: Record, time_s: float) -> None:
+def _advance(state: Record, mice: Records, p: Record, time_s: float) -> None:
     """Advance velocity and pose by one reading. Velocities at both ends bridge a gap."""
-    dt, step = begin_step(state, time_s)
-    if not dt > 0.0:
+    if not begin_step(state, time_s):
         return
-    missed = dt - step if time_s - state.known_time <= HOLD_S else 0.0
-    if missed > 0.0:
-        advance_pose(state.pose, state.velocity, 0.5 * missed)
-    if correct(state, place, p, dt, step, True):
+    half = 0.5 * state.missed if time_s - state.known_time <= HOLD_S else 0.0
+    if half > 0.0:
+        _advance_pose(state, half)
+    if correct(state, mice, p, True):
         state.known_time = time_s
-        advance_pose(state.pose, state.velocity, step + 0.5 * missed)
+        _advance_pose(state, state.step + half)
     else:
         state.rejected += 1
-        _hold(state, time_s, dt - 0.5 * missed)
+        _hold(state, time_s, state.step + state.missed - half)
 
 
 @inner
-def _show(state: Record, place: Record, time_s: float, out: Floats) -> None:
+def _show(state: Record, time_s: float, out: Record) -> None:
     """The estimate at a sample: the velocity of the last reading, and the pose that it leads to."""
     since = time_s - state.time
     if not since > 0.0:
         since = 0.0
-    is_known = not math.isnan(state.known_time)
-    for j in range(3):
-        change = (ACCEL_M_S2 if j < 2 else ANGULAR_RAD_S2) * since
-        out[j] = state.velocity[j] if is_known else math.nan
-        out[3 + j] = math.sqrt(state.std[j] ** 2 + change * change) if is_known else math.nan
-        out[6 + j] = state.pose[j]
-    advance_pose(out[6:9], state.velocity, since)
-    out[9] = excluded(state, place)
-
-
-@inner
-def excluded(state: Record, place: Record) -> float:
-    """Bit mask of the mice that were not used at the last reading."""
-    return float(~state.used & ((1 << place.count) - 1))
+    turn = state.turn_rate * since
+    chord = scaled(since, turned(turned_mean(turn), state.velocity))
+    position = state.position + turned(unit(state.heading), chord)
+    out.x, out.y, out.heading = position.real, position.imag, wrapped(state.heading + turn)
+    out.excluded = ~state.used & ((1 << state.count) - 1)
+    if math.isnan(state.known_time):
+        out.vx = out.vy = out.wz = out.vx_std = out.vy_std = out.wz_std = math.nan
+        return
+    out.vx, out.vy, out.wz = state.velocity.real, state.velocity.imag, state.turn_rate
+    change, angular = (ACCEL_M_S2 * since) ** 2, (ANGULAR_RAD_S2 * since) ** 2
+    out.vx_std = math.sqrt(state.x_std**2 + change)
+    out.vy_std = math.sqrt(state.y_std**2 + change)
+    out.wz_std = math.sqrt(state.turn_std**2 + angular)
 
 
 @compiled
-def _process(
-    time_s: Floats,
-    counts: Floats,
-    gyro: Floats,
-    flags: NDArray[np.uint32],
-    place: Record,
-    imu: ImuCalibration,
-    p: Record,
-    state: Record,
-    out: Floats,
-) -> None:
-    for i in range(len(time_s)):
-        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        follow_gyro(state, time_s[i], rate[2] if has_rate else math.nan, flags[i])
-        if not flags[i] & STALE:
-            read_counts(state, place, counts[i], flags[i])
-            _advance(state, place, p, time_s[i])
+def _process(samples: Records, parameters: Records, mice: Records, states: Records, out: Records) -> None:
+    state, p = states[0], parameters[0]
+    for k in range(len(samples)):
+        sample = samples[k]
+        follow_gyro(state, sample)
+        if not sample.is_stale:
+            read_counts(state, mice, sample)
+            _advance(state, mice, p, sample.time)
             end_step(state)
-        _show(state, place, time_s[i], out[i])
+        _show(state, sample.time, out[k])

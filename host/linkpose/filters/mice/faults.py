@@ -13,10 +13,14 @@ returns when it has agreed with the others over a time and a distance; at rest a
 from __future__ import annotations
 
 import math
+from typing import cast
+
+import numpy as np
 
 from linkpose.compiling import compiled, inner
-from linkpose.filters.mice.least_squares import ROUNDING, add_mouse, clear, misfit, solve, squared_speed
-from linkpose.filters.mice.state import MOST, Record
+from linkpose.filters.mice.least_squares import ROUNDING, fit, misfit, squared_speed
+from linkpose.filters.mice.plane import scaled, square
+from linkpose.filters.mice.state import NOBODY, Record, Records
 
 # Length of the window (s): a few counts at 5 cm/s. Doubled: faults are found later, at half the speed.
 WINDOW_S = 0.05
@@ -40,6 +44,8 @@ ACCEL_M_S2, ANGULAR_RAD_S2 = 2.0, 4.0
 # Gyro and mice may differ by this share of the rate (1σ): another floor (5 %), scale of the gyro (3 %).
 # Doubled: only lifted mice, not slipping ones, contradict the gyro.
 _RATE_SHARE = 0.08
+# Over what a test runs. The compiler would take Python constants for types of their own.
+_STEP, _WINDOW = cast(bool, np.bool_(True)), cast(bool, np.bool_(False))
 
 
 @compiled
@@ -50,174 +56,162 @@ def fault_limit(freedom: int) -> float:
 
 
 @inner
-def _cost(state: Record, place: Record, candidates: int, left_out: int, span: float, turn: float) -> float:
-    """Cost of the hypothesis that the mice in `left_out` are at fault; `state.solution` is the X that fits best.
+def _cost(state: Record, mice: Records, candidates: int, left_out: int, span: float, turn: float) -> float:
+    """Cost of the hypothesis that the mice in `left_out` are at fault; `state.fit` is the X that fits best.
 
     `turn` (rad) is the gyro's over the time `span` (s), less its bias; NaN without a gyro.
     """
-    clear(state)
-    cost = 0.0
-    for i in range(place.count):
-        if not candidates >> i & 1:
-            continue
-        if left_out >> i & 1:
-            cost += _EXCLUSION - (_SILENT_BONUS if state.silent_s[i] >= _SILENT_S else 0.0)
-        else:
-            add_mouse(state, place, i, state.weight[i], state.sums[i, 0], state.sums[i, 1])
-    linear, angular, by_gyro = 0.0, 0.0, 0.0
+    by_gyro = before = before_turn = 0.0
     if math.isfinite(turn):
-        share = _RATE_SHARE * turn
-        by_gyro = 1.0 / ((state.bias_std * span) ** 2 + share * share)
-        state.right[2] += by_gyro * turn
+        by_gyro = 1.0 / ((state.bias_std * span) ** 2 + (_RATE_SHARE * turn) ** 2)
+    else:
+        turn = 0.0
     if left_out and state.has_reference:
-        linear, angular = 1.0 / (ACCEL_M_S2 * WINDOW_S * span) ** 2, 1.0 / (ANGULAR_RAD_S2 * WINDOW_S * span) ** 2
-        state.right[0] += linear * state.reference[0] * span
-        state.right[1] += linear * state.reference[1] * span
-        state.right[2] += angular * state.reference[2] * span
-    # Nothing else to hold X where all mice are left out.
-    weak = 1.0 / (10.0 * span) ** 2
-    solve(state, linear + weak, angular + by_gyro + weak)
-    x, y, w = state.solution[0], state.solution[1], state.solution[2]
-    for i in range(place.count):
-        if candidates >> i & 1 and not left_out >> i & 1:
-            cost += state.weight[i] * misfit(place, i, x, y, w, state.sums[i, 0], state.sums[i, 1])
-    r = state.reference
-    cost += linear * ((x - r[0] * span) ** 2 + (y - r[1] * span) ** 2) + angular * (w - r[2] * span) ** 2
-    return float(cost + by_gyro * (w - turn) ** 2 if by_gyro > 0.0 else cost)
-
-
-@inner
-def _weigh(state: Record, place: Record, span: float, noise: float, mismatch: float) -> None:
-    """1/σ_i² of the sums over `span` (s); `noise` (m²) is their variance from sample to sample."""
-    r = state.reference
-    for i in range(place.count):
-        count = place.metres_per_count[i]
-        lasting = mismatch * mismatch * span * span * squared_speed(place, i, r[0], r[1], r[2])
-        state.weight[i] = 1.0 / (ROUNDING * count * count + lasting + noise)
+        before = 1.0 / (ACCEL_M_S2 * WINDOW_S * span) ** 2
+        before_turn = 1.0 / (ANGULAR_RAD_S2 * WINDOW_S * span) ** 2
+    weak = 1.0 / (10.0 * span) ** 2  # nothing else holds X where all mice are left out
+    motion, rotation = scaled(span, state.reference), state.reference_rate * span
+    linear, angular = before + weak, before_turn + by_gyro + weak
+    fit(
+        state, mice, candidates & ~left_out, linear, scaled(before / linear, motion),
+        angular, (before_turn * rotation + by_gyro * turn) / angular,
+    )  # fmt: skip
+    v, w = state.fit, state.fit_turn
+    cost: float = before * square(v - motion) + before_turn * (w - rotation) ** 2 + by_gyro * (w - turn) ** 2
+    for i in range(state.count):
+        m = mice[i]
+        if candidates & left_out & 1 << i:
+            cost += _EXCLUSION - (_SILENT_BONUS if m.silent_s >= _SILENT_S else 0.0)
+        elif candidates >> i & 1:
+            cost += m.weight * misfit(m, v, w)
+    return cost
 
 
 @inner
 def number(mask: int) -> int:
     """How many bits are set."""
-    count = 0
-    for i in range(MOST):
-        count += mask >> i & 1
-    return count
+    return (mask & 1) + (mask >> 1 & 1) + (mask >> 2 & 1) + (mask >> 3 & 1)
 
 
 @inner
 def trusted(state: Record) -> int:
     """Bit mask of the mice that have counts and are not excluded."""
-    return int(state.sound & ~state.distrusted)
+    members: int = state.sound & ~state.excluded
+    return members
 
 
 @inner
-def find_fault(state: Record, place: Record, candidates: int, span: float, turn: float) -> tuple[int, bool]:
-    """The mice most probably at fault (0: none), and whether every other set is decisively less probable.
+def _find_fault(state: Record, mice: Records, candidates: int, span: float, turn: float) -> int:
+    """The mice most probably at fault (0: none); `state.is_decisive`: every other set is decisively less probable.
 
-    `state.sums` and `state.weight` hold the motions of the candidates over `span`.
+    The mice's `sum` and `weight` hold the motions of the candidates over `span`.
     """
-    count = number(candidates)
+    state.is_decisive = True
+    count, has_gyro = number(candidates), math.isfinite(turn)
     # One mouse and a gyro have as many unknowns as equations; of two mice one is at fault only if a gyro shows which.
-    if count < 2 or (count == 2 and not math.isfinite(turn)):
-        return 0, False
-    freedom = 2 * count - (2 if math.isfinite(turn) else 3)
-    if not _cost(state, place, candidates, 0, span, turn) > fault_limit(freedom):
-        return 0, False
+    if count < 2 or (count == 2 and not has_gyro):
+        return NOBODY
+    least = _cost(state, mice, candidates, NOBODY, span, turn)
+    if not least > fault_limit(2 * count - (2 if has_gyro else 3)):
+        return NOBODY
     # Three mice that agree with each other and not with the gyro share one cause: the robot slips or is lifted.
-    if count > 2 and not _cost(state, place, candidates, 0, span, math.nan) > fault_limit(2 * count - 3):
-        return candidates, True
-    best, second, worst = math.inf, math.inf, 0
-    for left_out in range(1, 1 << place.count):
-        if left_out & ~candidates or (left_out == candidates and not math.isfinite(turn)):
+    if count > 2 and not _cost(state, mice, candidates, NOBODY, span, math.nan) > fault_limit(2 * count - 3):
+        return candidates
+    best, second, worst = math.inf, math.inf, NOBODY
+    for left_out in range(1, 1 << state.count):
+        if left_out & ~candidates or (left_out == candidates and not has_gyro):
             continue
-        cost = _cost(state, place, candidates, left_out, span, turn)
+        cost = _cost(state, mice, candidates, left_out, span, turn)
         if cost < best:
             best, second, worst = cost, best, left_out
         else:
             second = min(second, cost)
-    return worst, second - best > _DECISIVE
+    state.is_decisive = second - best > _DECISIVE
+    return worst
 
 
 @inner
-def skip_late(state: Record, place: Record, step: float, noise_m_s: float, mismatch: float) -> None:
+def _load(state: Record, mice: Records, is_step: bool, noise_m_s: float, mismatch: float) -> float:
+    """Prepare the tests over the last step or over the window; returns the gyro's turn in it (rad), NaN without one."""
+    span = state.step if is_step else state.window_s
+    noise = noise_m_s * noise_m_s * (span * span if is_step else 0.5 * span * state.step)
+    for i in range(state.count):
+        m = mice[i]
+        m.sum = m.moved if is_step else m.window
+        lasting = mismatch * mismatch * span * span * squared_speed(m, state.reference, state.reference_rate)
+        m.weight = 1.0 / (ROUNDING * m.metres_per_count * m.metres_per_count + lasting + noise)
+    if not math.isfinite(state.mean_rate):
+        return math.nan
+    turn: float = state.mean_rate * span if is_step else state.window_turn
+    turn -= state.bias * span
+    return turn
+
+
+@inner
+def skip_late(state: Record, mice: Records, noise_m_s: float, mismatch: float) -> None:
     """Leave out, for this step, mice whose counts are impossible: a packet is late, and all counts come at once."""
-    for i in range(place.count):
-        state.sums[i, 0], state.sums[i, 1] = state.moved[i, 0], state.moved[i, 1]
-    _weigh(state, place, step, (step * noise_m_s) ** 2, mismatch)
-    mask = trusted(state)
-    faulty, decisive = find_fault(state, place, mask, step, (state.mean_rate - state.bias) * step)
-    if decisive and faulty != mask:
+    turn = _load(state, mice, _STEP, noise_m_s, mismatch)
+    candidates = trusted(state)
+    faulty = _find_fault(state, mice, candidates, state.step, turn)
+    if state.is_decisive and faulty != candidates:
         state.used &= ~faulty
 
 
 @inner
-def _load_window(state: Record, place: Record, step: float, noise_m_s: float, mismatch: float) -> float:
-    """Prepare the tests over the window; returns the gyro's turn in it (rad), NaN without a gyro."""
-    for i in range(place.count):
-        state.sums[i, 0], state.sums[i, 1] = state.window[i, 0], state.window[i, 1]
-    _weigh(state, place, state.window_s, 0.5 * state.window_s * step * noise_m_s**2, mismatch)
-    has_gyro = math.isfinite(state.mean_rate)
-    return state.window_turn - state.bias * state.window_s if has_gyro else math.nan
-
-
-@inner
-def exclude(state: Record, place: Record, step: float, noise_m_s: float, mismatch: float) -> bool:
+def exclude(state: Record, mice: Records, noise_m_s: float, mismatch: float) -> bool:
     """Exclude the mice that have been at fault in the window for long enough; whether there are any."""
-    turn = _load_window(state, place, step, noise_m_s, mismatch)
-    faulty, decisive = find_fault(state, place, trusted(state), state.window_s, turn)
-    state.disagree_s = state.disagree_s + step if faulty else 0.0
-    is_found = faulty != 0 and (decisive or state.disagree_s >= _UNDECIDED_S)
-    state.suspected_s = state.suspected_s + step if is_found and faulty == state.suspects else step
-    state.suspects = faulty if is_found else 0
+    turn = _load(state, mice, _WINDOW, noise_m_s, mismatch)
+    faulty = _find_fault(state, mice, trusted(state), state.window_s, turn)
+    state.disagree_s = state.disagree_s + state.step if faulty else 0.0
+    is_found = faulty != 0 and (state.is_decisive or state.disagree_s >= _UNDECIDED_S)
+    state.suspected_s = state.suspected_s + state.step if is_found and faulty == state.suspects else state.step
+    state.suspects = faulty if is_found else NOBODY
     if not (is_found and state.suspected_s >= _LATE_S):
         return False
-    state.distrusted |= faulty
+    state.excluded |= faulty
     state.used &= ~faulty
-    _forget_agreement(state, faulty)
+    _forget_agreement(state, mice, faulty)
     state.disagree_s = 0.0
-    state.suspects = 0
+    state.suspects = NOBODY
     return True
 
 
 @inner
-def readmit(state: Record, place: Record, step: float, noise_m_s: float, mismatch: float) -> None:
+def readmit(state: Record, mice: Records, noise_m_s: float, mismatch: float) -> None:
     """Update the reference from the mice that agree, and readmit excluded mice that have agreed for long enough."""
-    turn = _load_window(state, place, step, noise_m_s, mismatch)
+    turn, span = _load(state, mice, _WINDOW, noise_m_s, mismatch), state.window_s
     judges = trusted(state)
-    if judges == 0:  # excluded mice that agree with each other and with the gyro are sound, and one that moves alone
-        faulty, _ = find_fault(state, place, state.sound, state.window_s, turn)
-        judges = state.sound & ~faulty
-        for i in range(place.count):
-            if judges == 1 << i and state.silent_s[i] > 0.0:
-                judges = 0
+    has_trusted = judges != 0
+    if (
+        not has_trusted
+    ):  # excluded mice that agree with each other and with the gyro are sound, and one that moves alone
+        judges = state.sound & ~_find_fault(state, mice, state.sound, span, turn)
+        for i in range(state.count):
+            if judges == 1 << i and mice[i].silent_s > 0.0:
+                judges = NOBODY
     if judges == 0:
-        _forget_agreement(state, state.distrusted)
+        _forget_agreement(state, mice, state.excluded)
         return
-    _cost(state, place, judges, 0, state.window_s, turn)
-    x, y, w = state.solution[0], state.solution[1], state.solution[2]
-    if trusted(state):
+    _cost(state, mice, judges, NOBODY, span, turn)
+    v, w = state.fit, state.fit_turn
+    if has_trusted:
         state.has_reference = True
-        state.reference[0], state.reference[1], state.reference[2] = (
-            x / state.window_s,
-            y / state.window_s,
-            w / state.window_s,
-        )
-    for i in range(place.count):
-        if not state.distrusted & state.sound & 1 << i:
+        state.reference, state.reference_rate = scaled(1.0 / span, v), w / span
+    for i in range(state.count):
+        m = mice[i]
+        if not state.excluded & state.sound & 1 << i:
             continue
-        off = misfit(place, i, x, y, w, state.sums[i, 0], state.sums[i, 1])
-        if state.weight[i] * off > _AGREES:
-            _forget_agreement(state, 1 << i)
+        if m.weight * misfit(m, v, w) > _AGREES:
+            m.agreed_s = m.agreed_m = 0.0
             continue
-        state.agreed_s[i] += step
-        state.agreed_m[i] += step * math.sqrt(squared_speed(place, i, x, y, w)) / state.window_s
-        if state.agreed_s[i] >= _AGREED_S and state.agreed_m[i] >= _AGREED_M:
-            state.distrusted &= ~(1 << i)
+        m.agreed_s += state.step
+        m.agreed_m += state.step * math.sqrt(squared_speed(m, v, w)) / span
+        if m.agreed_s >= _AGREED_S and m.agreed_m >= _AGREED_M:
+            state.excluded &= ~(1 << i)
 
 
 @inner
-def _forget_agreement(state: Record, mice: int) -> None:
-    for i in range(MOST):
-        if mice >> i & 1:
-            state.agreed_s[i] = state.agreed_m[i] = 0.0
+def _forget_agreement(state: Record, mice: Records, members: int) -> None:
+    for i in range(state.count):
+        if members >> i & 1:
+            mice[i].agreed_s = mice[i].agreed_m = 0.0

@@ -1,68 +1,58 @@
-"""Equations (6)-(12) of the redundant-mice paper [Mice]: the robot's velocity from the motion of its mice.
+"""Equations (3)-(12) of the redundant-mice paper [Mice]: the robot's velocity from the motion of its mice.
 
-    v_ix = v_bx − ω_b p_iy,   v_iy = v_by + ω_b p_ix                                      (6), (7)
+    v_i = v_b + ω_b q_i                                                                   (3)
     A ẋ = Θ,   ẋ = (Aᵀ W A)⁻¹ Aᵀ W Θ                                                      (8), (11), (12)
 
-with W = diag(1/σ_i²). The normal equations of any set of mice have four numbers, Σw (1, p_x, p_y, ‖p‖²), and three on
-the right, Σw (s_x, s_y, p_x s_y − p_y s_x).
+with W = diag(1/σ_i²), and vectors of the plane as complex numbers.
 """
 
 from __future__ import annotations
 
 from linkpose.compiling import inner
-from linkpose.filters.mice.state import Record
+from linkpose.filters.mice.plane import dot, scaled, square
+from linkpose.filters.mice.state import Record, Records
 
 # Variance (counts²) of a step's count: the difference of two roundings, each uniform over one count.
 ROUNDING = 1.0 / 6.0
 
 
 @inner
-def clear(state: Record) -> None:
-    """Set the normal equations to zero."""
-    for j in range(4):
-        state.normal[j] = 0.0
-    for j in range(3):
-        state.right[j] = 0.0
+def fit(state: Record, mice: Records, members: int, linear: float, v: complex, angular: float, turn: float) -> float:
+    """(12) for the mice in `members`, from each one's `sum` and `weight`: motion and its variances into `state.fit…`.
+
+    `linear` and `angular` are the weights (1/σ²) with which the motion v and the turn are known beforehand. Returns the
+    weighted mean square distance of the mice from their common centre (m²): 0, or NaN, where A has not rank 3.
+    """
+    a, b, d = linear, 0j, angular
+    right, right_turn = scaled(linear, v), angular * turn
+    for i in range(state.count):
+        if members >> i & 1:
+            m = mice[i]
+            a += m.weight
+            b += scaled(m.weight, m.arm)
+            d += m.weight * square(m.arm)
+            right += scaled(m.weight, m.sum)
+            right_turn += m.weight * dot(m.arm, m.sum)
+    # [[a, 0, b_x], [0, a, b_y], [b_x, b_y, d]] by elimination of the first two unknowns.
+    share = 1.0 / a
+    pivot = d - square(b) * share
+    rest = 1.0 / pivot
+    turn = rest * (right_turn - dot(b, right) * share)
+    state.fit = scaled(share, right - scaled(turn, b))
+    state.fit_turn = turn
+    state.fit_turn_variance = rest
+    state.fit_x_variance = share * (1.0 + share * rest * b.real * b.real)
+    state.fit_y_variance = share * (1.0 + share * rest * b.imag * b.imag)
+    return share * (pivot - angular)
 
 
 @inner
-def add_mouse(state: Record, place: Record, i: int, weight: float, x: float, y: float) -> None:
-    """Add mouse i, which moved by (x, y), to the normal equations."""
-    px, py = place.position[i, 0], place.position[i, 1]
-    state.normal[0] += weight
-    state.normal[1] += weight * px
-    state.normal[2] += weight * py
-    state.normal[3] += weight * (px * px + py * py)
-    state.right[0] += weight * x
-    state.right[1] += weight * y
-    state.right[2] += weight * (px * y - py * x)
+def squared_speed(m: Record, v: complex, turn_rate: float) -> float:
+    """‖v_i‖² of (3)."""
+    return square(v + scaled(turn_rate, m.arm))
 
 
 @inner
-def solve(state: Record, linear: float, angular: float) -> None:
-    """(12): solution and its variances; `linear` and `angular` are further weights on the diagonal of Aᵀ W A."""
-    w, wx, wy, wpp = state.normal[0], state.normal[1], state.normal[2], state.normal[3]
-    # [[a, 0, −wy], [0, a, wx], [−wy, wx, d]] by elimination of the first two unknowns.
-    a, d = w + linear, wpp + angular
-    rest = 1.0 / (d - (wx * wx + wy * wy) / a)
-    turn = rest * (state.right[2] + (wy * state.right[0] - wx * state.right[1]) / a)
-    state.solution[0] = (state.right[0] + wy * turn) / a
-    state.solution[1] = (state.right[1] - wx * turn) / a
-    state.solution[2] = turn
-    state.variance[0] = (1.0 + wy * wy * rest / a) / a
-    state.variance[1] = (1.0 + wx * wx * rest / a) / a
-    state.variance[2] = rest
-
-
-@inner
-def squared_speed(place: Record, i: int, vx: float, vy: float, w: float) -> float:
-    """‖v_i‖² of (6), (7)."""
-    x, y = vx - w * place.position[i, 1], vy + w * place.position[i, 0]
-    return float(x * x + y * y)
-
-
-@inner
-def misfit(place: Record, i: int, vx: float, vy: float, w: float, x: float, y: float) -> float:
-    """‖s_i − A_i ẋ‖² for s_i = (x, y)."""
-    ex, ey = x - (vx - w * place.position[i, 1]), y - (vy + w * place.position[i, 0])
-    return float(ex * ex + ey * ey)
+def misfit(m: Record, v: complex, turn: float) -> float:
+    """‖s_i − A_i ẋ‖², with s_i the mouse's `sum`."""
+    return square(m.sum - v - scaled(turn, m.arm))

@@ -1,49 +1,85 @@
 """State, placement and memory layout of the `mice` filter, as records that compiled code reads through one pointer.
 
-Frames: n is the floor's frame, b is the robot's (x ahead, y to the left, z up). All vectors are in b unless noted.
+Frames: n is the floor's frame, b is the robot's (x ahead, y to the left, z up). A vector of the plane is a complex
+number, x + jy, in b unless noted: turning it by φ multiplies it by e^{jφ}. Scalars and complex numbers in records
+compile several times as fast as elements of arrays.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.sensors.rig import Mouse
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Imu, Mouse
+from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
 Record = Any  # one record of the types below; a pointer in compiled code
+Records = Any  # an array of them
 
 MOST = 4  # mice: the firmware's ports; records have room for so many
+# A NumPy integer, because the compiler gives each Python integer argument a type of its own.
+NOBODY = cast(int, np.int64(0))
 
-_TWIST = ("f8", (3,))  # v_x, v_y (m/s), ω (rad/s)
-_EACH = ("f8", (MOST,))
-_EACH_VECTOR = ("f8", (MOST, 2))
+STALE = int(SampleFlags.MICE_STALE)
+_GAP_BEFORE, _GYRO_SATURATED = int(SampleFlags.GAP_BEFORE), int(SampleFlags.GYRO_SATURATED)
+_OVERFLOW = int(SampleFlags.MOUSE1_OVERFLOW)  # for mouse i, shifted left by i
+_MOST_RAD_S = 1e4  # beyond what any gyro reads
 
-PLACEMENT = np.dtype(
+SAMPLE = np.dtype(
     [
-        ("count", "i8"),
-        ("position", *_EACH_VECTOR),  # p_i (m)
-        ("axes", *_EACH_VECTOR),  # cos φ_i, sin φ_i
-        ("metres_per_count", *_EACH),
+        ("time", "f8"),  # s
+        ("rate", "f8"),  # of the gyro about z, calibrated (rad/s); NaN where it cannot be used
+        ("counts", "c16", (MOST,)),  # of each mouse, in its own axes; NaN without a mouse, or when its counter ran over
+        ("is_stale", "?"),  # whether the mice were not read for this sample
+        ("is_after_gap", "?"),
+    ],
+    align=True,
+)
+
+MOUSE = np.dtype(
+    [
+        # Placement.
+        ("arm", "c16"),  # q_i = j p_i (m): the velocity of the mouse at 1 rad/s, (3) of [Mice]
+        ("axis", "c16"),  # e^{jφ_i} times metres per count: turns counts into a motion in b (m)
+        ("metres_per_count", "f8"),
+        # Motion.
+        ("moved", "c16"),  # over the last step (m)
+        ("window", "c16"),  # over the window of the fault tests: an exponentially forgetting sum (m)
+        ("silent_s", "f8"),  # time without a count (s)
+        ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
+        ("agreed_m", "f8"),  # distance over which it has (m)
+        # Terms of a least-squares fit.
+        ("sum", "c16"),  # motion (m) or velocity (m/s)
+        ("weight", "f8"),  # 1 / its variance
     ],
     align=True,
 )
 
 STATE = np.dtype(
     [
+        ("count", "i8"),  # number of mice
         # Time.
         ("time", "f8"),  # of the last reading (s); NaN before the first
         ("sample_time", "f8"),  # of the last sample (s)
         ("interval", "f8"),  # usual time between two readings (s); NaN until known
         ("known_time", "f8"),  # of the last reading that gave a velocity (s)
         ("lost", "?"),  # whether samples were lost since the last reading
+        ("step", "f8"),  # part of the time since the reading before that the counts cover (s)
+        ("missed", "f8"),  # the rest of that time (s)
         # Estimate.
-        ("pose", "f8", (3,)),  # x, y (m), heading (rad) in n at the last reading
-        ("velocity", *_TWIST),
-        ("std", *_TWIST),
+        ("position", "c16"),  # in n at the last reading (m)
+        ("heading", "f8"),  # rad
+        ("velocity", "c16"),  # m/s
+        ("turn_rate", "f8"),  # rad/s
+        ("x_std", "f8"),  # standard deviations of the velocity (m/s) and of the turn rate (rad/s)
+        ("y_std", "f8"),
+        ("turn_std", "f8"),
         # Gyro.
         ("rate", "f8"),  # last usable rate (rad/s); NaN without one
         ("turned", "f8"),  # ∫ rate since the last reading (rad), bias included
@@ -53,33 +89,28 @@ STATE = np.dtype(
         ("bias", "f8"),  # of the gyro beyond the rig's (rad/s)
         ("bias_std", "f8"),
         ("bias_s", "f8"),  # how long agreeing mice have shown the bias (s)
-        # The last reading.
-        ("moved", *_EACH_VECTOR),  # motion over the step (m)
         # Sets of mice as bit masks: bit 0 is the first mouse.
         ("sound", "i8"),  # have counts that cover this step
         ("used", "i8"),  # count for the estimate
         ("away", "i8"),  # had no counts
-        ("distrusted", "i8"),  # excluded until they agree again
+        ("excluded", "i8"),  # not used until they agree again
         # The window: an exponentially forgetting sum.
-        ("window", *_EACH_VECTOR),  # S_i (m)
         ("window_s", "f8"),  # its length (s)
         ("window_turn", "f8"),  # ∫ rate (rad), bias included
-        ("reference", *_TWIST),  # mean velocity over the window when the mice last agreed
+        ("reference", "c16"),  # mean velocity over the window when the mice last agreed (m/s)
+        ("reference_rate", "f8"),  # rad/s
         ("has_reference", "?"),
         # What the fault tests remember.
-        ("silent_s", *_EACH),  # time without a count (s)
-        ("agreed_s", *_EACH),  # time for which an excluded mouse has agreed (s)
-        ("agreed_m", *_EACH),  # distance over which it has (m)
-        ("suspects", "i8"),  # bit mask of the mice that the last test found at fault
+        ("suspects", "i8"),  # the mice that the last test found at fault
         ("suspected_s", "f8"),  # for how long it has found the same (s)
         ("disagree_s", "f8"),  # for how long the mice have disagreed (s)
-        # Scratch of the fault tests.
-        ("sums", *_EACH_VECTOR),
-        ("weight", *_EACH),
-        ("normal", "f8", (4,)),
-        ("right", *_TWIST),
-        ("solution", *_TWIST),
-        ("variance", *_TWIST),
+        # Result of a least-squares fit: motion (m, rad) or velocity (m/s, rad/s), and variances.
+        ("fit", "c16"),
+        ("fit_turn", "f8"),
+        ("fit_x_variance", "f8"),
+        ("fit_y_variance", "f8"),
+        ("fit_turn_variance", "f8"),
+        ("is_decisive", "?"),  # whether the faulty set is decisively more probable than every other
         ("rejected", "i8"),  # readings that gave no velocity, or whose time did not increase
     ],
     align=True,
@@ -95,31 +126,45 @@ class MiceParameters(NamedTuple):
     noise_m_s: float = 0.0  # of one mouse, from sample to sample, at any speed, beyond the rounding to counts
 
 
-PARAMETERS = np.dtype([(name, "f8") for name in MiceParameters._fields], align=True)
+def parameters_record(parameters: Any) -> Any:
+    """Parameters (a NamedTuple of numbers) as an array of one record."""
+    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
+    return np.array([tuple(parameters)], dtype).view(np.recarray)
 
 
-def parameters_record(parameters: MiceParameters) -> Any:
-    """The parameters as an array of one record."""
-    return np.array([tuple(parameters)], PARAMETERS).view(np.recarray)
-
-
-def placement_record(mice: tuple[Mouse, ...]) -> Any:
-    """The rig's [[mouse]] tables as an array of one record."""
-    records = np.zeros(1, PLACEMENT).view(np.recarray)
-    place: Any = records[0]
-    place.count = len(mice)
+def mouse_records(mice: tuple[Mouse, ...]) -> Any:
+    """The rig's [[mouse]] tables as an array of MOST records of MOUSE."""
+    records = np.zeros(MOST, MOUSE).view(np.recarray)
     for i, mouse in enumerate(mice):
-        angle = math.radians(mouse.angle_deg)
-        place.position[i] = mouse.x_m, mouse.y_m
-        place.axes[i] = math.cos(angle), math.sin(angle)
-        place.metres_per_count[i] = 1.0 / mouse.counts_per_m
+        metres = 1.0 / mouse.counts_per_m
+        records[i].arm = complex(-mouse.y_m, mouse.x_m)
+        records[i].axis = cmath.rect(metres, math.radians(mouse.angle_deg))
+        records[i].metres_per_count = metres
     return records
 
 
-def fresh_state(bias_std_rad_s: float) -> Any:
-    """An array of one state record before the first sample."""
+def fresh_state(count: int, bias_std_rad_s: float) -> Any:
+    """An array of one state record before the first sample, for so many mice."""
     records = np.zeros(1, STATE).view(np.recarray)
     state: Any = records[0]
+    state.count = count
     state.time = state.sample_time = state.interval = state.known_time = state.rate = state.mean_rate = np.nan
     state.bias_std = bias_std_rad_s
     return records
+
+
+def sample_records(block: Measurements, imu: Imu) -> Any:
+    """What the compiled steps read of N samples: an array (N,) of SAMPLE."""
+    samples: Any = np.empty(len(block), SAMPLE).view(np.recarray)
+    samples.time = block.time_s
+    rate = block.gyro_rad_s - imu.gyro_bias_rad_s
+    is_usable = (np.abs(rate) < _MOST_RAD_S).all(axis=1) & (block.flags & _GYRO_SATURATED == 0)
+    samples.rate = np.where(is_usable, rate[:, 2], np.nan)
+    samples.is_stale = block.flags & STALE != 0
+    samples.is_after_gap = block.flags & _GAP_BEFORE != 0
+    ports = min(MOST, block.mice_counts.shape[1])
+    samples.counts[:, ports:] = np.nan
+    for i in range(ports):
+        samples.counts[:, i] = block.mice_counts[:, i, 0] + 1j * block.mice_counts[:, i, 1]
+        samples.counts[block.flags & (_OVERFLOW << i) != 0, i] = np.nan
+    return samples

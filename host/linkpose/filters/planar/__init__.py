@@ -1,8 +1,9 @@
 """`planar-ekf`, `planar-ukf`: pose of a robot from its mice and gyro, with self-calibration of the mice.
 
 In each step from one reading of the mice to the next, the gyro measures ω + b, each mouse its own velocity, and a rest
-shows b. The pose then advances on the arc of the updated velocity. `state` lists the state, `moments` the two filters,
-`rest` the zero-rate updates; the fault tests are those of the `mice` filter, with this filter's calibration and bias.
+shows b. The pose then advances on the arc of the updated velocity. `state` lists the state, `measure` holds the
+measurement and the update, `linear` and `sigma` the moments of the two filters, `rest` the zero-rate updates. The fault
+tests are those of the `mice` filter, with this filter's calibration and bias.
 
 Angles, relative scales and positions of the mice follow from any drive with turns. Two things cannot be observed: the
 angle common to all mice, which defines "ahead", and their common scale beyond what the gyro and the positions of the
@@ -16,16 +17,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
 from linkpose.filters.mice import MiceParameters, check_placement
 from linkpose.filters.mice.reading import BIAS_STD
-from linkpose.filters.mice.state import Floats, fresh_state, parameters_record, placement_record
-from linkpose.filters.planar.process import SHOWN, process
-from linkpose.filters.planar.state import ANGLE, MICE, OF_MOUSE, POSITION, SCALE, PlanarParameters
+from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, parameters_record, sample_records
+from linkpose.filters.planar.process import process
+from linkpose.filters.planar.state import (
+    ANGLE,
+    ESTIMATE,
+    MICE,
+    OF_MOUSE,
+    POSITION,
+    SCALE,
+    SIGMA,
+    TANGENT,
+    PlanarParameters,
+)
 from linkpose.filters.planar.state import fresh_state as fresh_planar_state
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -62,12 +71,12 @@ class _PlanarFilter:
         check_placement(rig.mouse)
         self.parameters, self.planar = parameters or MiceParameters(), planar or PlanarParameters()
         self._rig = rig
-        self._imu = ImuCalibration.of(rig.imu)
-        self._placed, self._placement = placement_record(rig.mouse), placement_record(rig.mouse)
-        self._parameters = parameters_record(self.parameters)
-        self._planar = _record_of(self.planar)
-        self._mice = fresh_state(BIAS_STD)
-        self.state = fresh_planar_state(len(rig.mouse), self.planar, self._imu.gyro_variance)
+        self._placed, self._mice = mouse_records(rig.mouse)[: len(rig.mouse)], mouse_records(rig.mouse)
+        self._parameters, self._planar = parameters_record(self.parameters), parameters_record(self.planar)
+        self._mice_state = fresh_state(len(rig.mouse), BIAS_STD)
+        self._tangent = None if self._is_ukf else np.zeros(1, TANGENT).view(np.recarray)
+        self._points = np.zeros(1, SIGMA).view(np.recarray) if self._is_ukf else None
+        self.state = fresh_planar_state(len(rig.mouse), self.planar, rig.imu.gyro_noise_rad_s**2)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -82,12 +91,12 @@ class _PlanarFilter:
     @property
     def rejected(self) -> int:
         """Readings so far that gave no measurement of a mouse."""
-        return int(self.state[0].rejected + self._mice[0].rejected)
+        return int(self.state[0].rejected + self._mice_state[0].rejected)
 
     @property
     def distrusted(self) -> int:
         """Bit mask of the mice that are excluded now; bit 0 is mouse 1."""
-        return int(self._mice[0].distrusted)
+        return int(self._mice_state[0].excluded)
 
     @property
     def found_mice(self) -> tuple[FoundMouse, ...]:
@@ -119,17 +128,12 @@ class _PlanarFilter:
 
     def process(self, block: Measurements) -> Floats:
         """x, y, heading (in [−π, π)), v_x, v_y, ω and their standard deviations at each of the N samples: (N, 12)."""
-        out = np.empty((len(block), 2 * SHOWN))
+        out = np.empty(len(block), ESTIMATE).view(np.recarray)
         process(
-            block.time_s, block.mice_counts, block.gyro_rad_s, block.flags, self._is_ukf, self._placed[0],
-            self._placement[0], self._imu, self._parameters[0], self._planar[0], self._mice[0], self.state[0], out,
+            sample_records(block, self._rig.imu), self._parameters, self._planar, self._placed, self._mice,
+            self._mice_state, self._tangent, self._points, self.state, out,
         )  # fmt: skip
-        return out
-
-
-def _record_of(parameters: PlanarParameters) -> Any:
-    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
-    return np.array([tuple(parameters)], dtype).view(np.recarray)
+        return out.view(np.float64).reshape(len(block), len(self.columns))
 
 
 class PlanarEkf(_PlanarFilter):

@@ -4,38 +4,19 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
-
 from linkpose.compiling import compiled, inner
-from linkpose.filters._imu import ImuCalibration, read_gyro
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number
 from linkpose.filters.mice.least_squares import squared_speed
-from linkpose.filters.mice.state import Floats, Record
-from linkpose.filters.planar.moments import (
-    GYRO,
-    MOUSE,
-    ZERO_VX,
-    ZERO_VY,
-    ZERO_WZ,
-    add_row,
-    drive_on,
-    linear_advance,
-    linear_moments,
-    sigma_advance,
-    sigma_moments,
-    spread_points,
-    update_vector,
-)
+from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
+from linkpose.filters.mice.state import Record, Records
+from linkpose.filters.planar import linear, sigma
+from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
-from linkpose.filters.planar.state import ANGLE, BIAS, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ
+from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
 
-SHOWN = 6  # pose and velocity
 # How long mice that contradict the prediction are left out (s). Doubled: the velocity is held longer after a collision.
 _PATIENCE_S = 0.5
-# Residual motion at rest: m/s and rad/s. Doubled: no visible change.
-_REST_M_S, _REST_RAD_S = 1e-4, 1e-5
 # Within one step a velocity changes by about this (m/s², rad/s²): the velocity is the mean over the step, the estimate
 # belongs to its end. Doubled: the stated ± of the velocity grows by half.
 _ACCEL_M_S2, _ANGULAR_RAD_S2 = 0.6, 1.2
@@ -50,57 +31,64 @@ _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
 @inner
+def _decay(state: Record, at: int, std: float, keep: float) -> None:
+    """A first-order process over one step: one number of the state keeps a share of its value."""
+    state.mean[at] *= keep
+    for k in range(state.size):
+        state.covariance[at, k] *= keep
+        state.covariance[k, at] *= keep
+    state.covariance[at, at] += std * std * (1.0 - keep * keep)
+
+
+@inner
 def _move_on(state: Record, p: Record, dt: float) -> None:
     """Prediction of velocity, bias and calibration over `dt` (s): first-order processes and random walks."""
-    n, cov = state.size, state.covariance
-    for j in range(3):
-        at = int(VX) + j
-        std = p.speed_m_s if j < 2 else p.turn_rad_s
-        keep = math.exp(-dt / (p.speed_s if j < 2 else p.turn_s))
-        state.mean[at] *= keep
-        for k in range(n):
-            cov[at, k] *= keep
-        for k in range(n):
-            cov[k, at] *= keep
-        cov[at, at] += std * std * (1.0 - keep * keep)
+    keep = math.exp(-dt / p.speed_s)
+    _decay(state, VX, p.speed_m_s, keep)
+    _decay(state, VY, p.speed_m_s, keep)
+    _decay(state, WZ, p.turn_rad_s, math.exp(-dt / p.turn_s))
+    cov = state.covariance
     cov[BIAS, BIAS] += p.bias_walk**2 * dt
-    for at in range(MICE, n, OF_MOUSE):
+    for at in range(MICE, state.size, OF_MOUSE):
         cov[at + SCALE, at + SCALE] += p.scale_walk**2 * dt
         cov[at + ANGLE, at + ANGLE] += p.angle_walk**2 * dt
 
 
 @inner
-def _collect(state: Record, mice: Record, rig: Record, counts: Floats, p: Record, dt: float, step: float) -> None:
-    """The rows of the measurement of this step."""
-    state.rows = 0
+def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) -> None:
+    """The measurement of this step."""
+    state.seen_by = 0
     if state.at_rest:
-        add_row(state, ZERO_VX, 0.0, _REST_M_S**2)
-        add_row(state, ZERO_VY, 0.0, _REST_M_S**2)
-        add_row(state, ZERO_WZ, 0.0, _REST_RAD_S**2)
+        state.rows = state.always = 3
         return
-    if math.isfinite(mice.mean_rate):
-        missing = _RATE_CHANGE_RAD_S2 * (dt - min(step, dt))
-        add_row(state, GYRO, mice.mean_rate, state.gyro_variance / max(mice.rates, 1) + missing * missing)
-    for i in range(rig.count):
-        if mice.used >> i & 1 and step > 0.0:
-            speed2 = squared_speed(rig, i, state.mean[VX], state.mean[VY], state.mean[WZ])
-            variance = reading.variance(rig, i, step, speed2, p.scatter, p.noise_m_s)
-            x, y = counts[i, 0] * rig.metres_per_count[i], counts[i, 1] * rig.metres_per_count[i]
-            c, s = rig.axes[i, 0], rig.axes[i, 1]
-            add_row(state, MOUSE + 2 * i, (c * x - s * y) / step, variance)
-            add_row(state, MOUSE + 2 * i + 1, (s * x + c * y) / step, variance)
+    state.rows = 0
+    if math.isfinite(m.mean_rate):
+        missing = _RATE_CHANGE_RAD_S2 * m.missed
+        state.rate_variance = state.gyro_variance / max(m.rates, 1) + missing * missing
+        state.rows = 1
+    state.always = state.rows
+    if not m.step > 0.0:
+        return
+    velocity, per_s = complex(state.at.vx, state.at.vy), 1.0 / m.step
+    for i in range(m.count):
+        if m.used >> i & 1:
+            seen, place = state.seen[i], rig[i]
+            speed2 = squared_speed(place, velocity, state.at.wz)
+            seen.velocity = scaled(per_s, turned(place.axis, sample.counts[i]))
+            seen.variance = reading.variance(place, m.step, speed2, p.scatter, p.noise_m_s)
+            state.rows += 2
+    state.seen_by = m.used
 
 
 @inner
-def _watch_floor(state: Record, mice: Record, p: Record, dt: float, step: float) -> None:
+def _watch_floor(state: Record, m: Record, p: Record) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
-    if state.at_rest or number(mice.used) < 2 or not (step == dt and math.isfinite(mice.mean_rate)):
+    if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
-    keep = math.exp(-dt / _FLOOR_MEMORY_S)
-    turn = mice.mean_rate - state.mean[BIAS]
-    state.turn_square = keep * state.turn_square + turn * turn * dt
-    state.turn_product = keep * state.turn_product + turn * mice.velocity[2] * dt
-    state.turn_variance = keep * keep * state.turn_variance + (turn * dt * mice.std[2]) ** 2
+    keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
+    state.turn_square = keep * state.turn_square + turn * turn * m.step
+    state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
+    state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
     if state.turn_square < _FLOOR_TURN:
         return
     off = abs(state.turn_product / state.turn_square - 1.0)
@@ -109,76 +97,64 @@ def _watch_floor(state: Record, mice: Record, p: Record, dt: float, step: float)
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
             state.covariance[a, b] += p.floor_scale**2
-    _forget_positions(state)
+        _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.floors += 1
 
 
 @inner
-def _forget_positions(state: Record) -> None:
-    """Return the positions of the mice to the rig's: they have taken up part of the scale error."""
-    for i in range(MICE, state.size, OF_MOUSE):
-        for at in range(i + POSITION, i + OF_MOUSE):
-            state.mean[at] = 0.0
-            for k in range(state.size):
-                state.covariance[at, k] = state.covariance[k, at] = 0.0
-            state.covariance[at, at] = state.start[at] ** 2
+def _restart(state: Record, first: int, end: int, keep: float) -> None:
+    """Part of the state starts anew, uncorrelated with the rest; `keep` of its mean stays.
+
+    Positions of the mice, when they have taken up part of a scale error; all, where rounding has spoilt the covariance.
+    """
+    for at in range(first, end):
+        state.mean[at] *= keep
+        for k in range(state.size):
+            state.covariance[at, k] = state.covariance[k, at] = 0.0
+        state.covariance[at, at] = state.start[at] ** 2
 
 
 @inner
-def _calibrate(state: Record, mice: Record, rig: Record, place: Record) -> None:
+def _calibrate(state: Record, m: Record, mice: Records, rig: Records) -> None:
     """Give the fault tests the placement and the gyro bias as the filter has estimated them."""
-    for i in range(rig.count):
-        at = MICE + OF_MOUSE * i
-        c, s = math.cos(state.mean[at + ANGLE]), math.sin(state.mean[at + ANGLE])
-        place.axes[i, 0] = c * rig.axes[i, 0] - s * rig.axes[i, 1]
-        place.axes[i, 1] = s * rig.axes[i, 0] + c * rig.axes[i, 1]
-        place.metres_per_count[i] = rig.metres_per_count[i] * math.exp(state.mean[at + SCALE])
-        place.position[i, 0] = rig.position[i, 0] + state.mean[at + POSITION]
-        place.position[i, 1] = rig.position[i, 1] + state.mean[at + POSITION + 1]
-    mice.bias = state.mean[BIAS]
-    mice.bias_std = math.sqrt(state.covariance[BIAS, BIAS]) + _BIAS_MARGIN_RAD_S
+    for i in range(m.count):
+        error, place, mouse = state.at.mice[i], rig[i], mice[i]
+        mouse.arm = arm(error, place)
+        scale = math.exp(error.scale)
+        mouse.axis = scaled(scale, turned(unit(error.angle), place.axis))
+        mouse.metres_per_count = scale * place.metres_per_count
+    m.bias = state.at.bias
+    m.bias_std = math.sqrt(state.covariance[BIAS, BIAS]) + _BIAS_MARGIN_RAD_S
 
 
 @inner
-def _restart(state: Record) -> None:
-    """A covariance that rounding has spoilt starts anew; the mean stays."""
-    state.restarts += 1
-    for i in range(state.size):
-        for j in range(state.size):
-            state.covariance[i, j] = state.start[i] ** 2 if i == j else 0.0
-
-
-@inner
-def _advance(state: Record, is_ukf: bool, dt: float) -> bool:
-    """Carry the pose on by `dt` (s) with the velocity."""
-    if is_ukf:
-        if not spread_points(state):
-            return False
-        sigma_advance(state, dt)
-    else:
-        linear_advance(state, dt)
+def _advance(state: Record, tangent: Records | None, points: Records | None, dt: float) -> bool:
+    """Carry the pose on by `dt` (s) with the velocity. The compiler drops the branch of the other filter."""
+    if tangent is not None:
+        linear.advance(state, dt)
+    if points is not None:
+        return sigma.advance(state, points[0], dt)
     return True
 
 
 @inner
-def _correct(state: Record, rig: Record, is_ukf: bool, always: int, dt: float) -> bool:
-    """Update with the collected rows, for a while without mice that contradict the prediction.
+def _correct(
+    state: Record, tangent: Records | None, points: Records | None, rig: Records, m: Record, dt: float
+) -> bool:  # fmt: skip
+    """Update with the measurement, for a while without mice that contradict the prediction.
 
     Mice that slip or are lifted contradict at once; the fault tests take a few steps to find them, in which they would
     spoil the calibration.
     """
     if state.rows == 0:
         return True
-    rows, is_patient = state.rows, state.refused_s < _PATIENCE_S
-    if is_ukf:
-        if not spread_points(state):
-            return False
-        sigma_moments(state, rig)
-    else:
-        linear_moments(state, rig)
-    limit = fault_limit(rows)
-    if not update_vector(state, always, limit if is_patient else math.inf):
+    limit = fault_limit(state.rows)
+    if tangent is not None:
+        linear.moments(state, tangent[0], rig, m.mean_rate)
+    if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
+        return False
+    if not update(state, limit if state.refused_s < _PATIENCE_S else math.inf):
         return False
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
     return True
@@ -187,86 +163,88 @@ def _correct(state: Record, rig: Record, is_ukf: bool, always: int, dt: float) -
 @inner
 def _scatter_way(state: Record, p: Record, dt: float, missed: float) -> None:
     """Noise that mice do not show: common to all of them, and what a robot does while samples are lost."""
-    speed2 = state.mean[VX] ** 2 + state.mean[VY] ** 2
+    speed2 = state.at.vx**2 + state.at.vy**2
     unseen = 0.25 * _ACCEL_M_S2 * missed * missed
     variance = p.floor * p.floor * speed2 * dt * _NOISE_S + unseen * unseen
-    state.covariance[0, 0] += variance
-    state.covariance[1, 1] += variance
+    state.covariance[X, X] += variance
+    state.covariance[Y, Y] += variance
 
 
 @inner
 def _step(
-    state: Record, mice: Record, rig: Record, place: Record, p: Record, q: Record, counts: Floats, time_s: float,
-    is_ukf: bool,
+    state: Record, tangent: Records | None, points: Records | None, m: Record, mice: Records, rig: Records, p: Record,
+    q: Record, sample: Record,
 ) -> None:  # fmt: skip
     """One reading of the mice."""
-    dt, step = reading.begin_step(mice, time_s)
-    if not dt > 0.0:
+    if not reading.begin_step(m, sample.time):
         return
-    if reading.correct(mice, place, p, dt, step, False):
-        mice.known_time = time_s
-    is_silent = mice.sound != 0
-    for i in range(rig.count):
-        is_silent = is_silent and (not mice.sound >> i & 1 or mice.silent_s[i] > 0.0)
-    watch_rest(state, is_silent, mice.rate, dt)
-    missed = dt - step if step > 0.0 else 0.0
-    is_good = missed == 0.0 or _advance(state, is_ukf, 0.5 * missed)
+    dt, half = m.step + m.missed, 0.5 * m.missed if m.step > 0.0 else 0.0
+    if reading.correct(m, mice, p, False):
+        m.known_time = sample.time
+    is_silent = m.sound != 0
+    for i in range(m.count):
+        is_silent = is_silent and (not m.sound >> i & 1 or mice[i].silent_s > 0.0)
+    watch_rest(state, is_silent, m.rate, dt)
+    is_good = half == 0.0 or _advance(state, tangent, points, half)
     _move_on(state, q, dt)
-    _collect(state, mice, rig, counts, p, dt, step)
-    state.rejected += state.rows == 0 or (mice.used == 0 and not state.at_rest)
-    always = state.rows if state.at_rest else int(math.isfinite(mice.mean_rate))
-    is_good = is_good and _correct(state, rig, is_ukf, always, dt) and _advance(state, is_ukf, dt - 0.5 * missed)
+    _collect(state, m, rig, sample, p)
+    state.rejected += state.rows == 0 or (m.used == 0 and not state.at_rest)
+    is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, tangent, points, dt - half)
     if not is_good:
-        _restart(state)
-    _scatter_way(state, p, dt, missed)
-    _watch_floor(state, mice, q, dt, step)
-    _calibrate(state, mice, rig, place)
+        state.restarts += 1
+        _restart(state, X, state.size, 1.0)
+    _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
+    _watch_floor(state, m, q)
+    _calibrate(state, m, mice, rig)
 
 
 @inner
-def _show(state: Record, since: float, step: float, out: Floats) -> None:
-    """Pose (heading in [−π, π)), velocity and their standard deviations, `since` (s) after the last reading."""
-    drive_on(state.mean, since, out)
-    out[2] -= 2.0 * math.pi * math.floor((out[2] + math.pi) / (2.0 * math.pi))
-    lag = since if state.at_rest else 0.5 * step + since
-    for j in range(SHOWN):
-        variance = state.covariance[j, j]
-        if j < 3:
-            variance += (
-                since * (2.0 * state.covariance[j, VX + j] if j == 2 else 0.0)
-                + since * since * (state.covariance[VX + j, VX + j])
-            )
-        else:
-            out[j] = state.mean[j]
-            change = (_ACCEL_M_S2 if j < 5 else _ANGULAR_RAD_S2) * lag
-            variance += change * change
-        out[SHOWN + j] = math.sqrt(max(variance, 0.0))
+def _std(state: Record, at: int, since: float, change: float) -> float:
+    """Standard deviation of one number of the state, `since` (s) after the last reading."""
+    variance = state.covariance[at, at] + change * change
+    if at < VX:
+        variance += since * since * state.covariance[VX + at, VX + at]
+    if at == HEADING:
+        variance += 2.0 * since * state.covariance[HEADING, WZ]
+    return math.sqrt(max(variance, 0.0))
+
+
+@inner
+def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
+    """Pose (heading in [−π, π)), velocity and their standard deviations at a sample."""
+    at, since = state.at, time_s - m.time
+    if not since > 0.0:
+        since = 0.0
+    turn = at.wz * since
+    velocity = complex(at.vx, at.vy)
+    way = scaled(since, turned(turned(unit(at.heading), turned_mean(turn)), velocity))
+    out.x, out.y, out.heading = at.x + way.real, at.y + way.imag, wrapped(at.heading + turn)
+    out.vx, out.vy, out.wz = at.vx, at.vy, at.wz
+    lag = since
+    if not state.at_rest and math.isfinite(m.interval):
+        lag += 0.5 * m.interval
+    out.x_std, out.y_std = _std(state, X, since, 0.0), _std(state, Y, since, 0.0)
+    out.heading_std = _std(state, HEADING, since, 0.0)
+    out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
+    out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
 
 
 @compiled
 def process(
-    time_s: Floats,
-    counts: Floats,
-    gyro: Floats,
-    flags: NDArray[np.uint32],
-    is_ukf: bool,
-    rig: Record,
-    place: Record,
-    imu: ImuCalibration,
-    p: Record,
-    q: Record,
-    mice: Record,
-    state: Record,
-    out: Floats,
-) -> None:
-    """Every sample of a block: estimates (N, 12) into `out`. `p` are MiceParameters, `q` PlanarParameters."""
-    for i in range(len(time_s)):
-        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        reading.follow_gyro(mice, time_s[i], rate[2] if has_rate else math.nan, flags[i])
-        if not flags[i] & reading.STALE:
-            reading.read_counts(mice, place, counts[i], flags[i])
-            _step(state, mice, rig, place, p, q, counts[i], time_s[i], is_ukf)
-            reading.end_step(mice)
-        since = time_s[i] - mice.time
-        step = mice.interval if math.isfinite(mice.interval) else 0.0
-        _show(state, since if since > 0.0 else 0.0, step, out[i])
+    samples: Records, parameters: Records, planar: Records, rig: Records, mice: Records, mice_states: Records,
+    tangent: Records | None, points: Records | None, states: Records, out: Records,
+) -> None:  # fmt: skip
+    """Every sample of a block: estimates (N,) of ESTIMATE into `out`.
+
+    `parameters` are MiceParameters, `planar` PlanarParameters, `rig` the mice as the rig places them, `mice` as the
+    filter has calibrated them. The extended filter has a `tangent`, the unscented one has `points`; the other is None.
+    """
+    state, m, p, q = states[0], mice_states[0], parameters[0], planar[0]
+    for k in range(len(samples)):
+        sample = samples[k]
+        reading.follow_gyro(m, sample)
+        if not sample.is_stale:
+            reading.read_counts(m, mice, sample)
+            _step(state, tangent, points, m, mice, rig, p, q, sample)
+            reading.end_step(m)
+        _show(state, m, sample.time, out[k])

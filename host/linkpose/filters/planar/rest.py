@@ -12,6 +12,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.mice.state import Record
+from linkpose.filters.planar.measure import update
 from linkpose.filters.planar.state import BIAS, QUEUE
 
 _BLOCK_S = 0.1  # one block (s)
@@ -54,17 +55,17 @@ def _finish_block(state: Record) -> bool:
     mean = state.block_sum / count
     noise = _NOISE_MARGIN * state.gyro_variance / count
     limit = _GUARD_Z * math.sqrt(state.covariance[BIAS, BIAS] + noise)
-    if abs(mean - state.mean[BIAS]) > limit:
+    if abs(mean - state.at.bias) > limit:
         return False
     if state.queued:
-        last = state.queue[state.queued - 1, 0]
-        if abs(mean - last) > _GUARD_Z * math.sqrt(2.0 * noise):
+        last = state.queue[state.queued - 1]
+        if abs(mean - last.mean) > _GUARD_Z * math.sqrt(2.0 * noise):
             return False
     if state.queued == QUEUE:
         _use_oldest(state)
-    k = state.queued
-    state.queue[k, 0], state.queue[k, 1] = mean, count
-    state.queue[k, 2] = max(0.0, state.block_squares - count * mean * mean)
+    block = state.queue[state.queued]
+    block.mean, block.count = mean, count
+    block.squares = max(0.0, state.block_squares - count * mean * mean)
     state.queued += 1
     state.block_s = state.block_sum = state.block_squares = 0.0
     state.block_count = 0
@@ -74,20 +75,17 @@ def _finish_block(state: Record) -> bool:
 @inner
 def _use_oldest(state: Record) -> None:
     """Update bias and noise with the oldest block, and drop it from the queue. ω was 0 then, so its rate is b."""
-    count = state.queue[0, 1]
-    known = state.gyro_samples
-    state.gyro_samples = min(known + count - 1.0, 1000.0)
-    state.gyro_variance = (known * state.gyro_variance + state.queue[0, 2]) / (known + count - 1.0)
-    n, spread = state.size, state.covariance[BIAS, BIAS] + state.gyro_variance / count
-    off = state.queue[0, 0] - state.mean[BIAS]
-    for i in range(n):
-        state.point[i] = state.covariance[i, BIAS]
-    for i in range(n):
-        gain = state.point[i] / spread
-        state.mean[i] += gain * off
-        for j in range(n):
-            state.covariance[i, j] -= gain * state.point[j]
+    block, known = state.queue[0], state.gyro_samples
+    more = block.count - 1.0
+    state.gyro_samples = min(known + more, 1000.0)
+    state.gyro_variance = (known * state.gyro_variance + block.squares) / (known + more)
+    state.rows = 1
+    state.residual[0] = block.mean - state.at.bias
+    state.innovation[0, 0] = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
+    for k in range(state.size):
+        state.cross[0, k] = state.covariance[BIAS, k]
+    update(state, math.inf)
     for k in range(1, QUEUE):
-        for c in range(3):
-            state.queue[k - 1, c] = state.queue[k, c]
+        to, block = state.queue[k - 1], state.queue[k]
+        to.mean, to.count, to.squares = block.mean, block.count, block.squares
     state.queued -= 1

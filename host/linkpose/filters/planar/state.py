@@ -12,67 +12,131 @@ The state is (x, y, θ, v_x, v_y, ω, b) and, for each mouse, (ε_i, α_i, δx_i
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from linkpose.filters.mice.state import MOST
 
-# Indices. A NumPy integer, because the compiler gives each Python integer constant a type of its own.
-X, Y, HEADING, VX, VY, WZ, BIAS, MICE = (np.int64(k) for k in range(8))
-SCALE, ANGLE, POSITION, OF_MOUSE = (np.int64(k) for k in (0, 1, 2, 4))
+
+def _index(k: int) -> int:
+    """A NumPy integer, because the compiler gives each Python integer constant a type of its own."""
+    return cast(int, np.int64(k))
+
+
+# First index of each part of the state.
+X, Y, HEADING, VX, VY, WZ, BIAS, MICE = (_index(k) for k in range(8))
+SCALE, ANGLE, POSITION, OF_MOUSE = (_index(k) for k in (0, 1, 2, 4))
 SIZE = int(MICE) + int(OF_MOUSE) * MOST
-ROWS = 2 * MOST + 3  # of the largest measurement
+ROWS = 2 * MOST + 1  # of the largest measurement
 QUEUE = 4  # blocks of the gyro's rate at rest
 
 _VECTOR = ("f8", (SIZE,))
 _MATRIX = ("f8", (SIZE, SIZE))
 
-STATE = np.dtype(
+_CALIBRATION = np.dtype([(name, "f8") for name in ("scale", "angle", "dx", "dy")])
+# A state by names: the same memory as SIZE numbers.
+POINT = np.dtype(
     [
-        ("size", "i8"),  # of the state with the rig's mice
-        ("mean", *_VECTOR),
-        ("covariance", *_MATRIX),
-        ("start", *_VECTOR),  # standard deviations to begin with
-        ("gyro_variance", "f8"),  # of one sample ((rad/s)²), as the rests show it
-        ("gyro_samples", "f8"),  # weight of that estimate
-        # Rest.
-        ("rest_s", "f8"),  # how long no mouse has counted (s)
-        ("at_rest", "?"),
-        ("block_s", "f8"),  # of the current block
-        ("block_sum", "f8"),  # of its rates (rad/s)
-        ("block_squares", "f8"),
-        ("block_count", "i8"),
-        ("queue", "f8", (QUEUE, 3)),  # mean rate, number of rates, sum of squared deviations of finished blocks
-        ("queued", "i8"),
-        # Common scale of the mice against the gyro: sums over the last turns.
-        ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
-        ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
-        ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
-        ("floors", "i8"),  # how often the floor has changed
-        ("chi2", "f8"),  # of the last innovation
-        ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
-        # The measurement of a step: values, their variances, what the state predicts.
-        ("rows", "i8"),
-        ("value", "f8", (ROWS,)),
-        ("noise", "f8", (ROWS,)),
-        ("kind", "i8", (ROWS,)),
-        ("predicted", "f8", (ROWS,)),
-        ("cross", "f8", (SIZE, ROWS)),
-        ("innovation", "f8", (ROWS, ROWS)),
-        # Scratch.
-        ("root", *_MATRIX),
+        *((name, "f8") for name in ("x", "y", "heading", "vx", "vy", "wz", "bias")),
+        ("mice", _CALIBRATION, (MOST,)),
+    ]
+)
+_SEEN = np.dtype([("velocity", "c16"), ("variance", "f8")])  # by a mouse, in b as the rig places it (m/s, (m/s)²)
+_REST_BLOCK = np.dtype([("mean", "f8"), ("count", "i8"), ("squares", "f8")])  # of the gyro's rate (rad/s)
+
+_FIELDS = [
+    ("size", "i8"),  # of the state with the rig's mice
+    ("mean", *_VECTOR),
+    ("covariance", *_MATRIX),
+    ("start", *_VECTOR),  # standard deviations to begin with
+    ("gyro_variance", "f8"),  # of one sample ((rad/s)²), as the rests show it
+    ("gyro_samples", "f8"),  # weight of that estimate
+    # Rest.
+    ("rest_s", "f8"),  # how long no mouse has counted (s)
+    ("at_rest", "?"),
+    ("block_s", "f8"),  # of the current block
+    ("block_sum", "f8"),  # of its rates (rad/s)
+    ("block_squares", "f8"),
+    ("block_count", "i8"),
+    ("queue", _REST_BLOCK, (QUEUE,)),  # finished blocks
+    ("queued", "i8"),
+    # Common scale of the mice against the gyro: sums over the last turns.
+    ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
+    ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
+    ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
+    ("floors", "i8"),  # how often the floor has changed
+    ("chi2", "f8"),  # of the last innovation
+    ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
+    # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
+    ("rows", "i8"),
+    ("always", "i8"),  # rows that count whatever the innovation
+    ("seen_by", "i8"),  # bit mask
+    ("rate_variance", "f8"),  # of the gyro's mean rate ((rad/s)²)
+    ("seen", _SEEN, (MOST,)),
+    # The innovation: z − ẑ, its covariance S, and its covariances with the state, row by row.
+    ("residual", "f8", (ROWS,)),
+    ("innovation", "f8", (ROWS, ROWS)),
+    ("cross", "f8", (ROWS, SIZE)),
+    ("predicted", "f8", (ROWS,)),  # ẑ
+    # Counters.
+    ("rejected", "i8"),  # readings that gave no measurement
+    ("restarts", "i8"),  # of a covariance that was not positive definite
+]
+
+
+def _with_alias(fields: list[Any], whole: str, name: str, dtype: Any) -> np.dtype[Any]:
+    """A record in which the memory of a field has a second name and type."""
+    plain = np.dtype(fields, align=True)
+    names = list(plain.names or ())
+    places: Any = plain.fields
+    return np.dtype(
+        {
+            "names": [*names, name],
+            "formats": [*(plain[each] for each in names), dtype],
+            "offsets": [*(places[each][1] for each in names), places[whole][1]],
+            "itemsize": plain.itemsize,
+        },
+        align=True,
+    )
+
+
+STATE = _with_alias(_FIELDS, "mean", "at", POINT)
+
+# Jacobian of the extended filter.
+TANGENT = np.dtype([("jacobian", "f8", (ROWS, SIZE))], align=True)
+
+# Sigma points of the unscented filter, two for each number of the state.
+SIGMA = _with_alias(
+    [
         ("points", "f8", (2 * SIZE, SIZE)),
-        ("point", *_VECTOR),
-        ("moved", "f8", (2 * SIZE, 3)),
-        ("fresh", "f8", (3, SIZE)),
-        ("jacobian", "f8", (ROWS, SIZE)),
-        ("at_points", "f8", (2 * SIZE, ROWS)),
-        # Counters.
-        ("rejected", "i8"),  # readings that gave no measurement
-        ("restarts", "i8"),  # of a covariance that was not positive definite
+        ("root", *_MATRIX),  # of the covariance
+        ("shown", "f8", (2 * SIZE, ROWS)),  # measurement at each point
+        ("moved", "f8", (2 * SIZE, 3)),  # pose of each point, later
     ],
-    align=True,
+    "points",
+    "at",
+    np.dtype((POINT, (2 * SIZE,))),
+)
+
+ESTIMATE = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "x",
+            "y",
+            "heading",
+            "vx",
+            "vy",
+            "wz",
+            "x_std",
+            "y_std",
+            "heading_std",
+            "vx_std",
+            "vy_std",
+            "wz_std",
+        )
+    ]
 )
 
 
