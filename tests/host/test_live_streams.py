@@ -92,7 +92,9 @@ class FoxgloveClient:
 
     def __init__(self, port: int) -> None:
         client = importlib.import_module("websockets.sync.client")
-        self.socket = client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], open_timeout=20)
+        self.socket = client.connect(
+            f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], open_timeout=20, close_timeout=0.2
+        )
 
     def subscribe(self, topic: str) -> dict:
         """The advertised channel of a topic, after the subscription to it."""

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from linkpose.errors import FileFormatError, LinkposeError, MissingLibrary
+from linkpose.evaluation.c3dcheck import check_sizes
 from linkpose.evaluation.takes import reference_of, take_of_markers
 from linkpose.recording.chunks import read_bytes
 from linkpose.recording.delimited import text_lines, to_utf8
@@ -45,8 +46,9 @@ def read_c3d(path: Path, up: str | None) -> Table:
         ezc3d: Any = importlib.import_module("ezc3d")
     except ImportError as error:
         raise MissingLibrary("ezc3d", path) from error
-    read_bytes(path)  # names the reason where the operating system refuses the file
+    data = read_bytes(path)
     try:
+        check_sizes(data)
         file = ezc3d.c3d(str(path))
         points: dict[str, Any] = file["parameters"]["POINT"]
         positions = np.array(file["data"]["points"], dtype=np.float64)[:3].transpose(2, 1, 0)
