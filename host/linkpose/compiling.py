@@ -8,8 +8,7 @@ beside this file: the first place that can be written is used. If none can be wr
 Machine code and its pickled index run with the user's rights. They are loaded only from a folder and files that the
 user owns and that nobody else can write, and each file carries a checksum: a damaged file is recompiled.
 
-Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls; `inlined` for a
-long part of a step that the compiler would otherwise leave as a call.
+Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls.
 """
 
 from __future__ import annotations
@@ -277,7 +276,6 @@ class _InnerCompiler(CompilerBase):  # type: ignore[misc]
 
 
 compiled = _decorator(True, nogil=True)  # filters run in parallel over long recordings
-inlined = _decorator(False, inline="always")
 # Without wrappers for Python and without a file of its own: both cost half of the time to compile.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=_InnerCompiler)
 

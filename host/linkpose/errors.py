@@ -47,6 +47,16 @@ class CannotRead(FileError):
         self.reason = reason
 
 
+class UnknownPicture(FileError):
+    """No picture has this ending. `formats` are the endings there are."""
+
+    def __init__(self, path: object, formats: Sequence[str]) -> None:
+        super().__init__(
+            path, f"{path} is not a picture that linkpose writes; its name must end in {', '.join(formats)}"
+        )
+        self.formats = tuple(formats)
+
+
 class CannotWrite(FileError):
     """The operating system does not take a file's content. `reason` is its own."""
 

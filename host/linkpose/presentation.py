@@ -121,6 +121,11 @@ def number_text(value: float, unit: str, decimals: int) -> str:
     return f"{value:.{decimals}f} {unit}" if math.isfinite(value) else "–"
 
 
+def counted(number: int, noun: str) -> str:
+    """A number with its noun: 1 gap, 2 gaps."""
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
 def std_text(std: float) -> str:
     """A standard deviation (m) in mm, cm or m, with two or three digits."""
     if not math.isfinite(std):

@@ -158,11 +158,13 @@ _STDS = {quantity.std_column: quantity for quantity in reversed(ALL) if quantity
 
 @functools.lru_cache(maxsize=1024)
 def split(column: str) -> Column | None:
-    """Takes a column's name apart; None for a column that holds no quantity (time_s, seq, flags).
+    """Takes a column's name apart; None for a column that holds no quantity (time_s, seq, flags, a covariance).
 
     The longest ending counts: `joint_inertial_height_std_m` is σ of the height, of the filter `joint-inertial`.
     """
     words = column.split("_")
+    if "cov" in words:  # ekf_cov_x_m_y_m: the end of its name is that of y
+        return None
     for first in range(len(words)):
         ending = "_".join(words[first:])
         found = _VALUES.get(ending) or _STDS.get(ending)
@@ -192,6 +194,11 @@ def by_filter(columns: Iterable[str]) -> dict[str, dict[Quantity, str]]:
         if part is not None and part.prefix and not (part.is_std or part.quantity.is_reading):
             found.setdefault(part.filter, {})[part.quantity] = column
     return found
+
+
+def covariance_column(filter_name: str, first: Quantity, second: Quantity) -> str:
+    """The column that holds the covariance of two quantities of a filter, such as `ekf_cov_x_m_y_m`."""
+    return f"{filter_name.replace('-', '_')}_cov_{first.column}_{second.column}"
 
 
 def std_column(column: str) -> str | None:

@@ -44,7 +44,7 @@ def draw_page(estimates: Estimates) -> None:
     sys.path.insert(0, str(ROOT / "tests" / "host"))
     from browser import Browser
 
-    with Page(estimates.columns, estimates.rig, "sim://link", on_mark=print) as page, Browser(1120, 720) as browser:
+    with Page(estimates.columns, estimates.rig, "sim://link", on_mark=print) as page, Browser(1120, 720, 1) as browser:
         page.show(estimates.values[::5], lambda: Status(HEALTH))
         browser.open(page.url)
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")

@@ -31,7 +31,8 @@ PATIENCE_S = 240.0  # (s) a bound on a loaded machine, never a wait
 class Browser:
     """One tab. A context manager: leaving it ends the browser."""
 
-    def __init__(self, width: int = 900, height: int = 500) -> None:
+    def __init__(self, width: int = 900, height: int = 500, scale: float = 0.4) -> None:
+        """The tab has `width` × `height` CSS pixels. WebGL is rendered by the CPU: a small `scale` saves most of it."""
         program = shutil.which("chromium")
         assert program is not None, "install the Debian package chromium"
         self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
@@ -53,7 +54,9 @@ class Browser:
         self._socket = self._connect()
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
+        )
         for domain in ("Runtime", "Log", "Page"):
             self.call(f"{domain}.enable")
 

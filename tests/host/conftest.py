@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,6 +16,8 @@ from linkpose.device.ports import register_scheme
 # The first example may wait for a compiler.
 settings.register_profile("linkpose", deadline=None)
 settings.load_profile("linkpose")
+# A shell starts its background jobs with SIGINT ignored, and children inherit that: the commands under test would, too.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 register_scheme("linkpose.simulation")  # tests open sim:// through the device layer too
 
 

@@ -168,10 +168,10 @@ def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
     out = tmp_path / "rest.csv"
     done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1.5, "--j2s", "auto", "-o", out)
     assert done.status == 0
-    assert re.search(r"the motion did not tell J2S along the sensor's [xyz] axis \(to 1.00 m only\)", done.err)
+    assert re.search(r"The motion does not determine J2S along the sensor's [xyz] axis \(1σ is 1.00 m\)", done.err)
     assert closing_line(out)["j2s_std_m"] == pytest.approx([1, 1, 1], abs=0.05)
     known = linkpose("estimate", "--live", "--port", SIM, "--duration", 1.5, "-o", out, "--force")
-    assert "did not tell" not in known.err and "j2s_m" not in closing_line(out)
+    assert "does not determine" not in known.err and "j2s_m" not in closing_line(out)
 
 
 def test_smooth_is_better_than_the_filter_with_the_same_columns(linkpose, tmp_path):

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
+import json
+import os
+import signal
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,16 +18,27 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
+from linkpose.estimation import FoundJ2s
 from linkpose.page import Page, Status, geometry
-from linkpose.page.history import PATH_POINTS, SPAN_S, History, Replay
+from linkpose.page.history import PATH_POINTS, SPAN_S, History
+from linkpose.page.origin import is_own
+from linkpose.page.page import j2s_text
+from linkpose.page.panel import with_gap_rows
+from linkpose.quantities import by_filter
 from linkpose.sensors.rig import Rig
 
 J2S_M = (-0.09, -0.04, 1.65)
 LINK = ["time_s", *(f"tilt_{q}{std}_{unit}" for q, unit in (("height", "m"), ("roll", "deg"), ("pitch", "deg"))
                     for std in ("", "_std"))]  # fmt: skip
+CHAIN = ["time_s", "chain_qw", "chain_qx", "chain_qy", "chain_qz", "chain_rotation_std_deg", "chain_angle_deg",
+         "chain_angle_std_deg"]  # fmt: skip
+HOST = Path(__file__).parents[2] / "host"
 ROBOT = ["time_s", "mice_x_m", "mice_x_std_m", "mice_y_m", "mice_y_std_m", "mice_heading_rad", "mice_excluded"]
 
 
@@ -60,31 +77,105 @@ def button(name: str) -> str:
     return f"[...document.querySelectorAll('button')].find(e => e.innerText == '{name}')"
 
 
+def chart_data(title: str) -> str:
+    """JavaScript for the data of the chart with this title; uPlot draws a gap where there is null."""
+    return (
+        f"Object.values(window.__viserTestpoints.uplots).map(e => e.chart)"
+        f".find(e => e.root.parentElement.parentElement.innerText.includes('{title}')).data"
+    )
+
+
 def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_path: Path) -> None:
-    rows, marks = link_rows(), list[float]()
-    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link", on_mark=marks.append) as page:
+    rows = link_rows()
+    rows = np.delete(rows, slice(100, 140), axis=0)  # a pulled cable: 2 s without samples
+    rows[-40:-30, 1:] = np.nan
+    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
         page.show(rows, status())
         browser.open(page.url)
         browser.wait_for_text(f"{rows[-1, 1]:.4f} m ±2.0 cm")
         browser.wait_for_text("IMU ok")
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
+        browser.wait_for(f"{chart_data('height')}[3].length > 150")
+        time, *_, height = browser.evaluate(f"{chart_data('height')}.slice(0, 4).map(e => [...e])")
+        missing = [at for at, value in zip(time, height, strict=True) if value is None]
+        assert len(missing) == 11 and rows[99, 0] < missing[0] < rows[100, 0]
         page.show(np.empty(0), status(imu="not answering"))
         alarm = "[...document.querySelectorAll('[role=alert]')].find(e => e.innerText.includes('IMU NOT ANSWERING'))"
         browser.wait_for(alarm)
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
         assert "IMU ok" not in browser.evaluate("document.body.innerText")
-        browser.evaluate(f"{button('mark')}.click()")
-        browser.wait_for_text("marks: 1")
-        assert marks == [rows[-1, 0]]
-        browser.evaluate(f"{button('stop')}.click()")
-        assert page.stopped.wait(30)
-        with pytest.raises(KeyboardInterrupt):
-            page.raise_if_stopped()
         browser.screenshot(tmp_path / "page.png")
         leave_without_error(browser)
 
 
-def test_a_robot_and_its_excluded_mouse(browser: Browser) -> None:
+@contextlib.contextmanager
+def command(*typed: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """linkpose in a process of its own, and the address of the page that it serves."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "linkpose", *map(str, typed)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(HOST)},
+    )
+    assert process.stderr is not None
+    try:
+        lines = []
+        for line in process.stderr:
+            lines.append(line)
+            if line.startswith("page: "):
+                yield process, line.removeprefix("page: ").strip()
+                break
+        else:
+            raise AssertionError("".join(lines))
+    finally:
+        process.kill()
+        process.wait()
+        process.stderr.close()
+
+
+def test_a_recording_is_watched_marked_and_stopped(browser: Browser, tmp_path: Path) -> None:
+    recording = tmp_path / "r.csv"
+    with command("record", recording, "--view", "--port", "sim://link") as (process, url):
+        browser.open(url)
+        browser.wait_for_text("height over the joint, ")
+        browser.evaluate(f"{button('mark')}.click()")
+        browser.wait_for_text("marks: 1")
+        browser.evaluate(f"{button('stop')}.click()")
+        assert process.wait(60) == 0
+    closing = json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))
+    assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
+    browser.open("about:blank")
+
+
+def robot_file(path: Path) -> None:
+    """An estimate of `localize` along a line, with correlated x and y and a stretch of unknown poses."""
+    names = ["time_s", "ekf_x_m", "ekf_y_m", "ekf_heading_rad", "ekf_x_std_m", "ekf_y_std_m", "ekf_cov_x_m_y_m"]
+    rows = [[0.1 * at, 0.1 * at, 0.05 * at, 0.4, 0.1, 0.2, 0.01] for at in range(15)]
+    text = [",".join("" if 5 <= at < 8 and column else f"{v:.6f}" for column, v in enumerate(row))
+            for at, row in enumerate(rows)]  # fmt: skip
+    path.write_text("\n".join([",".join(names), *text, ""]))
+
+
+def test_a_path_is_played_among_map_and_beacons(browser: Browser, tmp_path: Path) -> None:
+    estimate, truth = tmp_path / "path.csv", tmp_path / "truth.csv"
+    robot_file(estimate)
+    truth.write_text("time_s,x_m,y_m,heading_rad\n0,0,0,0.4\n1.4,1.4,0.7,0.4\n")
+    image, grid, beacons = tmp_path / "m.pgm", tmp_path / "m.yaml", tmp_path / "b.csv"
+    image.write_bytes(b"P5 4 4 255\n" + bytes([0] * 4 + [254] * 12))
+    grid.write_text("image: m.pgm\nresolution: 1\norigin: [0, 0, 0]\nnegate: 0\n"
+                    "occupied_thresh: 0.65\nfree_thresh: 0.2\n")  # fmt: skip
+    beacons.write_text("id,x_m,y_m\nA,1,3\n")
+    with command("plot", "--view", estimate, truth, "--map", grid, "--beacons", beacons) as (process, url):
+        browser.open(url)
+        browser.wait_for_text("x 1.400 m ±10.0 cm")
+        browser.wait_for_text("heading +22.9°")
+        browser.screenshot(tmp_path / "path.png")
+        leave_without_error(browser)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
+def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
     time = 0.1 * np.arange(50)
     rows = np.column_stack([time, time, 0 * time + 0.01, 0.1 * time, 0 * time + 0.02, 0 * time, 2.0 * (time > 3.05)])
     with Page(ROBOT, Rig(), "sim://mice") as page:
@@ -93,14 +184,43 @@ def test_a_robot_and_its_excluded_mouse(browser: Browser) -> None:
         browser.wait_for_text("x 4.900 m ±1.0 cm")
         browser.wait_for_text("mouse 2 LEFT OUT since 3.1 s")
         leave_without_error(browser)
-
-
-def test_a_file_is_played_to_its_end(browser: Browser) -> None:
-    rows = link_rows(20)
-    with Page(LINK, Rig().with_j2s(J2S_M), "e.csv", replay=Replay(rows)) as page:
+    angle = np.radians(30.0)
+    chain = np.array([[0.0, np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 1.5, 30.0, 1.2]])
+    with Page(CHAIN, Rig(), "sim://chain") as page:
+        page.show(chain, status())
         browser.open(page.url)
-        browser.wait_for_text(f"{rows[-1, 1]:.4f} m")
+        browser.wait_for_text("+30.0° ±1.2°")
         leave_without_error(browser)
+
+
+def test_what_is_not_excited_yet_is_shown() -> None:
+    found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
+    assert j2s_text(found) == (
+        "J2S 1.600 m ±200 mm; not excited yet: J2S along the sensor's z axis. Turn the link about x or y."
+    )
+    assert j2s_text(FoundJ2s.of(np.array([0.0, 0.0, 1.6]), 1e-6 * np.eye(3))) == "J2S 1.600 m ±1 mm"
+
+
+def test_a_gap_in_time_becomes_a_row_without_values() -> None:
+    rows = np.column_stack([[0.0, 0.1, 0.2, 1.2, 1.3], np.arange(5.0)])
+    with_gap = with_gap_rows(rows)
+    assert with_gap[:, 0].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.7, 1.2, 1.3])
+    assert np.isnan(with_gap[3, 1]) and np.isfinite(with_gap[:, 1]).sum() == 5
+    path = geometry.polyline(np.array([[0, 0, 0], [1, 0, 0], [np.nan] * 3, [2, 0, 0], [3, 0, 0]], float))
+    assert path[:, :, 0].tolist() == [[0, 1], [2, 3]]
+
+
+def test_an_ellipse_of_two_sigma_is_turned_by_the_covariance() -> None:
+    segments = geometry.ellipse(np.array([1.0, 2.0, 0.0, 0.1, 0.1, 0.0099]), 0.0)
+    points = segments[:, 0, :2] - [1.0, 2.0]
+    along, across = points @ [np.sqrt(0.5), np.sqrt(0.5)], points @ [np.sqrt(0.5), -np.sqrt(0.5)]
+    assert np.abs(along).max() == pytest.approx(2 * np.sqrt(0.0199), rel=0.01)
+    assert np.abs(across).max() == pytest.approx(2 * np.sqrt(0.0001), rel=0.01)
+
+
+def test_a_covariance_is_no_quantity_of_a_filter() -> None:
+    """Its column ends as that of y does."""
+    assert list(by_filter(["ekf_x_m", "ekf_y_m", "ekf_cov_x_m_y_m", "ekf_cov_x_m_heading_rad"])) == ["ekf"]
 
 
 def test_without_a_browser_nothing_waits_and_old_blocks_are_dropped() -> None:
@@ -108,6 +228,9 @@ def test_without_a_browser_nothing_waits_and_old_blocks_are_dropped() -> None:
     with Page(LINK, Rig(), "sim://link") as page:
         for _ in range(100):
             page.show(rows, status())
+        page.stopped.set()
+        with pytest.raises(KeyboardInterrupt):
+            page.raise_if_stopped()
         assert page.url.startswith("http://127.0.0.1:")
 
 
@@ -119,6 +242,35 @@ def test_no_file_of_the_machine_is_served() -> None:
             connection.request("GET", path)
             assert connection.getresponse().status == 404, path
             connection.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "allowed"),
+    [
+        ("127.0.0.1:8080", None, True),  # a program
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", True),
+        ("localhost:8080", "http://localhost:8080", True),
+        ("[::1]:8080", "http://[::1]:8080", True),
+        ("127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:9000", False),  # another program's page on this machine
+        ("127.0.0.1:8080", "null", False),  # a file, a sandboxed frame
+        ("evil.example:8080", "http://evil.example:8080", False),  # DNS rebinding
+        ("evil.example:8080", None, False),
+    ],
+)
+def test_only_the_page_itself_may_connect(host: str, origin: str | None, allowed: bool) -> None:
+    headers = {"Host": host} | ({"Origin": origin} if origin is not None else {})
+    assert is_own(headers, "127.0.0.1") == allowed
+
+
+def test_another_page_cannot_connect() -> None:
+    with Page(LINK, Rig(), "sim://link") as page:
+        url = page.url.replace("http:", "ws:")
+        with connect(url, origin=Origin(page.url), subprotocols=[Subprotocol("viser-v0")]):
+            pass
+        with pytest.raises(InvalidStatus) as refused, connect(url, origin=Origin("http://evil.example")):
+            pass
+        assert refused.value.response.status_code == 403
 
 
 def test_addresses_that_cannot_be_used_are_refused() -> None:

@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from linkpose.cli import live
 from linkpose.errors import LinkposeError
 from linkpose.recording import columns
 from linkpose.recording.fixedpoint import format_rows
@@ -394,10 +395,7 @@ def test_kill_9_at_any_moment_leaves_a_readable_file(tmp_path):
 def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
     path = tmp_path / "r.csv"
     command = [*CLI, "record", path, "--port", "sim://link", "--json"]
-    # A shell starts its background jobs with SIGINT ignored, and a child inherits that: the terminal's is restored.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 20
     while not (path.exists() and path.read_bytes().count(b"\n") > 20):
         assert time.monotonic() < deadline
@@ -409,6 +407,20 @@ def test_ctrl_c_ends_a_recording_well(tmp_path, stop):
     assert "Traceback" not in err
     assert json.loads(out.splitlines()[-1])["samples"] == len(table)
     assert table.closing is not None and table.closing["ended"] == "interrupted"
+
+
+@pytest.mark.parametrize(("signals", "handled"), [(1, [0, 1, 2]), (2, [0, 1])])
+def test_ctrl_c_takes_effect_between_two_blocks_and_pressed_twice_at_once(signals, handled):
+    """In the middle of a block it would part the count of a sample from its row."""
+    done = []
+
+    def handle(block):
+        for _ in range(signals if block == 2 else 0):
+            signal.raise_signal(signal.SIGINT)
+        done.append(block)
+
+    assert live.run((block for block in range(5)), handle) == "interrupted"
+    assert done == handled
 
 
 def test_the_converter_forgets_a_barometer_that_went_away():

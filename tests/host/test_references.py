@@ -153,3 +153,20 @@ def test_what_is_no_take_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(importlib.import_module("sys").modules, "ezc3d", None)
     with pytest.raises(MissingLibrary, match="ezc3d"):
         read_any(good)
+
+
+@pytest.mark.parametrize(
+    ("at", "damage", "reason"),
+    [
+        (8, b"\xff\xff", "more than it can hold"),  # the last frame in the header
+        (0, b"\x1f", "ends before its parameters"),  # the block of the parameters
+    ],
+)
+def test_a_c3d_file_that_states_more_than_it_holds_is_refused_before_memory_is_reserved(tmp_path, at, damage, reason):
+    """ezc3d reserves memory by the sizes that a file states: 12 GB for a damaged file of 8 kB."""
+    path = c3d(tmp_path / "take.c3d", ["S_O", "S_X", "S_Y"])
+    data = bytearray(path.read_bytes()[:8000])
+    data[at : at + len(damage)] = damage
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match=reason):
+        read_any(path, None)

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import math
-import os
-import pty
-import select
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from terminal import Terminal
 
 import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
+from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.view import Extremes, Screen
 from linkpose.estimation import Estimator, LiveEstimator
 from linkpose.presentation import with_std
 from linkpose.sensors.devices import Sensors
+from linkpose.simulation.link import LinkRun
 
-HOST = Path(__file__).parents[2] / "host"
 OK = {"imu": {"state": "ok"}, "baro": {"state": "ok"}}
 
 
@@ -138,28 +136,83 @@ def test_filters_that_become_ready_late_give_the_same_estimates() -> None:
     assert extremes.summary()["tilt"][1] == expected[:, whole.columns.index("tilt_height_m")].max()
 
 
-def test_rows_reach_a_redirected_stdout_while_the_view_is_on_the_terminal(tmp_path: Path) -> None:
-    """rich takes over stdout if it is allowed to: then no row arrives."""
-    command = ["estimate", "--live", "--port", "sim://link", "--duration", "0.5", "--filter", "tilt"]
-    leader, follower = pty.openpty()
-    with (tmp_path / "rows.csv").open("wb") as rows:
-        environment = {**os.environ, "PYTHONPATH": str(HOST), "TERM": "xterm"}
-        process = subprocess.Popen(
-            [sys.executable, "-m", "linkpose", *command], stdout=rows, stderr=follower, env=environment
-        )
-        os.close(follower)
-        seen = b""
-        while True:
-            if leader in select.select([leader], [], [], 1.0)[0]:
-                try:
-                    data = os.read(leader, 65536)
-                except OSError:
-                    break
-                if not data:
-                    break
-                seen += data
-    assert process.wait() == 0, seen.decode(errors="replace")
-    os.close(leader)
-    lines = [line for line in (tmp_path / "rows.csv").read_text().splitlines() if not line.startswith("#")]
-    assert len(lines) == 1 + 50
-    assert b"HEIGHT over joint" in seen
+def data_rows(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> None:
+    """rich captures stdout if it is allowed to: then no row arrives."""
+    rows, recording = tmp_path / "rows.csv", tmp_path / "rec.csv"
+    command = ["estimate", "--live", "--port", "sim://link", "--filter", "joint", "--filter", "tilt"]
+    with rows.open("wb") as stdout, Terminal(*command, "--record", recording, stdout=stdout) as terminal:
+        terminal.until(lambda text: "HEIGHT over joint" in text and "▸ joint" in text)
+        assert "m mark   f next filter   q stop" in terminal.text
+        terminal.press("m")
+        terminal.until(lambda text: "mark at " in text)
+        terminal.press("ff")
+        terminal.until(lambda text: "▸ tilt" in text)
+        terminal.resize(52, 20)
+        wide = "difference"
+        text = terminal.until(lambda text: "HEIGHT" in text and "▸ tilt" in text and wide not in text)
+        assert text.count("HEIGHT") == text.count(" lost") == 1, text
+        terminal.press("q")
+        assert terminal.wait() == 0, terminal.text
+        assert "HEIGHT" not in terminal.text and terminal.text.count("lowest") == 1
+        assert terminal.reads_lines
+    assert len(data_rows(rows)) == len(data_rows(recording)) > 20
+    closing = json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))
+    assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
+
+
+def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
+    marks: list[float] = []
+    marker, block = Marker(marks.append), LinkRun(1, 0, 1.0).measurements()
+    marker()
+    marker.advance(block[:0])
+    assert marks == []
+    marker.advance(block[:3])
+    marker.advance(block[3:5])
+    marker()
+    assert marks == pytest.approx([0.02, 0.04])
+
+
+def test_a_recording_is_marked_and_ended_by_ctrl_c(tmp_path: Path) -> None:
+    recording = tmp_path / "rec.csv"
+    with Terminal("record", recording, "--port", "sim://link") as terminal:
+        terminal.until(lambda text: "m marks an instant" in text and " samples" in text)
+        terminal.press("m")
+        terminal.until(lambda text: "mark at " in text)
+        terminal.press("\x03")
+        assert terminal.wait() == 0, terminal.text
+        assert "next: linkpose estimate" in terminal.text and terminal.reads_lines
+    assert len(json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))["marks"]) == 1
+
+
+def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    with Keys(True) as keys:
+        assert not keys.are_read and keys.pressed() == ""
+
+
+def test_a_narrow_screen_drops_the_slow_columns_first() -> None:
+    wide, narrow = (link_screen().render(health(), width, 24).plain for width in (80, 34))
+    assert "sim://link" in wide and "difference from best" in wide
+    assert "sim://link" not in narrow and "difference" not in narrow
+    assert "IMU ok BARO ok" in narrow and "0 lost" in narrow and "±0.4 mm" in narrow
+
+
+def test_the_next_filter_is_shown_with_its_own_curve() -> None:
+    screen = link_screen()
+    before = screen.render(health(), 80, 24).plain
+    for _ in range(3):
+        screen.next_filter()
+    chosen = screen.render(health(), 80, 24).plain
+    assert "▸ joint-inertial" in before and "▸ tilt" in chosen
+    assert f"{float(before.split('joint   ')[1].split()[0]) - 0.02:.4f}" in chosen.splitlines()[1]
+    screen.next_filter()
+    assert screen.render(health(), 80, 24).plain == before
+
+
+def test_a_chain_shows_its_joint_angle() -> None:
+    screen = Screen("sim://chain", ["chain"])
+    screen.add(0.0, {"chain": {quantities.ANGLE: (31.5, 0.4), quantities.HEIGHT1: (0.25, 0.01)}})
+    assert "joint angle +31.5°   height 1 0.250 m ±1.0 cm" in screen.render(health(), 80, 24).plain

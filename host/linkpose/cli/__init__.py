@@ -18,7 +18,7 @@ from linkpose.errors import LinkposeError, printable
 
 # Command -> what it does.
 COMMANDS = {
-    "ports": "List the serial ports and say which is the board.",
+    "ports": "List the serial ports and mark the board's.",
     "flash": "Upload the firmware to the board and verify that it answers.",
     "info": "Show the board's versions, sensors, settings and data health.",
     "record": "Record the sensors into a CSV file.",
@@ -74,7 +74,7 @@ class LazyGroup(click.Group):
 )
 @click.version_option(__version__, prog_name="linkpose")
 def group() -> None:
-    """Measure how a joint-connected link or a small robot moves, with an Arduino UNO for a motion-capture room."""
+    """Measure how a joint-connected link or a small mobile robot moves, using an Arduino UNO and its sensors."""
 
 
 def main() -> None:
@@ -97,10 +97,10 @@ def _run() -> int:
         error.show()
         return error.exit_code
     except LinkposeError as error:
-        from linkpose.cli.cures import sentence
+        from linkpose.cli.cures import WRONG_USAGE, sentence
 
         click.echo(f"linkpose: {printable(sentence(error))}", err=True)
-        return 1
+        return 2 if isinstance(error, WRONG_USAGE) else 1
     except Exception as error:
         if os.environ.get("LINKPOSE_DEBUG"):
             raise

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.calibration.imu import ImuCalibration
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 @click.argument("recordings", type=options.FILE, nargs=-1, required=True)
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write the calibration into.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quiet: bool) -> None:
     """Estimate the inertial sensor's errors and noise from rests, and write them into the rig file.
 
@@ -27,8 +28,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_imu(loaded)
     with_calibration(rig, found).save(rig_file)
     if json_lines:
@@ -37,24 +37,18 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
         _show(found)
     if found.accel_scale is None:
         click.echo(
-            f"Offset and scale of the accelerometer are unchanged: {_count(found.attitudes, 'attitude')} recorded, "
+            f"Offset and scale of the accelerometer are unchanged: {counted(found.attitudes, 'attitude')} recorded, "
             f"{FEWEST_ATTITUDES} needed.",
             err=True,
         )
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"calibrate joint SWING.csv --rig {rig_file}")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
 
 
 def _show(found: ImuCalibration) -> None:
     from linkpose.calibration.imu import FEWEST_ATTITUDES
 
     x, y, z = found.gyro_bias_rad_s
-    click.echo(f"{_count(found.rests, 'rest')} in {_count(found.attitudes, 'attitude')}")
+    click.echo(f"{counted(found.rests, 'rest')} in {counted(found.attitudes, 'attitude')}")
     click.echo(
         f"gyro: bias {x:.5f}, {y:.5f}, {z:.5f} ± {found.gyro_bias_std_rad_s:.5f} rad/s, "
         f"noise {found.gyro_noise_rad_s:.5f} rad/s"

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 @click.option("--rig", "rig_file", type=options.FILE, required=True, help="Rig file to write J2S into.")
 @click.option("--imu", "with_imu", is_flag=True, help="Write the sensor's bias, offset and scale as well.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate J2S, the vector from the joint centre to the sensor in its axes, and write it into the rig file.
 
@@ -35,8 +35,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
         with_calibration,
     )
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_joint(loaded, rig)
     with_calibration(rig, found, with_imu).save(rig_file)
     if json_lines:
@@ -59,9 +58,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
             click.echo(
                 "The rig file does not calibrate the sensor: add --imu, or type `linkpose calibrate imu`.", err=True
             )
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
+    options.show_rig_written(rig_file, quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
 
 
 def _show_weak(found: JointCalibration) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @options.rig_to_write("Rig file to write the magnetometer's calibration into.")
 @click.option("--force", is_flag=True, help="Write the rig file even if the field is not the earth's.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate hard iron, soft iron and the axes of the magnetometer, and write them into the rig file.
 
@@ -29,8 +29,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
     """
     from linkpose.calibration.mag import LEAST_FIELD_UT, MOST_FIELD_UT, calibrate_mag, with_calibration
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_mag(loaded, rig)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
@@ -55,9 +54,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             err=True,
         )
     with_calibration(rig, found).save(rig_file)
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"calibrate joint SWING.csv --rig {rig_file}")
+    options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
 
 
 def _show(found: MagCalibration) -> None:

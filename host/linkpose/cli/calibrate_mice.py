@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     help="Length of the straight line (m). Without it the scale comes from the turn and from where the mice sit.",
 )
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, json_lines: bool, quiet: bool) -> None:
     """Estimate counts per metre and mounting angle of each mouse, and write them into the rig file.
 
@@ -34,15 +34,12 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     """
     from linkpose.calibration.mice import calibrate_mice, with_calibration
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_mice(loaded, rig, length)
     with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
+    options.show_rig_written(rig_file, quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
 
 
 def _line(mouse: MouseCalibration) -> str:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @options.rig_to_write("Rig file to write the noise into.")
 @click.option("--force", is_flag=True, help="Write the rig file even if the sensor was not at rest.")
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_lines: bool, quiet: bool) -> None:
     """Estimate white noise, bias instability, random walk and temperature drift from a long rest.
 
@@ -32,8 +32,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
     """
     from linkpose.calibration.noise import calibrate_noise, with_calibration
 
-    loaded = options.load_recordings(recordings)
-    rig = options.resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_noise(loaded)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
@@ -45,9 +44,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             "--force to write the figures all the same"
         )
     with_calibration(rig, found).save(rig_file)
-    if not quiet:
-        click.echo(f"written to {rig_file}", err=True)
-    options.show_next(quiet, f"calibrate imu RESTS.csv --rig {rig_file}")
+    options.show_rig_written(rig_file, quiet, f"calibrate imu RESTS.csv --rig {rig_file}")
 
 
 def _show(found: NoiseCalibration) -> None:
@@ -79,26 +76,22 @@ def _show(found: NoiseCalibration) -> None:
 
 def _show_sensor(name: str, axes: Sequence[AxisNoise], scale: float, unit: str, decimals: int) -> None:
     """The coefficients of a sensor, `scale` times those in SI units."""
-
-    def row(values: Sequence[str]) -> str:
-        return ", ".join(values)
-
     models = [axis.model for axis in axes]
     click.echo(
         f"{name}: white noise "
-        + row([f"{scale * m.density:.{decimals}f} ± {scale * m.density_std:.{decimals}f}" for m in models])
+        + ", ".join([f"{scale * m.density:.{decimals}f} ± {scale * m.density_std:.{decimals}f}" for m in models])
         + f" {unit}/√Hz"
     )
     bounds = [
         f"{'≤ ' if m.instability_is_bound else ''}{scale * m.instability:.{decimals}f} (at {m.instability_at_s:.0f} s)"
         for m in models
     ]
-    click.echo(f"{name}: bias instability {row(bounds)} {unit}")
+    click.echo(f"{name}: bias instability {', '.join(bounds)} {unit}")
     walks = [
         f"{scale * m.walk:.{decimals + 1}f} ± {scale * m.walk_std:.{decimals + 1}f}" if m.walk else "not observed"
         for m in models
     ]
-    click.echo(f"{name}: random walk {row(walks)} {unit}/√s")
+    click.echo(f"{name}: random walk {', '.join(walks)} {unit}/√s")
     if axes[0].drift is not None:
         drifts = [f"{scale * (a.drift or 0):.{decimals}f} ± {scale * (a.drift_std or 0):.{decimals}f}" for a in axes]
-        click.echo(f"{name}: temperature drift {row(drifts)} {unit}/°C")
+        click.echo(f"{name}: temperature drift {', '.join(drifts)} {unit}/°C")

@@ -20,7 +20,13 @@ from linkpose.errors import printable
     metavar="OUT.ext",
     help="Write this file; its ending selects the format: .sto, .mot, .trc, .c3d, .tum, .mcap or .parquet.",
 )
-@click.option("--filter", "wanted", metavar="NAME", help="Convert the estimates of this filter only.")
+@click.option(
+    "--filter",
+    "wanted",
+    metavar="NAME",
+    shell_complete=options.complete_filter,
+    help="Convert the estimates of this filter only.",
+)
 @click.option(
     "--label",
     default="sensor_imu",
@@ -29,7 +35,7 @@ from linkpose.errors import printable
     help="Name of the sensor in .sto, .trc and .c3d; OpenSense expects BODY_imu.",
 )
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
+@options.quiet
 def command(source: Path, output: Path, wanted: str | None, label: str, force: bool, quiet: bool) -> None:
     """Convert the estimate or recording IN into a format of OpenSim, motion capture, robotics or pandas.
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
 from typing import Any
 
 from linkpose import errors
+from linkpose.cli.options import port_names
 
 FLASH = "type `linkpose flash`"
 
@@ -16,8 +18,8 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.TooFewRows: lambda e: (
         f"to score the common part alone, add --from {e.common_s[0]:.6g} --to {e.common_s[1]:.6g}"
     ),
-    errors.PortNotFound: lambda e: "`linkpose ports` lists those there are",
-    errors.NotASerialPort: lambda e: "`linkpose ports` lists those there are",
+    errors.PortNotFound: lambda e: _nearest_port(e.port) + "`linkpose ports` lists the ports",
+    errors.NotASerialPort: lambda e: "`linkpose ports` lists the ports",
     errors.NoBoardFound: lambda e: (
         ("connect it or choose with --port" if e.ports else "plug the board in")
         + (", or try --port sim://link" if e.simulated_will_do else "")
@@ -40,9 +42,18 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     ),
 }
 
+# Errors that are wrong usage: a name on the command line that does not exist.
+WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture)
+
+
+def _nearest_port(name: str) -> str:
+    """A question about the port whose name is most like this one; empty where none is."""
+    near = difflib.get_close_matches(name, port_names(), 1)
+    return f"did you mean {near[0]}? " if near else ""
+
 
 def cure(error: errors.LinkposeError) -> str:
-    """What to type against an error; empty where the error's own text says it all."""
+    """What to type against an error; empty where the error's own text suffices."""
     for kind in type(error).__mro__:
         if kind in CURES:
             return CURES[kind](error)

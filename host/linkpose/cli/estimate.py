@@ -15,16 +15,19 @@ import click
 from linkpose.cli import options
 from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
-from linkpose.cli.page import PageOptions
+from linkpose.cli.page import PageOptions, show_newest
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
     from linkpose.board import Board
+    from linkpose.cli.keys import Keys
     from linkpose.cli.live import Console
     from linkpose.estimation import EstimateWriter, Estimator
+    from linkpose.precompile import Precompilation
+    from linkpose.sensors.measurements import Floats, Measurements
 
-WORST_STD_M = 0.03  # of a J2S that the motion has told
+WORST_STD_M = 0.03  # (m, 1σ in the worst direction) from which on the heights are rough: 2 % of a link of 1.65 m
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,21 +48,25 @@ class Request:
 
 @click.command(name="estimate")
 @click.argument("recording", type=options.FILE, required=False)
-@click.option("--live", "is_live", is_flag=True, help="From the board, as it measures.")
+@click.option("--live", "is_live", is_flag=True, help="Estimate live, from the board.")
 @options.port
 @options.duration
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimates here.")
-@click.option("--record", type=options.FILE, metavar="REC.csv", help="Keep the live measurements as a recording.")
-@click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Keep every live byte as it came.")
+@click.option(
+    "--record", type=options.FILE, metavar="REC.csv", help="Also write the live measurements to this recording."
+)
+@click.option("--raw", type=options.FILE, metavar="OUT.bin", help="Also write every received byte to this file.")
 @click.option(
     "--filter",
     "filter_names",
     multiple=True,
     metavar="NAME",
     shell_complete=options.complete_filter,
-    help="Run this filter; may be repeated. Default: all that the sensors and the rig support.",
+    help="Run this filter; may be repeated. Default: every filter that the sensors and the rig support.",
 )
-@click.option("--smooth", is_flag=True, help="joint-inertial from what came before and after; recordings only.")
+@click.option(
+    "--smooth", is_flag=True, help="Use the smoother of joint-inertial, which also uses later samples; recordings only."
+)
 @options.rig_and_j2s
 @options.page
 @board_settings
@@ -101,8 +108,11 @@ def command(
 ) -> None:
     """Run the filters, live from the board or over RECORDING (a .csv or a raw .bin).
 
-    Without --filter, all that the sensors and the rig allow run side by side. Without -o the estimates go to stdout
-    (live on a terminal they are shown there).
+    Without --filter, every filter that the sensors and the rig support runs; -v lists the others with the reason.
+    Without -o, the estimates go to the standard output, unless a live view on the terminal shows them.
+
+    Keys of the live view: m marks an instant (the closing line lists it under "marks"), f shows the next filter, q ends
+    the run as Ctrl-C does.
     """
     from linkpose.cli.live import Console, refuse_same_file
 
@@ -112,7 +122,9 @@ def command(
     if recording is not None and (port or duration or record or raw or board or targets):
         raise click.UsageError("--port, --duration, --record, --raw, --to and the board's settings go with --live")
     if smooth and is_live:
-        raise click.UsageError("--smooth needs what comes after: record, and give the RECORDING to estimate --smooth")
+        raise click.UsageError(
+            "--smooth uses later samples: record first, then type: linkpose estimate RECORDING --smooth"
+        )
     if recording is not None and has_page:
         raise click.UsageError(
             "--view goes with --live; estimate with -o OUT.csv, then type: linkpose plot --view OUT.csv"
@@ -120,6 +132,7 @@ def command(
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     refuse_same_file(output, record, raw, source=recording)
+    options.refuse_mixed_output(output, json_lines)
     joint = options.joint_from(joint, j2s_std)
     request = Request(output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page)
     console = Console(quiet, verbose)
@@ -138,7 +151,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
     rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
     for remark in [*recording.remarks, *recording.contradictions(rig)]:
-        console.say(remark)
+        console.report(remark)
     if recording.unusable and not request.filter_names:
         raise NoUsableData(f"{path}: {recording.unusable}")
     estimator = Estimator.for_recording(request.filter_names, rig, recording)
@@ -160,7 +173,8 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     if request.output:
-        console.say(f"{rows} rows of {', '.join(head['filters'])}: {request.output}")
+        console.report(f"{rows} rows of {', '.join(head['filters'])}{options.written(request.output)}")
+        options.show_next(console.is_quiet, f"plot {request.output}")
 
 
 def _smooth(estimator: Estimator) -> None:
@@ -182,18 +196,16 @@ def _live(
     """Estimates as the board measures."""
     from linkpose.board import Board
     from linkpose.cli import live
-    from linkpose.cli.view import Extremes, View, final_table
-    from linkpose.sensors.measurements import Floats, Measurements
+    from linkpose.cli.keys import Keys
 
     with contextlib.ExitStack() as stack:
         connected = stack.enter_context(
             Board(
                 port, settings=board, rig=request.rig_file, joint=request.joint, raw=raw, force=request.force,
-                notify=console.say,
+                notify=console.report,
             )
         )  # fmt: skip
-        from linkpose.estimation import Estimator, LiveEstimator
-        from linkpose.page.status import Status
+        from linkpose.estimation import Estimator
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board(request.filter_names, connected)
@@ -202,55 +214,110 @@ def _live(
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force, plain=request.plain)
-        page = stack.enter_context(
-            request.page.open(estimator.columns, estimator.rig, connected.port, console.say, on_mark=connected.mark)
-        )
         head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
-        view = stack.enter_context(View(estimator.columns, console.shows_progress, _title(connected)))
-        if view.is_shown:
-            stack.enter_context(console.through(view.say))
-        following = LiveEstimator(estimator, compiling.is_ready)
-        extremes = Extremes(estimator.columns)
-
-        def write(rows: Floats) -> None:
-            if len(rows):
-                sink.write(rows, connected.started_s)
-                extremes.add(rows)
+        keys = stack.enter_context(Keys(console.shows_progress))
+        run = stack.enter_context(_LiveRun(connected, estimator, compiling, sink, request, console, keys))
 
         def handle(block: Measurements) -> None:
-            rows, newest = following.process(block)
-            write(rows)
-            if len(block):
-                view.show(newest, lambda: connected.health, compiling.progress)
-            else:
-                view.redraw(lambda: connected.health, compiling.progress)
-            if page is not None:
-                page.show(
-                    newest if len(block) else newest[:0],
-                    lambda: Status(connected.health, estimator.found_j2s, compiling.progress),
-                )
-                page.raise_if_stopped()
+            run.process(block)
+            run.follow_keys()
 
         ended = live.run_board(connected, duration, handle)
-        view.close()
-        if compiling.waiting:
-            console.say("The estimates of filters that are still being compiled follow.")
-            compiling.wait(lambda text: console.progress(lambda: text))
-        write(following.finish())
-        health = connected.health
-        sink.close({"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(estimator)})
-        for remark in sink.dropped:
-            console.say(remark)
-        if console.shows_progress:
-            for line in final_table(extremes.summary()):
-                console.say(line)
-        _report_j2s(estimator, console)
-        _report_mice(estimator, console)
-        live.show_summary(console, health, request.json_lines, f": {request.output}" if request.output else "")
+        run.finish(ended)
+        live.show_summary(console, connected.health, request.json_lines, options.written(request.output))
         if request.output:
-            console.say(f"next: linkpose plot {request.output}")
+            options.show_next(console.is_quiet, f"plot {request.output}")
         connected.check_usable()
+
+
+class _LiveRun:
+    """Filters, outputs, view, page and keys of one live run. A context manager: leaving it clears the view."""
+
+    def __init__(
+        self,
+        board: Board,
+        estimator: Estimator,
+        compiling: Precompilation,
+        sink: _Sink,
+        request: Request,
+        console: Console,
+        keys: Keys,
+    ) -> None:
+        from linkpose.cli.keys import Marker
+        from linkpose.cli.view import Extremes, View
+        from linkpose.estimation import LiveEstimator
+
+        self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
+        self._console, self._keys = console, keys
+        self._marks: list[float] = []
+        self._marker = Marker(self._mark)
+        self._following = LiveEstimator(estimator, compiling.is_ready)
+        self._extremes = Extremes(estimator.columns)
+        self._exit = contextlib.ExitStack()
+        self._page = self._exit.enter_context(
+            request.page.open(estimator.columns, estimator.rig, board.port, console.report, on_mark=self._mark)
+        )
+        several = len(estimator.filters) > 1
+        legend = "m mark   " + "f next filter   " * several + "q stop"
+        self._view = View(estimator.columns, console.shows_progress, _title(board), legend if keys.are_read else "")
+        self._exit.callback(self._view.close)
+        if self._view.is_shown:
+            self._exit.enter_context(console.through(self._view.report))
+
+    def process(self, block: Measurements) -> None:
+        """Runs the filters over a block, which may be empty, and shows and writes what they give."""
+        self._marker.advance(block)
+        rows, newest = self._following.process(block)
+        self._write(rows)
+        if len(block):
+            self._view.show(newest, lambda: self._board.health, self._compiling.progress)
+        else:
+            self._view.redraw(lambda: self._board.health, self._compiling.progress)
+        shown = newest if len(block) else newest[:0]
+        show_newest(self._page, shown, self._board, self._estimator, self._compiling)
+
+    def follow_keys(self) -> None:
+        """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
+        self._keys.follow({"m": self._marker, "f": self._view.next_filter})
+
+    def finish(self, ended: str) -> None:
+        """Writes the rows of filters that were compiled late, the closing line and the final table."""
+        from linkpose.cli.view import final_table
+
+        self._view.close()
+        if self._compiling.waiting:
+            self._console.report("The estimates of filters that are still being compiled follow.")
+            self._compiling.wait(lambda text: self._console.progress(lambda: text))
+        self._write(self._following.finish())
+        health = self._board.health
+        closing = {"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(self._estimator)}
+        if self._marks:
+            closing["marks"] = [round(time_s, 6) for time_s in sorted(self._marks)]
+        self._sink.close(closing)
+        for remark in self._sink.dropped:
+            self._console.report(remark)
+        if self._console.shows_progress:
+            for line in final_table(self._extremes.summary()):
+                self._console.report(line)
+        _report_j2s(self._estimator, self._console)
+        _report_mice(self._estimator, self._console)
+
+    def _mark(self, time_s: float) -> None:
+        self._marks.append(time_s)
+        self._board.mark(time_s)
+        self._console.report(f"mark at {time_s:.2f} s")
+
+    def _write(self, rows: Floats) -> None:
+        if len(rows):
+            self._sink.write(rows, self._board.started_s)
+            self._extremes.add(rows)
+
+    def __enter__(self) -> _LiveRun:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._exit.close()
 
 
 def _title(board: Board) -> str:
@@ -260,7 +327,7 @@ def _title(board: Board) -> str:
 
 
 def _check(estimator: Estimator, request: Request, console: Console) -> None:
-    """Names the filters that cannot run. Raises LinkposeError when J2S is to be estimated and no filter does it."""
+    """Reports which filters run. Raises LinkposeError if J2S is to be estimated and no filter that runs does it."""
     from linkpose import filters
     from linkpose.filters import REGISTRY
 
@@ -273,13 +340,13 @@ def _check(estimator: Estimator, request: Request, console: Console) -> None:
         console.detail(f"not running: {names}: {reason}")
     missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
     if missing and any(REGISTRY[f.name].sensors for f in estimator.filters):
-        console.say(f"{missing[0]}: {left_out[missing[0]]}")
+        console.report(f"{missing[0]}: {left_out[missing[0]]}")
     others = " (-v: why not others)" if left_out else ""
-    console.say(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
+    console.report(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
 
 
 def _outcome(estimator: Estimator) -> dict[str, Any]:
-    """For the closing line: rejected samples, and J2S where it was to be found."""
+    """Entries of the closing line: rejected samples, and J2S and the scale of the mice where they were estimated."""
     outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in estimator.filters}}
     found = estimator.found_j2s
     if found:
@@ -294,23 +361,23 @@ def _report_mice(estimator: Estimator, console: Console) -> None:
     if estimator.mice_scale:
         factor, std = estimator.mice_scale
         change = "more" if factor > 1 else "fewer"
-        console.say(
+        console.report(
             f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
             "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
         )
 
 
 def _report_j2s(estimator: Estimator, console: Console) -> None:
-    """J2S where it was to be found, and what the motion did not tell of it."""
+    """J2S where it was estimated, and the axis along which the motion did not excite it."""
     found = estimator.found_j2s
     if not found:
         return
     axes = (f"{value:.4f} ± {std:.4f}" for value, std in zip(found.mean_m, found.std_m, strict=True))
-    console.say(f"J2S {', '.join(axes)} m")
+    console.report(f"J2S {', '.join(axes)} m")
     if found.worst_std_m > WORST_STD_M:
-        console.say(
-            f"the motion did not tell J2S along the sensor's {found.worst_axis} axis (to {found.worst_std_m:.2f} m "
-            "only), so the heights are rough: swing the link longer, in all directions"
+        console.report(
+            f"The motion does not determine J2S along the sensor's {found.worst_axis} axis (1σ is "
+            f"{found.worst_std_m:.2f} m), so the heights are rough. Swing the link longer, in all directions."
         )
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @options.plot("Draw errors with ±2σ, their distribution and the table.")
 @options.force
 @options.as_json
-@click.option("-q", "--quiet", is_flag=True, help="Print no remarks and no verdicts.")
+@options.quiet
 def command(
     estimate: Path,
     reference: Path,

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
 
 
 @click.command(name="flash")
-@click.option("--port", metavar="PORT", help="Device, such as /dev/ttyACM0 or COM3. Default: the only connected UNO.")
+@click.option(
+    "--port",
+    metavar="PORT",
+    shell_complete=options.complete_port,
+    help="Device, such as /dev/ttyACM0 or COM3. Default: the only connected UNO.",
+)
 @click.option("--prebuilt", is_flag=True, help="Upload the firmware image of this package without building it.")
 @click.option("--hex", "hex_file", type=options.FILE, metavar="FILE.hex", help="Upload this build of the firmware.")
 @click.option(
@@ -77,12 +82,12 @@ def _build(environment: str, console: Console) -> Image:
     from linkpose.flashing.build import CannotBuild, build, project
     from linkpose.flashing.image import PREBUILT, read_image
 
-    console.say("building the firmware with PlatformIO; the first build downloads the toolchain")
+    console.report("building the firmware with PlatformIO; the first build downloads the toolchain")
     try:
         with project(environment) as firmware:
             return build(firmware, _shows_build(console))
     except CannotBuild as error:
-        console.say(f"{error}; uploading the prebuilt firmware instead (--prebuilt does so at once)")
+        console.report(f"{error}; uploading the prebuilt firmware instead (--prebuilt does so at once)")
     return read_image(PREBUILT)
 
 
@@ -92,7 +97,7 @@ def _upload(image: Image, port: str, console: Console) -> None:
     def show(progress: Progress) -> None:
         console.progress(lambda: f"{progress.stage.value} {progress.percent} %")
 
-    console.say(f"uploading {image.identity} ({len(image.data)} bytes) to {port}")
+    console.report(f"uploading {image.identity} ({len(image.data)} bytes) to {port}")
     upload(image, port, show)
 
 
@@ -115,8 +120,8 @@ def _prove(port: str, image: Image, console: Console) -> Hello:
     """The HELLO of the firmware that was written."""
     from linkpose.device.session import Session
 
-    console.say("the upload is verified; waiting for the firmware")
-    with _as_consequence(), Session(port, console.say) as session:
+    console.report("the upload is verified; waiting for the firmware")
+    with _as_consequence(), Session(port, console.report) as session:
         hello = session.hello
     if hello.source_revision != image.identity.source_revision:
         raise LinkposeError(

@@ -55,7 +55,7 @@ def _summarise(path: Path, console: Console) -> dict[str, Any]:
 
     file = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
     for remark in file.remarks:
-        console.say(remark)
+        console.report(remark)
     return summarise(file)
 
 
@@ -63,7 +63,7 @@ def _ask_board(port: str | None, self_test: bool, console: Console) -> dict[str,
     """What the board reports, and the health of its sensors' data."""
     from linkpose.board import open_session
 
-    with open_session(port, console.say) as session:
+    with open_session(port, console.report) as session:
         tested = _self_test(session) if self_test else {}
         sensors = _observe(session, console)
         return _report(session, session.health()) | {"health": sensors} | tested

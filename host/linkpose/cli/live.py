@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from linkpose.errors import LinkposeError, printable
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -31,16 +32,16 @@ class Console:
     """Lines for the user on stderr, and a progress line there when it is a terminal."""
 
     def __init__(self, quiet: bool, verbose: bool) -> None:
-        self._quiet, self._verbose = quiet, verbose
+        self.is_quiet, self._verbose = quiet, verbose
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
         self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
 
-    def say(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Prints a line."""
         self.clear()
-        if not self._quiet:
+        if not self.is_quiet:
             self._print(printable(text))
 
     @contextlib.contextmanager
@@ -54,7 +55,7 @@ class Console:
 
     def detail(self, text: str) -> None:
         if self._verbose:
-            self.say(text)
+            self.report(text)
 
     def progress(self, make_text: Callable[[], str]) -> None:
         """Shows a line that replaces the one before, a few times a second."""
@@ -73,7 +74,7 @@ class Console:
         if self.shows_progress:
             prepare(names, lambda text: self.progress(lambda: text))
         else:
-            first = iter([self.say])
+            first = iter([self.report])
             prepare(names, lambda text: next(first, str)(text))
         self.clear()
 
@@ -87,12 +88,14 @@ class Console:
 def run(stream: Generator[Block, None, None], handle: Callable[[Block], object]) -> str:
     """Passes the blocks of a stream to `handle` until the stream or the user ends it.
 
+    The stream must yield several times a second: a signal takes effect between two blocks, a second one at once.
     Returns which of the two it was: "duration" or "interrupted".
     """
-    with ending_well(), contextlib.closing(stream):
+    with _signals_between_blocks() as raise_if_signalled, contextlib.closing(stream):
         try:
             for block in stream:
                 handle(block)
+                raise_if_signalled()
         except KeyboardInterrupt:
             return "interrupted"
     return "duration"
@@ -107,39 +110,66 @@ def run_board(board: Board, duration_s: float | None, handle: Callable[[Measurem
 
 @contextlib.contextmanager
 def ending_well() -> Iterator[None]:
-    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does.
-
-    A signal that is ignored, as `nohup` ignores SIGHUP, stays so.
-    """
+    """Within this context, SIGTERM and SIGHUP (the terminal was closed) end a run as Ctrl-C does."""
 
     def interrupt(*_: int | FrameType | None) -> None:
         raise KeyboardInterrupt
 
-    names = ("SIGTERM", "SIGHUP")  # Windows has no SIGHUP
+    with _handled_by(interrupt, "SIGTERM", "SIGHUP"):
+        yield
+
+
+@contextlib.contextmanager
+def _signals_between_blocks() -> Iterator[Callable[[], None]]:
+    """A function that raises KeyboardInterrupt once Ctrl-C, SIGTERM or SIGHUP has arrived.
+
+    Raised by the signal itself, it could part a sample's count from its row in the file.
+    """
+    arrived = False
+
+    def note(*_: int | FrameType | None) -> None:
+        nonlocal arrived
+        if arrived:
+            raise KeyboardInterrupt
+        arrived = True
+
+    def raise_if_signalled() -> None:
+        if arrived:
+            raise KeyboardInterrupt
+
+    with _handled_by(note, "SIGINT", "SIGTERM", "SIGHUP"):
+        yield raise_if_signalled
+
+
+@contextlib.contextmanager
+def _handled_by(handler: Callable[[int, FrameType | None], object], *names: str) -> Iterator[None]:
+    """These signals call the handler. One that is ignored stays so, as `nohup` ignores SIGHUP; Windows has none."""
     signals = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    before = {each: signal.signal(each, interrupt) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
+    before = {each: signal.signal(each, handler) for each in signals if signal.getsignal(each) != signal.SIG_IGN}
     try:
         yield
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for each, earlier in before.items():
+            signal.signal(each, earlier)
 
 
 def show_summary(console: Console, health: Health, json_lines: bool, where: str) -> None:
     """The summary on stderr, and as the last line of stdout with --json."""
     from linkpose.device.session import summary
 
-    console.say(f"{health_line(health)}{where}")
+    console.report(f"{health_line(health)}{where}")
     if json_lines:
         click.echo(json.dumps(summary(health)))
 
 
 def health_line(health: Health) -> str:
     """How it goes, in a line."""
-    text = f"{health.duration_s:.1f} s, {health.samples} samples, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    text = (
+        f"{health.duration_s:.1f} s, {counted(health.samples, 'sample')}, {health.rate_hz:.1f} Hz, {health.lost} lost"
+    )
     text += f", {health.corrupt.total} corrupt"
     if health.gaps:
-        text += f", {len(health.gaps)} gaps"
+        text += f", {counted(len(health.gaps), 'gap')}"
     faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
     invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
     saturated = sum(of.get("saturated", 0) for of in health.sensors.values())

@@ -141,7 +141,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     type=options.FiniteRange(min=0),
     default=0.02,
     show_default=True,
-    help="k of --noise affine (m/m).",
+    help="Growth k of the range's standard deviation with --noise affine (m/m).",
 )
 @click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
 @click.option("--bearing-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a bearing (rad).")
@@ -281,11 +281,13 @@ def command(
     }
     for name, track in tracks.items():
         _require_measurements(log, name, track)
+    options.refuse_mixed_output(output, json_lines)
     if output is not None:
         write_tracks(output, tracks, log, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
-        click.echo(json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result))
+        text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
+        click.echo(text, err=str(output) == "-")
 
 
 def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:

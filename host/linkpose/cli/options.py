@@ -100,16 +100,20 @@ def complete_filter(_ctx: click.Context, _param: click.Parameter, incomplete: st
 
 def complete_port(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
     """Names of ports for the shell's completion."""
+    return [name for name in port_names() if name.startswith(incomplete)]
+
+
+def port_names() -> list[str]:
+    """The serial ports that are connected, and the simulated boards."""
     from linkpose.device.ports import find_ports
 
-    names = [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
-    return [name for name in names if name.startswith(incomplete)]
+    return [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
 
 
 def duration(function: Function) -> Function:
-    return click.option("--duration", type=SecondsType(), help="Stop after so many seconds. Default: Ctrl-C ends.")(
-        function
-    )
+    return click.option(
+        "--duration", type=SecondsType(), help="Stop after this time (s). Default: Ctrl-C ends the run."
+    )(function)
 
 
 def page(function: Function) -> Function:
@@ -124,7 +128,10 @@ def page(function: Function) -> Function:
         "--view-host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Serve the page at this address."
     )(function)
     return click.option(
-        "--view", "has_page", is_flag=True, help="Show it in the browser: link or robot in 3-D, charts."
+        "--view",
+        "has_page",
+        is_flag=True,
+        help="Show the estimates in the browser: link or robot in 3-D, charts, sensor health.",
     )(function)
 
 
@@ -133,13 +140,13 @@ def rig_and_j2s(function: Function) -> Function:
         "--j2s-std",
         type=FiniteRange(min=0, min_open=True),
         metavar="METRES",
-        help="How well --j2s is known, each axis: joint-inertial refines it. Default: 0.0001.",
+        help="Standard deviation of --j2s, each axis (m); joint-inertial refines J2S within it. Default: 0.0001.",
     )(function)
     function = click.option(
         "--j2s",
         "joint",
         type=JointType(),
-        help="Vector from the joint centre to the sensor, in its axes (m); auto: estimate it.",
+        help="J2S, the vector from the joint centre to the sensor, in the sensor's axes (m); auto: estimate it.",
     )(function)
     return click.option("--rig", "rig_file", type=FILE, help="Rig file: calibration, J2S, mice.")(function)
 
@@ -152,11 +159,11 @@ def rig_to_write(what: str) -> Callable[[Function], Function]:
 
 
 def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
-    """What --j2s and --j2s-std say together."""
+    """The joint that --j2s and --j2s-std describe. Raises UsageError for --j2s-std without a vector."""
     if j2s_std_m is None:
         return joint
     if joint is None or joint is UNKNOWN_JOINT:
-        raise click.UsageError("--j2s-std is of a J2S that is given: add --j2s X,Y,Z")
+        raise click.UsageError("--j2s-std is the uncertainty of --j2s X,Y,Z: add --j2s X,Y,Z")
     return replace(joint, j2s_std_m=j2s_std_m)
 
 
@@ -225,15 +232,26 @@ def simulated_outputs(what: str) -> Callable[[Function], Function]:
     return decorate
 
 
-def next_and_quiet(function: Function) -> Function:
-    """-q of a command that ends with what to type next."""
+def quiet(function: Function) -> Function:
+    """-q of a command without -v."""
     return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
 
 
 def show_next(quiet: bool, following: str) -> None:
-    """What to type next, on stderr."""
-    if not quiet:
+    """What to type next, on stderr; nothing where a file that it names is the standard output."""
+    if not quiet and "-" not in following.split():
         click.echo(f"next: linkpose {following}", err=True)
+
+
+def written(path: Path | None) -> str:
+    """The end of a message that names the file that was written; empty for none and for the standard output."""
+    return "" if path is None or str(path) == "-" else f": {path}"
+
+
+def refuse_mixed_output(output: Path | None, json_lines: bool) -> None:
+    """Raises UsageError where two kinds of results would be mixed on the standard output."""
+    if json_lines and str(output) == "-":
+        raise click.UsageError("-o - and --json both write to the standard output: leave out one of them")
 
 
 def as_json(function: Function) -> Function:
@@ -251,8 +269,8 @@ def plain(function: Function) -> Function:
 
 
 def verbosity(function: Function) -> Function:
-    function = click.option("-q", "--quiet", is_flag=True, help="Say nothing but errors.")(function)
-    return click.option("-v", "--verbose", is_flag=True, help="Say more.")(function)
+    function = click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
+    return click.option("-v", "--verbose", is_flag=True, help="Print details.")(function)
 
 
 def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None) -> Rig:
@@ -261,8 +279,21 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     return replace(rig, joint=joint) if joint else rig
 
 
+def recordings_and_rig(paths: Sequence[Path], rig_file: Path) -> tuple[list[Recording], Rig]:
+    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording."""
+    loaded = load_recordings(paths)
+    return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+
+
+def show_rig_written(rig_file: Path, quiet: bool, following: str) -> None:
+    """The end of a calibration, on stderr: the rig file that was written, and what to type next."""
+    if not quiet:
+        click.echo(f"written to {rig_file}", err=True)
+    show_next(quiet, following)
+
+
 def load_recordings(paths: Sequence[Path]) -> list[Recording]:
-    """The recordings, their remarks said on stderr."""
+    """The recordings; their remarks go to stderr."""
     from linkpose.recording.reader import load_recording
 
     loaded = [load_recording(path) for path in paths]

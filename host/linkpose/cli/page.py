@@ -1,4 +1,4 @@
-"""The page of `estimate --live` and `plot` with `--view`."""
+"""The page of `estimate --live`, `record` and `plot` with `--view`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
+    from linkpose.board import Board
+    from linkpose.cli.live import Console
+    from linkpose.estimation import Estimator
     from linkpose.page import Page
     from linkpose.page.history import Replay
+    from linkpose.page.scene import Surroundings
+    from linkpose.precompile import Precompilation
+    from linkpose.sensors.measurements import Floats, Measurements
     from linkpose.sensors.rig import Rig
 
 
@@ -35,24 +41,64 @@ class PageOptions:
         columns: Sequence[str],
         rig: Rig,
         title: str,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         *,
         on_mark: Callable[[float], None] | None = None,
         replay: Replay | None = None,
+        surroundings: Surroundings | None = None,
     ) -> Iterator[Page | None]:
-        """The page if it is wanted; `say` prints its address, and a warning where it is open to the network."""
+        """The page if it is wanted; `report` prints its address, and a warning where it is open to the network."""
         if not self.is_wanted:
             yield None
             return
         from linkpose.page import Page
 
         with Page(
-            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay
+            columns, rig, title, host=self.host, port=self.port, on_mark=on_mark, replay=replay,
+            surroundings=surroundings,
         ) as page:  # fmt: skip
             if not is_loopback(self.host):
-                say(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
-            say(f"page: {page.url}")
+                report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
+            report(f"page: {page.url}")
             yield page
+
+    @contextlib.contextmanager
+    def follow(
+        self, board: Board, console: Console, on_mark: Callable[[float], None]
+    ) -> Iterator[Callable[[Measurements], None]]:
+        """A function that takes the board's blocks, runs all filters that can run, and shows the estimates on the page.
+
+        Without --view it does nothing. It raises KeyboardInterrupt once the user has pressed "stop".
+        """
+        if not self.is_wanted:
+            yield lambda _: None
+            return
+        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.precompile import Precompilation
+
+        estimator = Estimator.for_board((), board)
+        with (
+            Precompilation([f.name for f in estimator.filters]) as compiling,
+            self.open(estimator.columns, estimator.rig, board.port, console.report, on_mark=on_mark) as page,
+        ):
+            following = LiveEstimator(estimator, compiling.is_ready)
+
+            def show(block: Measurements) -> None:
+                _, newest = following.process(block)
+                show_newest(page, newest if len(block) else newest[:0], board, estimator, compiling)
+
+            yield show
+
+
+def show_newest(
+    page: Page | None, newest: Floats, board: Board, estimator: Estimator, compiling: Precompilation
+) -> None:
+    """Shows the newest row of a live run, which may be empty. Raises KeyboardInterrupt once "stop" was pressed."""
+    from linkpose.page.status import Status
+
+    if page is not None:
+        page.show(newest, lambda: Status(board.health, estimator.found_j2s, compiling.progress))
+        page.raise_if_stopped()
 
 
 def is_loopback(host: str) -> bool:

@@ -24,13 +24,20 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=options.FILE, metavar="FILE.png", help="PNG, SVG or PDF; default: the first file's name."
 )
-@click.option("--filter", "wanted", multiple=True, metavar="NAME", help="Draw this filter only; may be repeated.")
+@click.option(
+    "--filter",
+    "wanted",
+    multiple=True,
+    metavar="NAME",
+    shell_complete=options.complete_filter,
+    help="Draw this filter only; may be repeated.",
+)
 @click.option("--map", "map_file", type=options.FILE, metavar="MAP.yaml", help="Draw this map under a robot's path.")
 @click.option("--beacons", type=options.FILE, metavar="BEACONS.csv", help="Draw these beacons with a robot's path.")
 @options.up
 @options.page
 @options.force
-@click.option("-q", "--quiet", is_flag=True, help="Print no remarks.")
+@options.quiet
 def command(
     files: tuple[Path, ...],
     output: Path | None,
@@ -53,13 +60,15 @@ def command(
     from linkpose import plotting
     from linkpose.cli.live import Console
     from linkpose.evaluation.references import read_any, read_for_picture
+    from linkpose.recording.csvfile import STDOUT
 
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     if has_page:
-        if output or map_file or beacons:
-            raise click.UsageError("--view shows a page; leave out --output, --map and --beacons")
-        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, quiet)
+        if output:
+            raise click.UsageError("--view shows a page; leave out --output")
+        scene = _scene(map_file, beacons)
+        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, scene, quiet)
         return
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force)
@@ -74,7 +83,8 @@ def command(
     for remark in [remark for table in tables for remark in table.remarks] + remarks:
         if not quiet:
             click.echo(printable(remark), err=True)
-    click.echo(output)
+    if output != STDOUT:
+        click.echo(output)
 
 
 def _show_progress(console: Console, path: Path) -> Callable[[float], None]:
@@ -94,10 +104,11 @@ def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
     return Scene(grid, {str(name): place for name, place in places.items()})
 
 
-def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, quiet: bool) -> None:
+def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, scene: Scene | None, quiet: bool) -> None:
     """Plays the first estimate, with the reference if there is one, until Ctrl-C or "stop"."""
     from linkpose.cli.live import Console, ending_well
     from linkpose.page.history import Replay
+    from linkpose.page.scene import Surroundings
     from linkpose.page.tables import rig_of, rows_of
 
     console = Console(quiet, verbose=False)
@@ -106,9 +117,16 @@ def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, qu
     title = "  ".join(table.path.name for table in tables)
     with (
         ending_well(),
-        page_options.open(columns, rig, title, lambda text: click.echo(text, err=True), replay=Replay(values)) as page,
+        page_options.open(
+            columns,
+            rig,
+            title,
+            lambda text: click.echo(text, err=True),
+            replay=Replay(values),
+            surroundings=Surroundings(scene.grid, scene.beacons) if scene is not None else None,
+        ) as page,
     ):
-        console.say("Ctrl-C ends")
+        console.report("Ctrl-C ends")
         with contextlib.suppress(KeyboardInterrupt):
             while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
                 pass

@@ -10,13 +10,13 @@ from typing import Any
 import click
 
 
-def progress(label: str) -> Callable[[Iterable[Any]], Iterable[Any]]:
-    """Passes items on and shows a bar on stderr where that is a terminal."""
-    return functools.partial(_with_bar, label)
+def progress(label: str, quiet: bool = False) -> Callable[[Iterable[Any]], Iterable[Any]]:
+    """Passes items on and shows a bar on stderr where that is a terminal and `quiet` is not set."""
+    return functools.partial(_with_bar, label, not quiet and sys.stderr.isatty())
 
 
-def _with_bar(label: str, items: Iterable[Any]) -> Iterator[Any]:
-    if sys.stderr.isatty():
+def _with_bar(label: str, is_shown: bool, items: Iterable[Any]) -> Iterator[Any]:
+    if is_shown:
         with click.progressbar(list(items), label=label, file=sys.stderr) as bar:
             yield from bar
     else:

@@ -16,7 +16,8 @@ from linkpose.cli.live import Console
 @options.plot("Draw the errors of all variants.")
 @options.force
 @options.as_json
-def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -> None:
+@options.quiet
+def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Compare fixed with range-adaptive R, diagonal with off-diagonal Q and R, and the EKF with the UKF, indoors.
 
     The thesis's own logs and result tables are not public. The drives are simulated on a floor of the same size.
@@ -26,8 +27,8 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
     from linkpose.experiments import indoor
 
     plotting.check_output(plot_path, force)
-    Console(quiet=False, verbose=False).compile(indoor.FILTERS)
-    variants = indoor.compare(seeds, progress("drives"))
+    Console(quiet, verbose=False).compile(indoor.FILTERS)
+    variants = indoor.compare(seeds, progress("drives", quiet))
     rows = [variant.as_row() for variant in variants]
     if json_lines:
         click.echo("\n".join(json.dumps(row) for row in rows))

@@ -21,13 +21,14 @@ if TYPE_CHECKING:
 @options.plot("Draw Figure 2.")
 @options.force
 @options.as_json
-def command(seeds: int, errors: str, plot_path: Path | None, force: bool, json_lines: bool) -> None:
+@options.quiet
+def command(seeds: int, errors: str, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Run Methods A to D and joint-inertial on Tests 1 to 3, and compare with the paper's Tables 1 and 2."""
     from linkpose import plotting
     from linkpose.experiments.link import METHODS, reproduce, traces
 
     plotting.check_output(plot_path, force)
-    Console(quiet=False, verbose=False).compile(METHODS)
+    Console(quiet, verbose=False).compile(METHODS)
     entries = [entry for test in (1, 2, 3) for entry in reproduce(test, seeds, errors)]
     if json_lines:
         for entry in entries:

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 @options.plot("Draw Figures 2 and 3.")
 @options.force
 @options.as_json
-def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -> None:
+@options.quiet
+def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Compare two and three optical mice with one.
 
     The robot drives at (1, 1) cm/s, and each mouse's velocity has an error within ±0.25 cm/s, as in the paper.
@@ -30,7 +31,7 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
     from linkpose.experiments.mice import paper_run, redundancy
 
     plotting.check_output(plot_path, force)
-    Console(quiet=False, verbose=False).compile(["mice"])
+    Console(quiet, verbose=False).compile(["mice"])
     rows = [row for mice in (2, 3) for row in redundancy(mice, seeds)]
     if json_lines:
         for row in rows:

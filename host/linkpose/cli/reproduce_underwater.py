@@ -16,7 +16,8 @@ from linkpose.cli.live import Console
 @options.plot("Draw the errors of all variants.")
 @options.force
 @options.as_json
-def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -> None:
+@options.quiet
+def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Check the simulator of Tables 2.2 to 2.9, and compare the EKF with the UKF on its measurements.
 
     Synchronous and asynchronous sensors, with and without a common error of the ranges, outliers and gate. The
@@ -27,9 +28,9 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool) -
     from linkpose.experiments import underwater
 
     plotting.check_output(plot_path, force)
-    Console(quiet=False, verbose=False).compile(underwater.FILTERS)
+    Console(quiet, verbose=False).compile(underwater.FILTERS)
     checks = underwater.check_simulator(seeds)
-    cases = underwater.compare(seeds, progress("dives"))
+    cases = underwater.compare(seeds, progress("dives", quiet))
     rows = [row for case in cases for row in case.rows()]
     if json_lines:
         click.echo("\n".join(json.dumps(row) for row in [*checks, *rows]))

@@ -30,7 +30,7 @@ from linkpose.cli import options
     help="Share of beams that end at an obstacle that the map lacks.",
 )
 @options.force
-@options.next_and_quiet
+@options.quiet
 def command(
     output: Path,
     truth: Path,

@@ -28,7 +28,7 @@ from linkpose.sensors.rig import Rig, Vector
 @click.option("--imu2", is_flag=True, help="Add a second inertial sensor, half-way between the joint and the first.")
 @click.option("--mag", is_flag=True, help="Add a magnetometer.")
 @options.force
-@options.next_and_quiet
+@options.quiet
 def command(
     output: Path,
     truth: Path,

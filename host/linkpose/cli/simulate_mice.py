@@ -47,7 +47,7 @@ from linkpose.sensors.devices import MAX_MICE
     help="Slip, lift or unplug a mouse for some seconds, for example lift:2:5-8; may be repeated.",
 )
 @options.force
-@options.next_and_quiet
+@options.quiet
 def command(
     output: Path,
     truth: Path,

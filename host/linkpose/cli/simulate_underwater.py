@@ -43,7 +43,7 @@ NON_NEGATIVE = options.FiniteRange(min=0)
 )
 @options.force
 @options.as_json
-@options.next_and_quiet
+@options.quiet
 def command(
     output: Path,
     truth: Path,

@@ -1,12 +1,16 @@
-"""The live view on a terminal: the best estimate with its σ, its curve over the last seconds, and the other filters."""
+"""The live view on a terminal: the best estimate with its σ, its curve over the last seconds, and the other filters.
+
+`Screen` renders text of a given size and needs no terminal; `View` puts it on one.
+"""
 
 from __future__ import annotations
 
 import math
+import textwrap
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -25,9 +29,11 @@ from linkpose.presentation import (
     std_text,
     with_std,
 )
+from linkpose.quantities import Quantity
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
+    from rich.live import Live
     from rich.text import Text
 
 REDRAW_INTERVAL_S = 0.1
@@ -42,37 +48,46 @@ LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the s
 class View:
     """The live view on stderr. If stderr is not a terminal it shows nothing, and imports nothing to show it with."""
 
-    def __init__(self, columns: Sequence[str], is_shown: bool, title: str) -> None:
-        """`title` names the port and the settings worth a glance, such as J2S."""
+    def __init__(self, columns: Sequence[str], is_shown: bool, title: str, keys: str = "") -> None:
+        """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys."""
         self._rows = RowReader(columns)
-        self._screen = Screen(title, self._rows.filters)
-        self._live: Any = None
+        self._screen = Screen(title, self._rows.filters, keys)
+        self._live: Live | None = None
+        self._size: tuple[int, int] = (0, 0)
         self._drawn_at = -math.inf
         if is_shown:
-            from rich.console import Console
-            from rich.live import Live
+            self._start()
 
-            # Results go to stdout untouched: rich must not take it for its own.
-            self._live = Live(
-                console=Console(stderr=True), auto_refresh=False, transient=True,
-                redirect_stdout=False, redirect_stderr=False,
-            )  # fmt: skip
-            self._live.start()
+    def _start(self) -> None:
+        from rich.console import Console
+        from rich.live import Live
+
+        # Results go to stdout untouched: rich must not redirect it.
+        self._live = Live(
+            console=Console(stderr=True), auto_refresh=False, transient=True, redirect_stdout=False,
+            redirect_stderr=False,
+        )  # fmt: skip
+        self._size = self._live.console.size
+        self._live.start()
 
     @property
     def is_shown(self) -> bool:
         """Whether the view is on the screen."""
         return self._live is not None
 
-    def say(self, text: str) -> None:
+    def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""
         if self._live is None:
             click.echo(text, err=True)
         else:
             self._live.console.print(text, markup=False, highlight=False)
 
+    def next_filter(self) -> None:
+        """Shows the next filter: the best one, then each of the others."""
+        self._screen.next_filter()
+
     def show(self, estimates: Floats, health: Callable[[], Health], status: str = "") -> None:
-        """Takes the newest row of estimates (columns,), and redraws a few times a second.
+        """Adds the newest row of estimates (columns,), and redraws a few times a second.
 
         `status` is a line on what is not ready yet, such as filters that are being compiled.
         """
@@ -87,11 +102,19 @@ class View:
         if self._live is None or now - self._drawn_at < REDRAW_INTERVAL_S:
             return
         self._drawn_at = now
-        console = self._live.console
-        self._live.update(self._screen.render(health(), console.width, console.height, status), refresh=True)
+        if self._live.console.size != self._size:
+            self._restart()
+        self._live.update(self._screen.render(health(), *self._size, status), refresh=True)
+
+    def _restart(self) -> None:
+        """Clears a terminal that was resized: it wrapped lines of the view, and rich would erase too few of them."""
+        if self._live is not None:
+            self._live.stop()
+            self._live.console.clear()
+            self._start()
 
     def close(self) -> None:
-        """Takes the view off the screen."""
+        """Removes the view from the screen."""
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -104,28 +127,55 @@ class View:
 
 
 class Screen:
-    """What the view shows, as text of a given size: no terminal is needed to test it."""
+    """The content of the view, as text of a given size."""
 
-    def __init__(self, title: str, filters: Sequence[str]) -> None:
-        self._title, self._filters = title, list(filters)
+    def __init__(self, title: str, filters: Sequence[str], keys: str = "") -> None:
+        self._title, self._filters, self._keys = title, list(filters), keys
         self._time_s = 0.0
         self._row: Row = {}
-        self._heights: deque[tuple[float, float]] = deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1)
-        self._path: list[tuple[float, float]] = []
+        self._chosen: str | None = None  # None: the best filter
+        # By filter; None is the best one at each instant.
+        self._heights: dict[str | None, deque[tuple[float, float]]] = {}
+        self._paths: dict[str | None, list[tuple[float, float]]] = {}
         self._exclusions = Exclusions()
 
+    def next_filter(self) -> None:
+        """Chooses the next filter to show: the best one, then each of the others."""
+        choices = [None, *self._filters]
+        self._chosen = choices[(choices.index(self._chosen) + 1) % len(choices)]
+
     def add(self, time_s: float, row: Row) -> None:
-        """Takes a row of estimates."""
+        """Adds a row of estimates."""
         self._time_s, self._row = time_s, row
-        link = best_filter(self._row, self._filters, quantities.HEIGHT)
-        robot = best_filter(self._row, self._filters, quantities.X)
-        if link is not None and (not self._heights or time_s - self._heights[-1][0] >= POINT_INTERVAL_S):
-            self._heights.append((time_s, row[link][quantities.HEIGHT][0]))
-        if robot is not None and quantities.HEADING in row[robot]:
-            self._path.append((row[robot][quantities.X][0], row[robot][quantities.Y][0]))
-            if len(self._path) > PATH_POINTS:
-                self._path = self._path[::2]
+        for name, values in [(None, self._best(quantities.HEIGHT)), *row.items()]:
+            if quantities.HEIGHT in values:
+                self._add_height(name, time_s, values[quantities.HEIGHT][0])
+        for name, values in [(None, self._best(quantities.HEADING)), *row.items()]:
+            if quantities.HEADING in values and quantities.X in values and quantities.Y in values:
+                self._add_place(name, values[quantities.X][0], values[quantities.Y][0])
         self._exclusions.follow(time_s, row)
+
+    def _best(self, quantity: Quantity) -> Mapping[Quantity, tuple[float, float]]:
+        name = best_filter(self._row, self._filters, quantity)
+        return {} if name is None else self._row[name]
+
+    def _add_height(self, name: str | None, time_s: float, height_m: float) -> None:
+        points = self._heights.setdefault(name, deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1))
+        # A stamp lies a little before or after its tick: some slack keeps the points evenly spaced.
+        if not points or time_s - points[-1][0] >= 0.9 * POINT_INTERVAL_S:
+            points.append((time_s, height_m))
+
+    def _add_place(self, name: str | None, x_m: float, y_m: float) -> None:
+        path = self._paths.setdefault(name, [])
+        path.append((x_m, y_m))
+        if len(path) > PATH_POINTS:
+            del path[::2]
+
+    def _shown(self, quantity: Quantity) -> str | None:
+        """The filter whose value of this quantity is shown: the chosen one if it has it, otherwise the best one."""
+        if self._chosen is not None and quantity in self._row.get(self._chosen, {}):
+            return self._chosen
+        return best_filter(self._row, self._filters, quantity)
 
     def render(self, health: Health, width: int, height: int, status: str = "") -> Text:
         """The screen in at most `width` × `height` characters. Faults and exclusions are never cut."""
@@ -148,47 +198,64 @@ class Screen:
 
     def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
         """(priority, [(line, style), …]) from top to bottom."""
-        faults = [(line[:width], "bold red") for line in fault_lines(health)]
-        faults += [(line, "bold red") for line in self._exclusions.lines()]
+        faults = [(part, "bold red") for line in fault_lines(health) for part in textwrap.wrap(line, width)]
+        faults += [(part, "bold red") for line in self._exclusions.lines() for part in textwrap.wrap(line, width)]
         sections = [(9, [(self._head(health, width), "bold")]), (10, faults)]
-        link = best_filter(self._row, self._filters, quantities.HEIGHT)
-        robot = best_filter(self._row, self._filters, quantities.HEADING)
+        link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
         if link is not None:
-            times, values = [time for time, _ in self._heights], [value for _, value in self._heights]
-            lines = curve(times, values, CURVE_S, width, CURVE_ROWS, LEAST_HEIGHT_M)
-            sections += [
-                (8, [(self._headline(link), "")]),
-                (7, [(line, "cyan") for line in lines]),
-                (5, self._height_table(link, width)),
-            ]
+            sections += self._link_sections(link, width)
         if robot is not None:
-            xs, ys = [x for x, _ in self._path], [y for _, y in self._path]
-            lines = path_map(xs, ys, min(width, 60), MAP_ROWS)
-            sections += [(8, [("   ".join(pose_text(self._row[robot])), "")]), (6, [(line, "cyan") for line in lines])]
-            sections += [(4, self._pose_table())]
-        if status:
-            sections.append((9, [(status, "yellow")]))
+            sections += self._robot_sections(robot, width)
+        chain = self._shown(quantities.ANGLE)
+        if chain is not None:
+            sections.append((8, [(self._chain_line(chain), "")]))
+        sections += [(9, [(status, "yellow")] if status else []), (1, [(self._keys, "dim")] if self._keys else [])]
         return [section for section in sections if section[1]]
 
-    def _head(self, health: Health, width: int) -> str:
-        sensors = " ".join(
-            f"{name.upper()} {of['state'] if of['state'] != 'ok' else 'ok'}"
-            for name, of in health.sensors.items()
-            if of.get("state") != "absent"
-        )
-        right = f"{self._time_s:.1f} s  {health.rate_hz:.0f} Hz  {health.lost} lost"
-        parts = [f"linkpose  {self._title}", right, sensors]
-        line = "  ".join(filter(None, parts))
-        if len(line) > width:  # the title is the slowest to change
-            line = "  ".join(filter(None, parts[1:]))
-        return line
+    def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
+        points = self._heights.get(name if name == self._chosen else None, ())
+        times, values = [time for time, _ in points], [value for _, value in points]
+        lines = curve(times, values, CURVE_S, width, CURVE_ROWS, LEAST_HEIGHT_M)
+        table = (5, self._height_table(name, width))
+        return [(8, [(self._headline(name, width), "")]), (7, [(line, "cyan") for line in lines]), table]
 
-    def _headline(self, name: str) -> str:
+    def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
+        path = self._paths.get(name if name == self._chosen else None, ())
+        lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
+        head = (8, [("   ".join(pose_text(self._row[name])), "")])
+        return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
+
+    def _chain_line(self, name: str) -> str:
+        values = self._row[name]
+        parts = [f"joint angle {signed_angle(values[quantities.ANGLE][0])}"]
+        for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
+            if quantity in values:
+                parts.append(f"height {number} {with_std(*values[quantity], 'm', 3)}")
+        return "   ".join(parts)
+
+    def _head(self, health: Health, width: int) -> str:
+        """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
+        sensors = " ".join(
+            f"{name.upper()} {of['state']}" for name, of in health.sensors.items() if of.get("state") != "absent"
+        )
+        lost = f"{health.lost} lost"
+        parts = [f"linkpose  {self._title}", f"{self._time_s:.1f} s", f"{health.rate_hz:.0f} Hz", lost, sensors]
+        for slow in (parts[0], parts[2], parts[1]):  # the slowest to change goes first
+            if len("  ".join(filter(None, parts))) > width:
+                parts.remove(slow)
+        return "  ".join(filter(None, parts))
+
+    def _headline(self, name: str, width: int) -> str:
+        """Height, roll, pitch and yaw; narrow screens drop the last ones."""
         values = self._row[name]
         parts = [f"HEIGHT over joint   {with_std(*values[quantities.HEIGHT], 'm', 4)}"]
         for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
             if quantity in values:
                 parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
+        while len(parts) > 1 and len("   ".join(parts)) > width:
+            parts.pop()
+        if len(parts[0]) > width:
+            parts[0] = f"HEIGHT {with_std(*values[quantities.HEIGHT], 'm', 4)}"
         return "   ".join(parts)
 
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
@@ -206,7 +273,7 @@ class Screen:
             lines.append((line, "bold" if name == best else ""))
         return lines
 
-    def _pose_table(self) -> list[tuple[str, str]]:
+    def _pose_table(self, shown: str) -> list[tuple[str, str]]:
         rows = [(name, self._row[name]) for name in self._filters if quantities.HEADING in self._row.get(name, {})]
         if len(rows) < 2:
             return []
@@ -214,7 +281,8 @@ class Screen:
         for name, values in rows:
             x, y, heading = (values[q][0] for q in (quantities.X, quantities.Y, quantities.HEADING))
             angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
-            lines.append((f"  {name:<16} {number_text(x, 'm', 3):>9} {number_text(y, 'm', 3):>9} {angle:>9}", ""))
+            line = f"{number_text(x, 'm', 3):>9} {number_text(y, 'm', 3):>9} {angle:>9}"
+            lines.append((f"{'▸' if name == shown else ' '} {name:<16} {line}", "bold" if name == shown else ""))
         return lines
 
 
@@ -242,7 +310,7 @@ class Extremes:
         self._count = dict.fromkeys(self._of, 0)
 
     def add(self, estimates: Floats) -> None:
-        """Takes a block of estimates (N, columns)."""
+        """Adds a block of estimates (N, columns)."""
         import numpy as np
 
         for name, (value_at, std_at) in self._of.items():
@@ -256,7 +324,7 @@ class Extremes:
                 self._count[name] += int(known.sum())
 
     def summary(self) -> dict[str, tuple[float, float, float]]:
-        """Filter -> (lowest, highest, RMS of σ), of filters that knew a height."""
+        """Filter -> (lowest, highest, RMS of σ), of filters that estimated a height."""
         return {
             name: (
                 low,

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.recording.table import LONGEST_HOLE
 from linkpose.sensors.measurements import Floats
 
-# A reference is interpolated over at most so many of its usual intervals; a longer hole is a gap.
-LONGEST_HOLE = 3.5
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
 _CLEARLY_BETTER = 0.7
 _SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter

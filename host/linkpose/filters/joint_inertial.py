@@ -173,7 +173,7 @@ class JointInertialFilter:
         """Estimates at each of the N samples: (N, 9) in the order of `columns`; NaN where not known yet."""
         n = len(block)
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = [np.recarray(n, ESTIMATE) for _ in self._states]
+        estimates = [np.empty(n, ESTIMATE) for _ in self._states]
         for states, estimate in zip(self._states, estimates, strict=True):
             process(
                 block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,

@@ -88,11 +88,11 @@ class TiltInertialFilter:
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.recarray(len(block), ESTIMATE)
+        estimates = np.empty(len(block), ESTIMATE)
         process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
             self._imu, self._record, self._states, estimates,
         )  # fmt: skip
         if not self._has_height:
-            estimates.height = estimates.height_std = np.nan
-        return np.column_stack([estimates.height, estimates.height_std, *roll_pitch_deg(estimates.tilt)])
+            estimates["height"] = estimates["height_std"] = np.nan
+        return np.column_stack([estimates["height"], estimates["height_std"], *roll_pitch_deg(estimates["tilt"])])

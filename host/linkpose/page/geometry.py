@@ -56,13 +56,20 @@ def cone() -> tuple[Floats, NDArray[np.uint32]]:
 
 
 def polyline(points: Floats) -> Floats:
-    """Points (N, 3) of a path as segments (N − 1, 2, 3); segments with an unknown end are left out."""
+    """Points (N, 3) of a path as segments (M, 2, 3). A point that is not finite is a gap: no segment crosses it."""
     segments = np.stack([points[:-1], points[1:]], axis=1)
     return segments[np.isfinite(segments).all(axis=(1, 2))]
 
 
-def ellipse(x: float, y: float, std_x: float, std_y: float, z: float) -> Floats:
-    """±2σ in x and in y about a place (m), as segments (N, 2, 3) at height z."""
+def ellipse(place: Floats, z: float) -> Floats:
+    """The ellipse of 2σ about a place, as segments (N, 2, 3) at height z (m).
+
+    `place` is x, y, any, σ of x and of y (m), covariance of x and y (m²).
+    """
+    x, y, _, std_x, std_y, covariance = place[:6].tolist()
+    matrix = np.array([[std_x**2, covariance], [covariance, std_y**2]])
+    variances, axes = np.linalg.eigh(matrix)
     angles = np.linspace(0.0, 2 * np.pi, _SEGMENTS + 1)
-    points = [x + 2 * std_x * np.cos(angles), y + 2 * std_y * np.sin(angles), np.full(_SEGMENTS + 1, z)]
-    return polyline(np.column_stack(points))
+    circle = np.stack([np.cos(angles), np.sin(angles)])
+    points = 2.0 * axes @ (np.sqrt(np.maximum(variances, 0.0))[:, np.newaxis] * circle)
+    return polyline(np.column_stack([x + points[0], y + points[1], np.full(_SEGMENTS + 1, z)]))

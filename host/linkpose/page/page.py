@@ -15,9 +15,10 @@ import numpy as np
 from linkpose import quantities
 from linkpose.errors import LinkposeError
 from linkpose.page.history import History, Replay
+from linkpose.page.origin import own_requests_only
 from linkpose.page.status import Status
 from linkpose.presentation import Exclusions, RowReader, best_filter, fault_lines, working_sensors
-from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, X, Y
+from linkpose.quantities import ANGLE, EXCLUDED, HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -25,12 +26,14 @@ if TYPE_CHECKING:
     import viser
 
     from linkpose.estimation import FoundJ2s
+    from linkpose.page.scene import Surroundings
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
 UPDATE_INTERVAL_S = 0.05  # between two updates of the page: motion looks smooth at 20 Hz
-CHART_INTERVAL = 5  # updates between two of the charts, which are the largest messages
+CHART_INTERVAL = 8  # updates between two of the charts, which are the largest messages
 STATUS_INTERVAL = 10  # blocks between two looks at the health, which counts over all sensors
+J2S_GOAL_M = 0.03  # 1σ in the worst direction from which on the guide asks for no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
 _PORTS_TRIED = 100
 
@@ -52,6 +55,7 @@ class Page:
         port: int | None = None,
         on_mark: Callable[[float], None] | None = None,
         replay: Replay | None = None,
+        surroundings: Surroundings | None = None,
     ) -> None:
         """Starts the server.
 
@@ -63,6 +67,7 @@ class Page:
             port: TCP port; None: the first free one from 8080.
             on_mark: called with the time (s) of the newest row when the user presses "mark".
             replay: rows of a file to play, instead of `show`.
+            surroundings: map and beacons around a robot.
 
         Raises LinkposeError where the address cannot be used, or the port is taken.
         """
@@ -81,7 +86,14 @@ class Page:
         self._closing = threading.Event()
         self._server = _serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self._build(rig)
+        self._of_filter = quantities.by_filter(self._columns)
+        self._reference_at = [
+            (part.quantity, at)
+            for column, at in self._at.items()
+            if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
+        ]
+        self._follows_mice = any(EXCLUDED in of for of in self._of_filter.values())
+        self._build(rig, surroundings)
         self._updates = 0
         self._clients: set[int] = set()
         self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
@@ -117,17 +129,19 @@ class Page:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _build(self, rig: Rig) -> None:
+    def _build(self, rig: Rig, surroundings: Surroundings | None) -> None:
         from linkpose.page.panel import Panel
-        from linkpose.page.scene import LinkScene, RobotScene
+        from linkpose.page.scene import ChainScene, LinkScene, RobotScene
 
-        server, filters = self._server, quantities.by_filter(self._columns).values()
+        server, filters = self._server, self._of_filter.values()
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._panel = Panel(server, self._columns, self._changed.set)
-        self._scene: LinkScene | RobotScene
-        if any(HEADING in of for of in filters) and not any(HEIGHT in of for of in filters):
-            self._scene = RobotScene(server)
+        self._scene: LinkScene | RobotScene | ChainScene
+        if any(QW in of for of in filters):
+            self._scene = ChainScene(server)
+        elif any(HEADING in of for of in filters) and not any(HEIGHT in of for of in filters):
+            self._scene = RobotScene(server, surroundings)
         else:
             j2s = rig.joint.known_j2s_m
             self._scene = LinkScene(server, None if j2s is None else np.array(j2s))
@@ -183,7 +197,8 @@ class Page:
         while self._queue and isinstance(self._history, History):
             for row in self._queue.popleft():
                 self._history.add(row)
-                self._exclusions.follow(float(row[0]), self._rows.read(row.tolist()))
+                if self._follows_mice:
+                    self._exclusions.follow(float(row[0]), self._rows.read(row.tolist()))
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -218,7 +233,7 @@ class Page:
             self._panel.draw_charts(self._history.window(), name)
 
     def _best(self, row: Any) -> str | None:
-        for quantity in (HEIGHT, HEADING, ROLL):
+        for quantity in (HEIGHT, HEADING, ROLL, ANGLE, QW):
             name = best_filter(row, self._rows.filters, quantity)
             if name is not None:
                 return name
@@ -231,7 +246,7 @@ class Page:
         if health is not None:
             words.append(f"{health.rate_hz:.0f} Hz   {health.lost} lost")
         if status.j2s is not None:
-            words.append(_j2s_text(status.j2s))
+            words.append(j2s_text(status.j2s))
         if self._marks:
             words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")
         if status.line:
@@ -241,31 +256,30 @@ class Page:
         self._panel.draw_health(self._title, "   ".join(words), working, faults + self._exclusions.lines())
 
     def _reference(self, newest: Floats) -> dict[Quantity, float]:
-        found = ((column, quantities.split(column)) for column in self._columns)
-        return {
-            part.quantity: float(newest[self._at[column]])
-            for column, part in found
-            if part is not None and not part.prefix and not part.is_std
-        }
+        return {quantity: float(newest[at]) for quantity, at in self._reference_at}
 
     def _path(self, name: str) -> Floats | None:
-        """x, y, heading, σ of x and of y (N, 5) along the path of the filter."""
-        of = quantities.by_filter(self._columns).get(name, {})
+        """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path."""
+        of = self._of_filter.get(name, {})
         if not {X, Y, HEADING} <= of.keys():
             return None
         rows = self._history.path()
-        std = [self._at.get(quantities.std_column(of[q]) or "") for q in (X, Y)]
-        columns = [rows[:, self._at[of[q]]] for q in (X, Y, HEADING)]
-        columns += [rows[:, at] if at is not None else np.full(len(rows), math.nan) for at in std]
-        return np.column_stack(columns)
+        names = [of[X], of[Y], of[HEADING], quantities.std_column(of[X]), quantities.std_column(of[Y])]
+        names += [quantities.covariance_column(name, X, Y), X.column, Y.column]
+        unknown = np.full(len(rows), math.nan)
+        path = np.column_stack([rows[:, self._at[n]] if n in self._at else unknown for n in names])
+        path[:, 5] = np.nan_to_num(path[:, 5])  # without its column: the axes of the ellipse are those of the map
+        return path
 
 
-def _j2s_text(found: FoundJ2s) -> str:
-    """J2S as found so far, and in which direction the motion has not shown it yet."""
+def j2s_text(found: FoundJ2s) -> str:
+    """J2S as estimated so far, and the motion that is missing to estimate it better."""
     length = float(np.linalg.norm(found.mean_m))
     text = f"J2S {length:.3f} m ±{1e3 * found.worst_std_m:.0f} mm"
-    if found.worst_std_m > 0.03:
-        text += f": not known along the sensor's {found.worst_axis} axis yet, swing the link in other directions"
+    if found.worst_std_m > J2S_GOAL_M:
+        # A rotation about an axis moves the sensor only across that axis, so it leaves J2S along the axis unknown.
+        others = " or ".join(axis for axis in "xyz" if axis != found.worst_axis)
+        text += f"; not excited yet: J2S along the sensor's {found.worst_axis} axis. Turn the link about {others}."
     return text
 
 
@@ -294,9 +308,7 @@ def _try_to_bind(host: str, port: int) -> None:
 
 def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
     """The server. It prints nothing: stdout is for results."""
-    if (
-        is_named
-    ):  # viser itself would take the next free port, and never return for an address that is not this machine's
+    if is_named:  # viser itself would take the next free port, and wait forever for an address of another machine
         try:
             _try_to_bind(host, port)
         except OSError as reason:
@@ -311,4 +323,5 @@ def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
             return None
 
     rich.reconfigure(quiet=True)  # the global console, with which viser prints; linkpose has its own
-    return Server(host, port, label="linkpose", verbose=False)
+    with own_requests_only(host):  # returns when the server listens
+        return Server(host, port, label="linkpose", verbose=False)

@@ -5,17 +5,33 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from linkpose import quantities
 from linkpose.presentation import Row, pose_text, signed_angle, with_std
-from linkpose.quantities import HEADING, HEIGHT, PITCH, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import (
+    ANGLE,
+    CHAIN_ROTATION,
+    HEADING,
+    HEIGHT,
+    HEIGHT1,
+    HEIGHT2,
+    PITCH,
+    QW,
+    ROLL,
+    YAW,
+    Quantity,
+    X,
+    Y,
+)
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     import viser
+
+Nullable = list[float | None]
 
 BEST = "best"  # the choice that follows the best filter
 _BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
@@ -36,6 +52,8 @@ class Panel:
         self._headline = gui.add_html("")
         able = {quantity for of in self._of_filter.values() for quantity in of}
         wanted = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
+        if {ANGLE, QW} & able:
+            wanted = (ANGLE, HEIGHT1, HEIGHT2)
         shown = [quantity for quantity in wanted if quantity in able]
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
@@ -82,21 +100,29 @@ class Panel:
             column = self._of_filter.get(name, {}).get(quantity)
             chart.visible = column is not None
             if column is not None:
-                chart.data = self._chart_data(window, quantity, column)
+                self._send(chart, self._chart_data(window, quantity, column))
 
-    def _chart_data(self, window: Floats, quantity: Quantity, column: str) -> tuple[Floats, ...]:
+    @staticmethod
+    def _send(chart: viser.GuiUplotHandle, data: tuple[Nullable, ...]) -> None:
+        """Gives a chart its data. viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null."""
+        cast(Any, chart._impl.props).data = data
+        chart._queue_update("data", data)
+
+    def _chart_data(self, window: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
+        """Time, value − 2σ, value + 2σ, value, and the reference if there is one, with None in gaps."""
         scale = quantity.value.scale
-        known = window[np.isfinite(window[:, self._columns[column]])]
-        value = known[:, self._columns[column]] * scale
+        rows = with_gap_rows(window)
+        value = rows[:, self._columns[column]] * scale
         if quantity.period is not None:
-            value = np.unwrap(value, period=quantity.period * scale)
+            known = np.isfinite(value)
+            value[known] = np.unwrap(value[known], period=quantity.period * scale)
         std_at = self._columns.get(quantities.std_column(column) or "")
-        std = known[:, std_at] * scale if std_at is not None else np.zeros(len(known))
+        std = rows[:, std_at] * scale if std_at is not None else np.zeros(len(rows))
         std = np.where(np.isfinite(std), std, 0.0)
-        data = [known[:, 0], value - 2 * std, value + 2 * std, value]
+        data = [value - 2 * std, value + 2 * std, value]
         if quantity.column in self._columns:
-            data.append(known[:, self._columns[quantity.column]] * scale)
-        return tuple(np.ascontiguousarray(part) for part in data)
+            data.append(rows[:, self._columns[quantity.column]] * scale)
+        return (rows[:, 0].tolist(), *map(_nullable, data))
 
     def draw_health(self, title: str, summary: str, working: Sequence[str], faults: Sequence[str]) -> None:
         """Shows which sensors work, in green, and each fault as a red line."""
@@ -115,6 +141,8 @@ class Panel:
         if HEIGHT in values:
             first, lines = with_std(*values[HEIGHT], "m", 4), [_angles(values)]
             caption = "height over the joint"
+        elif ANGLE in values or QW in values:
+            first, lines, caption = _joint_text(values), [], "joint angle"
         elif HEADING in values:
             first, *lines = pose_text(values)
             caption = "place and heading"
@@ -142,6 +170,31 @@ def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
             bound = f" ±{std:.2g}°" if math.isfinite(value + std) else ""
             parts.append(f"{quantity.name} {signed_angle(value)}{bound}")
     return "   ".join(parts)
+
+
+def _joint_text(values: Mapping[Quantity, tuple[float, float]]) -> str:
+    """The angle of a hinge, or the whole angle of a ball joint's rotation, with its standard deviation."""
+    if ANGLE in values:
+        value, std = values[ANGLE]
+    else:
+        w, *_ = (values[q][0] for q in CHAIN_ROTATION)
+        value, std = math.degrees(2 * math.acos(min(abs(w), 1.0))) if math.isfinite(w) else math.nan, values[QW][1]
+    return signed_angle(value) + (f" ±{std:.2g}°" if math.isfinite(value + std) else "")
+
+
+def with_gap_rows(rows: Floats) -> Floats:
+    """Rows (N, columns) by time, with a row of NaN inside each gap, which is longer than three usual intervals."""
+    if len(rows) < 3:
+        return rows.copy()
+    step = np.diff(rows[:, 0])
+    at = np.flatnonzero(step > 3.0 * np.median(step))
+    between = np.full((len(at), rows.shape[1]), np.nan)
+    between[:, 0] = 0.5 * (rows[at, 0] + rows[at + 1, 0])
+    return np.insert(rows, at + 1, between, axis=0)
+
+
+def _nullable(values: Floats) -> Nullable:
+    return [value if value == value else None for value in values.tolist()]
 
 
 def _pill(text: str, colour: str) -> str:

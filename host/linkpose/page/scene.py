@@ -1,25 +1,30 @@
-"""The scene of the page: a link on its joint with the uncertainty of its attitude, or a robot with its path."""
+"""The scenes of the page: a link on its joint, a robot with its path and surroundings, two links of a chain."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from linkpose.page import geometry
 from linkpose.presentation import Row
-from linkpose.quantities import HEADING, PITCH, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import CHAIN_ROTATION, HEADING, PITCH, ROLL, YAW, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     import viser
+
+    from linkpose.localization.grid import GridMap
 
 Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)
 _ELLIPSES = 12  # along a path
 _PATH_INTERVAL = 10  # redraws of the scene between two of the path, which is larger
+_LINK_M = 0.5  # length of each link of a chain, as drawn
 _FLOOR_M = 0.002  # of lines over the ground, so that the ground does not hide parts of them
 
 
@@ -27,11 +32,22 @@ class Scene(Protocol):
     """What the page draws in 3-D."""
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
-        """Draws the newest row as the filter `name` sees it; `path` (N, 5) is x, y, heading and σ of x and of y (m)."""
+        """Draws the newest row as the filter `name` estimates it.
+
+        `path` (N, 8) is x, y, heading, σ of x and of y (m), the covariance of x and y (m²), x and y of the reference.
+        """
 
     @property
     def is_path_due(self) -> bool:
         """Whether the next `draw` draws a path, if it gets one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What stands around a robot, in its map's frame."""
+
+    grid: GridMap | None = None
+    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m), perhaps z
 
 
 class LinkScene:
@@ -103,17 +119,20 @@ class LinkScene:
 
 
 class RobotScene:
-    """A robot in the plane: ground, pose, path, and ±2σ ellipses along it."""
+    """A robot in the plane: ground, map, beacons, pose, path, ±2σ ellipses along it, and the reference's path."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
         self._scene = server.scene
         _ground(self._scene, 20.0)
         self._robot = self._scene.add_frame("/robot", axes_length=0.25, axes_radius=0.008, visible=False)
         self._scene.add_box("/robot/body", _ORANGE, (0.24, 0.18, 0.06), position=(0.0, 0.0, 0.03))
         self._scene.add_box("/robot/front", _BLACK, (0.03, 0.18, 0.062), position=(0.105, 0.0, 0.031))
         self._draws = 0
-        server.initial_camera.position = (1.0, -3.5, 4.0)
-        server.initial_camera.look_at = (1.0, 0.0, 0.0)
+        centre, size = np.array([1.0, 0.0]), 4.0
+        if surroundings is not None:
+            centre, size = self._draw_surroundings(surroundings, centre, size)
+        server.initial_camera.position = (centre[0], centre[1] - 0.9 * size, size)
+        server.initial_camera.look_at = (centre[0], centre[1], 0.0)
 
     @property
     def is_path_due(self) -> bool:
@@ -130,22 +149,86 @@ class RobotScene:
         if path is not None:
             self._draw_path(path)
 
+    def _draw_surroundings(self, around: Surroundings, centre: Floats, size: float) -> tuple[Floats, float]:
+        """Draws map and beacons. Returns the centre (2,) and the size (m) of what there is."""
+        for name, place in around.beacons.items():
+            height = place[2] if len(place) > 2 else 0.0
+            self._scene.add_icosphere(f"/beacon/{name}", 0.15, _ORANGE, position=(place[0], place[1], height))
+            self._scene.add_label(f"/beacon/{name}/label", name)
+        corners = [np.array(place[:2]) for place in around.beacons.values()]
+        if around.grid is not None:
+            _, left, low, turn = around.grid.geometry.tolist()
+            wide, high = around.grid.size_m
+            across = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+            middle = np.array([left, low]) + across @ np.array([wide, high]) / 2
+            # viser puts the first row of an image at its lowest y, as the map has it.
+            wxyz = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+            image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
+            self._scene.add_image(
+                "/map",
+                np.repeat(image, 3, axis=2),
+                wide,
+                high,
+                wxyz=wxyz,
+                position=(middle[0], middle[1], _FLOOR_M / 2),
+            )
+            corners += [
+                np.array([left, low]) + across @ np.array(c) for c in ((0, 0), (wide, 0), (0, high), (wide, high))
+            ]
+        if not corners:
+            return centre, size
+        low_corner, high_corner = np.min(corners, axis=0), np.max(corners, axis=0)
+        return (low_corner + high_corner) / 2, max(float(np.max(high_corner - low_corner)), 1.0)
+
     def _draw_path(self, path: Floats) -> None:
-        known = path[np.isfinite(path[:, :2]).all(axis=1)]
-        if len(known) < 2:
-            return
-        points = np.column_stack([known[:, :2], np.full(len(known), _FLOOR_M)])
-        self._lines("/path", geometry.polyline(points), _BLUE, 3.0)
-        at = np.linspace(0, len(known) - 1, _ELLIPSES).astype(int)
-        places = [p for p in known[at] if np.isfinite(p[3:]).all()]
-        if places:
-            rings = [geometry.ellipse(p[0], p[1], p[3], p[4], 2 * _FLOOR_M) for p in places]
-            self._lines("/ellipses", np.concatenate(rings), _GREY, 1.5)
+        for name, columns, colour, width in (("/path", [0, 1], _BLUE, 3.0), ("/reference", [6, 7], _BLACK, 1.5)):
+            points = np.column_stack([path[:, columns], np.full(len(path), _FLOOR_M)])
+            self._lines(name, geometry.polyline(points), colour, width)
+        known = path[np.isfinite(path[:, [0, 1, 3, 4]]).all(axis=1)]
+        if len(known):
+            at = np.linspace(0, len(known) - 1, min(_ELLIPSES, len(known))).astype(int)
+            self._lines(
+                "/ellipses",
+                np.concatenate([geometry.ellipse(known[i], 2 * _FLOOR_M) for i in at]),
+                _GREY,
+                1.5,
+            )
 
     def _lines(self, name: str, segments: Floats, colour: Colour, width: float) -> None:
         if len(segments):
             points = segments.astype(np.float32)
             self._scene.add_line_segments(name, points, colour, thickness=width, thickness_units="screen")
+
+
+class ChainScene:
+    """Two links at a joint: link 1 stands upright, link 2 has the estimated rotation relative to it.
+
+    The attitude of link 1 is not among the estimates of a chain, so the scene shows the motion of the joint alone.
+    """
+
+    is_path_due = False
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        scene = server.scene
+        _ground(scene, 2.4)
+        scene.add_icosphere("/joint", 0.035, _BLACK, position=(0.0, 0.0, _LINK_M))
+        self._second = scene.add_frame("/second", show_axes=False, position=(0.0, 0.0, _LINK_M), visible=False)
+        for name, colour, z, sensor_z in (
+            ("/first", _GREY, 0.5 * _LINK_M, 0.5 * _LINK_M),
+            ("/second/link", _BLUE, 0.5 * _LINK_M, 0.7 * _LINK_M),
+        ):
+            scene.add_cylinder(f"{name}/bar", 0.02, _LINK_M, colour, position=(0.0, 0.0, z))
+            scene.add_box(f"{name}/sensor", _ORANGE, (0.08, 0.06, 0.05), position=(0.0, 0.0, sensor_z))
+        scene.add_frame("/second/axes", axes_length=0.2, axes_radius=0.006, position=(0.0, 0.0, _LINK_M))
+        server.initial_camera.position = (1.3, -1.9, 1.3)
+        server.initial_camera.look_at = (0.0, 0.0, 0.6)
+
+    def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
+        values = row.get(name, {})
+        rotation = np.array([values.get(q, (math.nan, math.nan))[0] for q in CHAIN_ROTATION])
+        self._second.visible = is_known = bool(np.isfinite(rotation).all())
+        if is_known:
+            self._second.wxyz = rotation / np.linalg.norm(rotation)
 
 
 def _ground(scene: viser.SceneApi, size_m: float) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.series import Series
 from linkpose.plotting.sources import gather, is_reference
-from linkpose.quantities import HEIGHT, PITCH, ROLL, by_filter, std_column
+from linkpose.quantities import HEIGHT, PITCH, ROLL, X, Y, by_filter, covariance_column, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
@@ -31,8 +31,12 @@ def rows_of(tables: Sequence[Table], wanted: Sequence[str]) -> tuple[list[str], 
             found = [c for c in (column, std_column(column)) if c in table.columns and c not in columns]
             columns += [c for c in found if c is not None]
             values += [table.columns[c] for c in found if c is not None]
+        covariance = covariance_column(name, X, Y)
+        if covariance in table.columns:
+            columns.append(covariance)
+            values.append(table.columns[covariance])
     if sources.reference is not None:
-        for quantity in (HEIGHT, ROLL, PITCH):
+        for quantity in (HEIGHT, ROLL, PITCH, X, Y):
             if sources.reference.has(quantity):
                 shown = sources.reference.values[quantity] / quantity.value.scale
                 columns.append(quantity.column)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import datetime
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linkpose.errors import CannotWrite, FileError, FileExists
+from linkpose.errors import CannotWrite, FileExists, UnknownPicture
+from linkpose.recording.csvfile import STDOUT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".svg", ".pdf")
+DPI = 130
 
-# Okabe and Ito's palette, which colour-blind readers can tell apart: one colour per filter, in every plot.
+# Okabe and Ito's palette, whose colours colour-blind readers can distinguish: one colour per filter, in every plot.
 _BLUE, _PURPLE, _RED, _ORANGE, _GREEN, _SKY = "#0072B2", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#56B4E9"
 _GREY = "#8A8A8A"
 COLOURS = {
@@ -76,10 +79,10 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
 
 def check_output(path: Path | None, force: bool) -> None:
     """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
-    if path is None:
+    if path is None or path == STDOUT:
         return
     if path.suffix.lower() not in FORMATS:
-        raise FileError(path, f"{path} is no picture that linkpose writes; its name must end in {', '.join(FORMATS)}")
+        raise UnknownPicture(path, FORMATS)
     if path.exists() and not force:
         raise FileExists(path)
     if not path.absolute().parent.is_dir():
@@ -87,13 +90,17 @@ def check_output(path: Path | None, force: bool) -> None:
 
 
 def save(figure: Figure, path: Path, force: bool) -> None:
-    """Writes the picture in the format that the file's ending names. Raises FileError as `check_output` does, and
-    where the file cannot be written.
+    """Writes the picture in the format that the file's ending names, to STDOUT as PNG.
+
+    Raises FileError as `check_output` does, and where the file cannot be written.
     """
     check_output(path, force)
+    if path == STDOUT:
+        figure.savefig(sys.stdout.buffer, dpi=DPI, format="png")
+        return
     # Two pictures of the same data are the same file.
     metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}
     try:
-        figure.savefig(path, dpi=130, metadata=metadata.get(path.suffix.lower()))
+        figure.savefig(path, dpi=DPI, metadata=metadata.get(path.suffix.lower()))
     except (OSError, ValueError) as error:
         raise CannotWrite(path, str(error)) from error

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from linkpose.experiments.variants import Variant
 
 _SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
-_WHOLE = 3  # the Test of which Figure 2 shows the whole run
+_WHOLE = 3  # Figure 2 shows the whole run of this Test
 _MICE_SHOWN_S = 4.0
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.evaluation.series import LONGEST_HOLE, interval
+from linkpose.evaluation.series import interval
+from linkpose.recording.table import LONGEST_HOLE
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:

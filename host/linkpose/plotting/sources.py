@@ -14,6 +14,7 @@ from linkpose.evaluation.series import interval
 from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
+from linkpose.presentation import counted
 from linkpose.quantities import Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
@@ -163,12 +164,8 @@ def _describe(table: Table) -> str:
     lost = closing.get("lost")
     if not isinstance(lost, int):
         lost = whole.lost if whole else lost_samples(time_s)
-    words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {_gaps(holes)}")
+    words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {counted(holes, 'gap')}")
     return "   ·   ".join(word for word in words if word)
-
-
-def _gaps(count: int) -> str:
-    return "1 gap" if count == 1 else f"{count} gaps"
 
 
 def _length(seconds: float) -> str:

@@ -15,11 +15,14 @@ import contextlib
 import errno
 import json
 import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
 from linkpose.errors import CannotWrite, FileError, FileExists
+
+STDOUT = Path("-")  # as an output: the standard output
 
 
 def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
@@ -47,10 +50,12 @@ class CsvFile:
         force: bool,
         plain: bool = False,
     ) -> None:
-        """`plain` writes no comment lines and the metadata beside the file."""
-        self.path = path
+        """`plain` writes no comment lines, and the metadata beside the file, or nowhere for STDOUT."""
+        self.path, self._is_plain = path, plain
         self._beside: dict[str, Any] | None = {"kind": kind, "metadata": metadata, "closing": None} if plain else None
-        if plain:
+        if path == STDOUT:
+            self._beside = None
+        elif plain:
             os.close(create(metadata_path(path), force))
         self._fd = create(path, force)
         self._has_name = os.fstat(self._fd).st_nlink > 0  # what is behind /dev/stdout may have none
@@ -68,9 +73,9 @@ class CsvFile:
 
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""
-        if self._beside is None:
+        if not self._is_plain:
             self.write(f"# {json.dumps(closing)}\n")
-        else:
+        elif self._beside is not None:
             self._beside["closing"] = closing
             self._write_beside()
         with contextlib.suppress(OSError):  # a pipe cannot be synced
@@ -99,7 +104,12 @@ class CsvFile:
 
 
 def create(path: Path, force: bool) -> int:
-    """Opens a new file for writing and gives its descriptor. An existing one is kept unless `force`."""
+    """Opens a new file for writing and gives its descriptor. An existing one is kept unless `force`.
+
+    STDOUT gives a duplicate of the standard output's descriptor.
+    """
+    if path == STDOUT:
+        return _standard_output()
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     try:
         if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
@@ -112,6 +122,15 @@ def create(path: Path, force: bool) -> int:
         raise FileExists(path) from None
     except OSError as error:
         raise CannotWrite(path, error.strerror) from error
+
+
+def _standard_output() -> int:
+    """A duplicate of the standard output's descriptor, after what is buffered for it was written."""
+    try:
+        sys.stdout.flush()
+        return os.dup(1)
+    except OSError as error:
+        raise CannotWrite("the standard output", error.strerror) from error
 
 
 def write_all(fd: int, path: Path, data: bytes) -> None:

@@ -21,6 +21,9 @@ from linkpose.recording.parquet import ParquetTable, is_parquet
 from linkpose.recording.textfile import Part, TextTable, metadata_of
 from linkpose.sensors.measurements import Floats
 
+# A step of more than so many usual ones is a gap; a reference is interpolated over no longer hole.
+LONGEST_HOLE = 3.5
+
 
 @dataclass(frozen=True, slots=True)
 class Whole:
@@ -108,6 +111,12 @@ class TableFile:
         """Closes the file."""
         self._source.close()
 
+    def table(self, parts: list[Part], whole: Whole | None = None) -> Table:
+        """These parts of the file as one table."""
+        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in self.names}
+        line = parts[0].first_line
+        return Table(self.path, self.kind, columns, self.metadata, self.closing, line, self.remarks, whole)
+
     def _read_metadata_beside(self) -> None:
         """The kind and the metadata that NAME.meta.json beside NAME.csv holds, if it is there."""
         beside = metadata_path(self.path)
@@ -129,9 +138,7 @@ def read_table(path: Path, kind: str | None = None) -> Table:
     line for whatever else is not a number, a row of another length, or a time that runs backwards.
     """
     with contextlib.closing(TableFile(path, kind)) as file:
-        parts = list(file.parts())
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in file.names}
-        return Table(path, file.kind, columns, file.metadata, file.closing, parts[0].first_line, file.remarks)
+        return file.table(list(file.parts()))
 
 
 def require(path: Path, found: Collection[str], *names: str) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.recording.table import Progress, Table, TableFile, Whole
+from linkpose.recording.table import LONGEST_HOLE, Progress, Table, TableFile, Whole
 from linkpose.recording.textfile import Part
 from linkpose.sensors.measurements import Floats
 
@@ -19,7 +19,6 @@ MOST_ROWS = 500_000  # of a table that is kept whole: 83 min at 100 Hz. Twice of
 # rows is the distance. Twice of it doubles the memory of a plot, and a picture has a few thousand columns of pixels.
 _REGULAR_ROWS = 240_000
 _EXTREME_ROWS = 60_000
-_GAP_STEPS = 3.5  # as plots define a gap
 
 
 def read_thinned(path: Path, progress: Progress | None = None) -> Table:
@@ -37,7 +36,7 @@ def read_thinned(path: Path, progress: Progress | None = None) -> Table:
             rows += len(part)
             if rows > MOST_ROWS:
                 return _thin(file, parts, source)
-        return _table(file, parts, None)
+        return file.table(parts)
 
 
 def _thin(file: TableFile, parts: list[Part], rest: Iterator[Part]) -> Table:
@@ -49,13 +48,7 @@ def _thin(file: TableFile, parts: list[Part], rest: Iterator[Part]) -> Table:
     while parts:
         kept.append(thinner.thin(parts.pop(0)))
     kept += [thinner.thin(part) for part in rest]
-    return _table(file, kept, thinner.whole)
-
-
-def _table(file: TableFile, parts: list[Part], whole: Whole | None) -> Table:
-    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in file.names}
-    line = parts[0].first_line
-    return Table(file.path, file.kind, columns, file.metadata, file.closing, line, file.remarks, whole)
+    return file.table(kept, thinner.whole)
 
 
 class _Thinner:
@@ -91,7 +84,7 @@ class _Thinner:
         if not self._interval_s:
             positive = steps[steps > 0]
             self._interval_s = float(np.median(positive)) if len(positive) else 0.0
-        after = np.flatnonzero(steps > _GAP_STEPS * self._interval_s) if self._interval_s else np.empty(0, np.intp)
+        after = np.flatnonzero(steps > LONGEST_HOLE * self._interval_s) if self._interval_s else np.empty(0, np.intp)
         self._gaps += len(after)
         self._lost += int(np.maximum(1, np.rint(steps[after] / self._interval_s) - 1).sum()) if len(after) else 0
         self._last_s = float(time_s[-1])

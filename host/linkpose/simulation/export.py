@@ -15,6 +15,7 @@ from linkpose.errors import CannotWrite, FileError, FileExists, LinkposeError
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
 from linkpose.localization.maps import save_map
+from linkpose.recording.csvfile import STDOUT
 from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats
@@ -31,10 +32,12 @@ _BLOCK = 50_000  # samples of the truth in memory at once
 
 def check_outputs(paths: Iterable[Path], force: bool) -> None:
     """Raises FileError where two of the files are one, one exists and `force` is not set, or has no folder."""
-    named = [path.absolute() for path in paths]
+    named = [path if path == STDOUT else path.absolute() for path in paths]
     for path in named:
         if named.count(path) > 1:
             raise FileError(path, f"{path} is named for two outputs; name two files")
+        if path == STDOUT:
+            continue
         if path.is_dir():
             raise CannotWrite(path, "it is a folder")
         if path.is_file() and not force:

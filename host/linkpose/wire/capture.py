@@ -181,8 +181,10 @@ def read_capture(file: BinaryIO) -> Iterator[Capture]:
 def decode_capture(data: bytes) -> Capture:
     """All messages from the board in a capture, as `read_capture` finds them."""
     parts = [*read_capture(io.BytesIO(data)), _decode_part(b"", 0, StreamDecoder())]
+    # As bytes: NumPy copies records field by field, which takes as long as decoding them.
+    samples = np.concatenate([part.samples.view(np.uint8) for part in parts]).view(SAMPLE_DTYPE)
     return Capture(
-        np.concatenate([part.samples for part in parts]),
+        samples,
         np.concatenate([part.mouse_count for part in parts]),
         [message for part in parts for message in part.others],
         parts[0].corrupt,

@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.filters.inertial.state import Floats, SensorErrors
 
@@ -36,21 +37,22 @@ def log_odds(first: Floats, second: Floats) -> Floats:
     return np.clip(_LOG_ODDS + _OCCAM * second - first, -_MOST, _MOST)
 
 
-def mix(a: Any, b: Any) -> dict[str, Floats]:
-    """The mean of two filters' estimates (records of ESTIMATE, (N,)) as arrays (N,); `tilt` is (N, 3), not normalised.
+def mix(a: NDArray[Any], b: NDArray[Any]) -> dict[str, Floats]:
+    """The mean of two filters' estimates (arrays (N,) of ESTIMATE) as arrays (N,); `tilt` is (N, 3), not normalised.
 
     A variance includes how far the filters differ. Where one filter has no height, the other's counts alone.
     """
-    share = 1.0 / (1.0 + np.exp(-log_odds(a.distance, b.distance)))
-    lone = np.where(np.isnan(b.height) & ~np.isnan(a.height), 1.0, share)
-    lone = np.where(np.isnan(a.height) & ~np.isnan(b.height), 0.0, lone)
-    found: dict[str, Floats] = {"tilt": a.tilt * share[:, None] + b.tilt * (1.0 - share)[:, None]}
+    share = 1.0 / (1.0 + np.exp(-log_odds(a["distance"], b["distance"])))
+    unknown_a, unknown_b = np.isnan(a["height"]), np.isnan(b["height"])
+    lone = np.where(unknown_b & ~unknown_a, 1.0, share)
+    lone = np.where(unknown_a & ~unknown_b, 0.0, lone)
+    found: dict[str, Floats] = {"tilt": a["tilt"] * share[:, None] + b["tilt"] * (1.0 - share)[:, None]}
     for name in ("height", "x", "y"):
         found[name] = _mixed(lone, a[name], b[name])
-    found["height_std"] = _mixed_std(lone, a.height, a.height_std, b.height, b.height_std)
-    turn = (b.yaw - a.yaw + np.pi) % (2 * np.pi) - np.pi
-    found["yaw"] = (a.yaw + (1.0 - share) * turn + np.pi) % (2 * np.pi) - np.pi
-    found["yaw_std"] = np.minimum(_mixed_std(share, 0.0 * turn, a.yaw_std, turn, b.yaw_std), np.pi)
+    found["height_std"] = _mixed_std(lone, a["height"], a["height_std"], b["height"], b["height_std"])
+    turn = (b["yaw"] - a["yaw"] + np.pi) % (2 * np.pi) - np.pi
+    found["yaw"] = (a["yaw"] + (1.0 - share) * turn + np.pi) % (2 * np.pi) - np.pi
+    found["yaw_std"] = np.minimum(_mixed_std(share, 0.0 * turn, a["yaw_std"], turn, b["yaw_std"]), np.pi)
     return found
 
 

@@ -1,0 +1,172 @@
+"""What holds for all commands alike: options, wrong usage, nearest names, outputs, and text on any terminal."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from linkpose.cli import group
+from linkpose.device import ports
+from linkpose.device.ports import PortInfo
+from linkpose.plotting.canvas import FORMATS
+from linkpose.presentation import counted
+
+HOST = Path(__file__).parents[2] / "host"
+
+
+def commands(of: click.Group = group, prefix: str = "") -> Iterator[tuple[str, click.Command]]:
+    context = click.Context(of)
+    for name in of.list_commands(context):
+        command = of.get_command(context, name)
+        assert command is not None
+        if isinstance(command, click.Group):
+            yield from commands(command, f"{prefix}{name} ")
+        else:
+            yield prefix + name, command
+
+
+ALL = dict(commands())
+
+
+def having(option: str) -> set[str]:
+    return {name for name, command in ALL.items() if any(option in each.opts for each in command.params)}
+
+
+def test_options_exist_wherever_they_make_sense() -> None:
+    pictures = {name for name in ALL if name.startswith("reproduce") or name in ("plot", "evaluate")}
+    writers = {name for name in ALL if name.startswith("simulate")} | {"record", "estimate", "localize", "convert"}
+    results = {name for name in ALL if name.startswith(("calibrate", "reproduce"))}
+    results |= {"ports", "info", "record", "estimate", "evaluate", "localize"}
+    assert having("--force") >= pictures | writers
+    assert having("--json") >= results
+    assert having("-q") >= set(ALL) - {"ports", "localize"}
+    assert having("-v") >= {"flash", "info", "record", "estimate"}
+    assert having("--view") == {"record", "estimate", "plot"}
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_help_is_imperative_and_complete(name: str) -> None:
+    command = ALL[name]
+    for option in command.params:
+        if isinstance(option, click.Option) and option.name != "help":
+            assert option.help and not re.match("[a-z]", option.help) and option.help.endswith((".", "]")), option.opts
+    assert (command.help or "").strip().endswith(".")
+
+
+def test_filters_and_ports_are_completed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "find_ports", lambda: [PortInfo("/dev/ttyACM0", "", 1, 1, "", True, False)])
+    for option, typed, expected in (
+        ("--filter", "joint", ["joint-inertial", "joint"]),
+        ("--port", "/dev/ttyA", ["/dev/ttyACM0"]),
+        ("--port", "sim", ["sim://link", "sim://mice"]),
+    ):
+        for name in having(option) - {"localize"}:
+            command = ALL[name]
+            parameter = next(each for each in command.params if option in each.opts)
+            found = [item.value for item in parameter.shell_complete(click.Context(command), typed)]
+            assert found == expected, (name, option)
+
+
+@pytest.mark.parametrize(
+    ("typed", "sentence"),
+    [
+        ("estimat", "Did you mean estimate?"),
+        ("calibrate jont", "Did you mean joint?"),
+        ("simulate lnk", "Did you mean link?"),
+        ("reproduce indor", "Did you mean indoor?"),
+        ("estimate r.csv --live", "leave out r.csv, or leave out --live"),
+        ("estimate", "name a RECORDING, or add --live"),
+        ("estimate --live --port sim://link?speed=0 --filter joint-inertal", "did you mean joint-inertial?"),
+        ("record --port sim://link --rate 333", "choose from 50, 64, 80, 100, 125, 128, 160, 200, 250"),
+        ("record --port sim://link --duration 0", "not a number of seconds above 0"),
+        ("record --view-port 9000", "go with --view"),
+        ("plot e.csv -o e.bmp", "its name must end in .png"),
+        ("reproduce link --plot e.bmp", "its name must end in .png"),
+        ("convert e.csv -o e.bmp", "none of the endings"),
+        ("estimate r.csv -o - --json", "leave out one of them"),
+        ("record - --json", "leave out one of them"),
+    ],
+)
+def test_wrong_usage_has_status_2_and_one_sentence(linkpose, typed: str, sentence: str) -> None:
+    done = linkpose(*typed.split())
+    assert done.status == 2, done
+    assert sentence in done.err and "Traceback" not in done.err and done.out == ""
+
+
+def test_a_mistyped_port_is_answered_with_the_nearest(
+    monkeypatch: pytest.MonkeyPatch, refused: Callable[..., str]
+) -> None:
+    monkeypatch.setattr(ports, "find_ports", lambda: [PortInfo("/dev/ttyACM0", "", 1, 1, "", True, False)])
+    assert "did you mean /dev/ttyACM0?" in refused("info", "--port", "/dev/ttyACN0")
+    assert "did you mean sim://link?" in refused("info", "--port", "sim:/link")
+
+
+@pytest.mark.parametrize(
+    ("command", "outputs"),
+    [
+        ("simulate link", ("-o", "--truth")),
+        ("simulate mice", ("-o", "--truth")),
+        ("simulate indoor", ("-o", "--truth", "--map")),
+        ("simulate underwater", ("-o", "--truth", "--beacons")),
+    ],
+)
+def test_all_outputs_are_checked_before_one_is_written(
+    refused: Callable[..., str], tmp_path: Path, command: str, outputs: tuple[str, ...]
+) -> None:
+    last = tmp_path / "2.csv"
+    last.write_text("kept")
+    typed = [word for at, option in enumerate(outputs) for word in (option, tmp_path / f"{at + 3 - len(outputs)}.csv")]
+    assert "2.csv exists already" in refused(*command.split(), *typed)
+    assert list(tmp_path.iterdir()) == [last] and last.read_text() == "kept"
+
+
+def test_numbers_and_nouns_agree() -> None:
+    assert [counted(number, "gap") for number in (0, 1, 2)] == ["0 gaps", "1 gap", "2 gaps"]
+
+
+def run(*command: object, **environment: str) -> subprocess.CompletedProcess[bytes]:
+    everything = {**os.environ, "PYTHONPATH": str(HOST), **environment}
+    return subprocess.run([sys.executable, "-m", "linkpose", *map(str, command)], capture_output=True, env=everything)
+
+
+def test_a_dash_is_the_standard_output(tmp_path: Path) -> None:
+    """The bytes are those of the file of the same command, and no file named - appears."""
+    recording, estimate = tmp_path / "r.csv", tmp_path / "e.csv"
+    link = ["simulate", "link", "--duration", 1]
+    assert run(*link, "-o", recording, "--truth", tmp_path / "t.csv").returncode == 0
+    piped = run(*link, "-o", "-", "--truth", tmp_path / "t2.csv")
+    rows = [line for line in recording.read_bytes().splitlines() if not line.startswith(b"#")]
+    assert [line for line in piped.stdout.splitlines() if not line.startswith(b"#")] == rows
+    assert piped.stderr == b""  # there is nothing to type next
+    typed = ["estimate", recording, "--filter", "baro", "-q", "-o"]
+    assert run(*typed, estimate).returncode == 0
+    assert run(*typed, "-").stdout == estimate.read_bytes()
+    live = run("record", "-", "--port", "sim://link?speed=0", "--duration", 0.2, "--plain")
+    assert len(live.stdout.splitlines()) == 21 and live.stdout.startswith(b"time_s,")
+    picture = run("plot", recording, "-o", "-")
+    assert picture.stdout.startswith(b"\x89PNG") and picture.stderr == b""
+    assert not Path("-").exists() and {path.name for path in tmp_path.iterdir()} == {
+        "r.csv", "t.csv", "t2.csv", "e.csv",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437"])
+def test_a_terminal_without_greek_letters_gets_a_replacement(encoding: str) -> None:
+    done = run("evaluate", "--help", PYTHONIOENCODING=encoding)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
+    assert "σ".encode(encoding, "replace") in done.stdout
+    refused = run("estimate", "σ.csv", "--j2s", "σ", PYTHONIOENCODING=encoding)
+    assert refused.returncode == 2 and b"Traceback" not in refused.stderr
+
+
+def test_every_picture_format_is_in_the_help(linkpose) -> None:
+    for name in ("plot", "evaluate", "reproduce link"):
+        text = linkpose(*name.split(), "--help").out.lower()
+        assert all(ending.removeprefix(".") in text for ending in FORMATS), name
