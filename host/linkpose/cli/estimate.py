@@ -78,7 +78,8 @@ class Request:
     "targets",
     multiple=True,
     metavar="URL",
-    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT or lsl:NAME; may be repeated.",
+    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT, ws://HOST:PORT (Foxglove) or lsl:NAME; "
+    "may be repeated.",
 )
 @options.as_json
 @options.verbosity
@@ -316,7 +317,7 @@ class _LiveRun:
 
     def _write(self, rows: Floats) -> None:
         if len(rows):
-            self._sink.write(rows)
+            self._sink.write(rows, self._board.started_s)
             self._extremes.add(rows)
 
     def __enter__(self) -> _LiveRun:
@@ -408,7 +409,8 @@ class _Sink:
             header = ",".join(estimator.columns) + "\n"
             _print(header if request.plain else csv_head("estimate", head, estimator.columns))
 
-    def write(self, estimates: Any) -> None:
+    def write(self, estimates: Any, start_s: float = 0.0) -> None:
+        """Puts out rows of estimates; `start_s` is the host's time (time.perf_counter, s) of `time_s` 0."""
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
@@ -417,7 +419,7 @@ class _Sink:
             rows = self._estimator.objects(estimates)
             for output in self._outputs:
                 for row in rows:
-                    output.send(row)
+                    output.send(row, start_s + (row["time_s"] or 0.0))
             if self._json:
                 _print("".join(json.dumps(row) + "\n" for row in rows))
 
