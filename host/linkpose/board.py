@@ -122,6 +122,11 @@ class Board:
 
         self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force, plain))
 
+    @property
+    def started_s(self) -> float:
+        """The host's time (time.perf_counter, s) of the first sample; 0 before it."""
+        return self.session.timeline.start_s
+
     def mark(self, time_s: float) -> None:
         """Notes an instant: the closing line of the recording, if there is one, lists it under `marks`."""
         self._recorder.marks.append(time_s)

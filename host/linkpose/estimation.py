@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -20,6 +20,7 @@ from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, RecordingFile, load_recording
 from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
+from linkpose.sensors.health import LEFT_OUT
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import CHAIN_JOINTS, UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
 
@@ -57,6 +58,42 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+class ExcludedMice:
+    """The mice whose valid counts a filter excluded: samples of each, and the mice excluded at the last sample."""
+
+    def __init__(self, estimator_columns: Sequence[str]) -> None:
+        self._columns = [
+            at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
+        ]
+        self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
+        self.now: set[str] = set()
+
+    def count(self, block: Measurements, estimates: Floats) -> None:
+        """Count the exclusions in the estimates (N, columns) of a block of N samples."""
+        if not self._columns or not len(block):
+            return
+        masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
+        self.now = set()
+        if not masks.any():
+            return
+        valid = np.isfinite(block.mice_counts).all(axis=2)
+        excluded = valid & (masks[:, None] >> np.arange(valid.shape[1]) & 1 != 0)
+        for port in np.flatnonzero(excluded.any(axis=0)).tolist():
+            name = f"mouse{port + 1}"
+            self.samples[name] = self.samples.get(name, 0) + int(excluded[:, port].sum())
+            if excluded[-1, port]:
+                self.now.add(name)
+
+    def added_to(self, sensors: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Health of sensors with the number of excluded samples; the state is "left out" while a mouse is excluded."""
+        merged = dict(sensors)
+        for name, samples in self.samples.items():
+            if name in merged:
+                of = merged[name] | {"left_out": merged[name].get("left_out", 0) + samples}
+                merged[name] = of | {"state": LEFT_OUT} if name in self.now and of["state"] == "ok" else of
+        return merged
+
+
 # Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Twice of it changes nothing
 # that can be measured.
 _LONG_BLOCK = 1000
@@ -87,6 +124,7 @@ class Estimator:
             raise NoFilterRuns(self.left_out)
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
         self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
+        self.excluded = ExcludedMice(self.columns)
 
     @staticmethod
     def for_board(names: Sequence[str], board: Board, chain_joint: str | None = None) -> Estimator:
@@ -137,9 +175,12 @@ class Estimator:
         """The estimates (N, columns) at the next N samples. The filters run in parallel over a long block."""
         workers = min(os.cpu_count() or 1, len(self.filters))
         if len(block) < _LONG_BLOCK or workers < 2:
-            return np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
-        with ThreadPoolExecutor(workers) as pool:
-            return np.column_stack([block.time_s, *pool.map(lambda f: f.process(block), self.filters)])
+            estimates = np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+        else:
+            with ThreadPoolExecutor(workers) as pool:
+                estimates = np.column_stack([block.time_s, *pool.map(lambda f: f.process(block), self.filters)])
+        self.excluded.count(block, estimates)
+        return estimates
 
     @property
     def found_j2s(self) -> FoundJ2s | None:
@@ -190,6 +231,7 @@ class LiveEstimator:
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
         """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
         self._filters = estimator.filters
+        self._excluded = estimator.excluded
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
         self._blocks: list[Measurements] = []  # not yet processed by all filters
@@ -223,6 +265,8 @@ class LiveEstimator:
             np.column_stack([block.time_s, *(results[i] for results in self._results)])
             for i, block in enumerate(self._blocks[:count])
         ]
+        for block, estimates in zip(self._blocks, rows, strict=False):
+            self._excluded.count(block, estimates)
         del self._blocks[:count]
         for results in self._results:
             del results[:count]
@@ -281,6 +325,7 @@ class Estimates:
     filters: tuple[str, ...]  # that ran, best first
     rejected: dict[str, int]  # filter -> samples that it could not use
     left_out: dict[str, CannotRun]  # filter -> why it did not run
+    excluded_mice: dict[str, int]  # "mouse1", ... -> samples whose valid counts a filter excluded
     found_j2s: FoundJ2s | None  # J2S where it was to be estimated
     rig: Rig  # that was in force
 
@@ -366,6 +411,7 @@ def estimate(
         tuple(f.name for f in estimator.filters),
         {f.name: f.rejected for f in estimator.filters},
         estimator.left_out,
+        estimator.excluded.samples,
         estimator.found_j2s,
         in_force,
     )

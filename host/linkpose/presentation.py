@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # A row of estimates by filter: filter -> quantity -> (value, σ) in the column's unit; NaN where there is none.
 Row = dict[str, dict[Quantity, tuple[float, float]]]
 
-_SETTING_UP = "being set up"
+_STATES = ("being set up", "left out")  # that need no cure here
 
 
 class RowReader:
@@ -80,8 +80,8 @@ def fault_lines(health: Health) -> list[str]:
         if state in ("ok", "absent", None):
             continue
         cure = "check VCC, SDA=A4, SCL=A5" if not name.startswith("mouse") else "check its cable and pull-ups"
-        if state == _SETTING_UP:
-            lines.append(f"{name.upper()} is {_SETTING_UP}")
+        if state in _STATES:
+            lines.append(f"{name.upper()} is {state}")
         else:
             lines.append(f"{name.upper()} {state.upper()}: {cure}")
     return lines

@@ -13,6 +13,7 @@ from linkpose.errors import InvalidValue, LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
+from linkpose.sensors.devices import MOUSE_VALID
 from linkpose.sensors.health import HealthMonitor, expected_sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -54,7 +55,20 @@ class Recorder:
         checked, changes = self.monitor.check(block.measurements)
         for change in changes:
             self._session.notify(str(change))
+        self._count_late_mice(placements)
         return checked
+
+    def _count_late_mice(self, placements: list[Placement]) -> None:
+        """Count and report the readings of mice for which the recording has no columns."""
+        first = self._converter.mouse_ports
+        for port in range(first, max((len(p.sample.mice) // 2 for p in placements), default=0)):
+            samples = sum(p.place.flags & MOUSE_VALID[port] != 0 for p in placements)
+            if samples and self.monitor.leave_out(f"mouse{port + 1}", samples):
+                time_s = next(p.place.time_s for p in placements if p.place.flags & MOUSE_VALID[port])
+                self._session.notify(
+                    f"{time_s:.2f} s: a mouse was found at port {port + 1}, which had none at the start; its movement "
+                    "is left out. Connect all mice before the start, or add a [[mouse]] for each to the rig file"
+                )
 
     def close(self, ended: str) -> None:
         """Writes the closing line; `ended` is "duration", "interrupted" or "failure"."""

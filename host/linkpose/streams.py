@@ -1,7 +1,8 @@
-"""Sends live estimates to other programs: JSON or Open Sound Control (OSC) over UDP, or the Lab Streaming Layer (LSL).
+"""Sends live estimates to other programs: JSON or Open Sound Control (OSC) over UDP, the Lab Streaming Layer (LSL),
+and Foxglove's WebSocket protocol.
 
-Sending never waits. A datagram that the system does not accept at once is dropped and counted; a receiver that is slow
-or absent costs nothing.
+Sending never waits. A datagram that the system does not accept at once is dropped and counted; LSL and Foxglove send
+from threads of their own, and drop the oldest messages for a receiver that is slow. An absent receiver costs nothing.
 """
 
 from __future__ import annotations
@@ -9,7 +10,8 @@ from __future__ import annotations
 import json
 import math
 import socket
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
@@ -17,7 +19,8 @@ from linkpose.convert import libraries
 from linkpose.errors import InvalidValue
 from linkpose.quantities import split, std_column
 
-FORMS = "udp://HOST:PORT, osc://HOST:PORT or lsl:NAME"
+_CLOCK_READINGS = 20  # of which the fastest takes about 1 µs; one alone may be interrupted for milliseconds
+FORMS = "udp://HOST:PORT, osc://HOST:PORT, ws://HOST:PORT or lsl:NAME"
 
 
 class Output(Protocol):
@@ -26,21 +29,27 @@ class Output(Protocol):
     name: str
     dropped: int  # estimates that the system did not accept
 
-    def send(self, row: Mapping[str, float | None]) -> None:
-        """Sends the estimates of one sample: column -> value, None where there is none. Never waits."""
+    def send(self, row: Mapping[str, float | None], host_s: float) -> None:
+        """Sends the estimates of one sample: column -> value, None where there is none. Never waits.
+
+        `host_s` is the time of the sample on the host's clock (time.perf_counter, s).
+        """
 
     def close(self) -> None:
         """Ends the output."""
 
 
 def open_output(target: str, columns: Sequence[str]) -> Output:
-    """The output that `target` names: udp://HOST:PORT, osc://HOST:PORT or lsl:NAME, for these columns of an estimate.
+    """The output that `target` names in one of FORMS, for these columns of an estimate.
 
-    Raises InvalidValue for another form or an unknown host, and MissingLibrary without python-osc or pylsl.
+    Raises InvalidValue for another form, an unknown host or a port in use, and MissingLibrary where its library
+    is not installed.
     """
     if target.startswith("lsl:") and len(target) > len("lsl:"):
         return LslOutput(target.removeprefix("lsl:"), columns)
-    kinds: dict[str, type[JsonOutput] | type[OscOutput]] = {"udp": JsonOutput, "osc": OscOutput}
+    kinds: dict[str, type[JsonOutput] | type[OscOutput] | type[FoxgloveOutput]] = {
+        "udp": JsonOutput, "osc": OscOutput, "ws": FoxgloveOutput,
+    }  # fmt: skip
     try:
         parts = urlsplit(target)
         host, port = parts.hostname, parts.port
@@ -77,7 +86,7 @@ class _UdpOutput:
 class JsonOutput(_UdpOutput):
     """One JSON object per sample, as `estimate --json` prints: PlotJuggler's UDP server reads it."""
 
-    def send(self, row: Mapping[str, float | None]) -> None:
+    def send(self, row: Mapping[str, float | None], host_s: float) -> None:
         self._send(json.dumps(dict(row)).encode())
 
 
@@ -91,7 +100,7 @@ class OscOutput(_UdpOutput):
         parts = {name: split(name) for name in columns}
         self._columns = [(name, std_column(name)) for name, part in parts.items() if part and not part.is_std]
 
-    def send(self, row: Mapping[str, float | None]) -> None:
+    def send(self, row: Mapping[str, float | None], host_s: float) -> None:
         bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
         for name, std in self._columns:
             value, sigma = row.get(name), row.get(std) if std else None
@@ -107,7 +116,8 @@ class OscOutput(_UdpOutput):
 class LslOutput:
     """An LSL stream of type "Pose" with one channel per column; missing values are NaN.
 
-    Samples are stamped on LSL's clock when they are sent; `time_s` is a channel. liblsl sends from a thread of its own.
+    Each sample is stamped with its time on LSL's clock: the board's clock as it is fitted to the host's, and the host's
+    clock as LSL counts it. `time_s` is a channel. liblsl sends from a thread of its own.
     """
 
     def __init__(self, name: str, columns: Sequence[str]) -> None:
@@ -121,10 +131,49 @@ class LslOutput:
             channel = channels.append_child("channel").append_child_value("label", column)
             channel.append_child_value("unit", part.quantity.unit if part else "s")
         self._outlet: Any = lsl.StreamOutlet(info)
+        self._offset_s = _offset_s(lsl.local_clock)
 
-    def send(self, row: Mapping[str, float | None]) -> None:
+    def send(self, row: Mapping[str, float | None], host_s: float) -> None:
         values = (row.get(column) for column in self._columns)
-        self._outlet.push_sample([math.nan if value is None else value for value in values])
+        self._outlet.push_sample([math.nan if value is None else value for value in values], host_s + self._offset_s)
 
     def close(self) -> None:
         self._outlet = None
+
+
+class FoxgloveOutput:
+    """A server for Foxglove: the topic /linkpose/values with one JSON object per sample, missing values left out.
+
+    Messages are stamped with the time of their sample since 1970. The server's threads are the library's own.
+    """
+
+    def __init__(self, target: str, host: str, port: int, columns: Sequence[str]) -> None:
+        foxglove: Any = libraries.load("foxglove", target, "live")
+        self.name, self.dropped = target, 0
+        self._context: Any = foxglove.Context()
+        try:
+            self._server: Any = foxglove.start_server(name="linkpose", host=host, port=port, context=self._context)
+        except Exception as error:  # of the library's own types
+            raise InvalidValue("to", f"names {target}, where no server can be started: {error}") from error
+        schema = {"type": "object", "properties": {column: {"type": "number"} for column in columns}}
+        self._channel: Any = foxglove.Channel("/linkpose/values", schema=schema, context=self._context)
+        self._offset_s = _offset_s(time.time)
+
+    def send(self, row: Mapping[str, float | None], host_s: float) -> None:
+        values = {name: value for name, value in row.items() if value is not None}
+        self._channel.log(values, log_time=round(1e9 * (host_s + self._offset_s)))
+
+    def close(self) -> None:
+        self._server.stop()
+        self._channel.close()
+
+
+def _offset_s(clock: Callable[[], float]) -> float:
+    """What to add to the host's clock (time.perf_counter, s) to get `clock`, from the fastest of several readings."""
+    best = (math.inf, 0.0)
+    for _ in range(_CLOCK_READINGS):
+        before = time.perf_counter()
+        value = clock()
+        after = time.perf_counter()
+        best = min(best, (after - before, value - (before + after) / 2))
+    return best[1]

@@ -235,6 +235,7 @@ def test_a_lost_reading_is_counted_and_not_reported() -> None:
 def test_sensors_that_are_set_up_or_absent_are_no_faults() -> None:
     block = healthy()
     block.mice_counts[:150] = np.nan
+    block.pressure_Pa[:], block.baro_fresh[:] = np.nan, False
     _, changes, report = run(block, {"imu": "ok", "baro": "absent", "mouse1": "being set up"})
     assert not changes
     assert report["baro"] == {"state": "absent"}
@@ -337,3 +338,39 @@ def test_info_shows_the_health_of_each_sensor(linkpose) -> None:
     report = json.loads(linkpose("info", "--port", "sim://link?speed=20", "--json").out)
     assert report["health"]["imu"]["state"] == "ok"
     assert report["health"]["imu2"] == {"state": "absent"}
+
+
+def test_a_mouse_that_appears_at_a_port_with_columns_is_found_and_counted() -> None:
+    block = healthy()
+    block.mice_counts[:150] = np.nan
+    _, [change], report = run(block, {"imu": "ok", "mouse1": "absent"})
+    assert str(change) == "1.50 s: mouse 1 was found"
+    assert report["mouse1"] == {"state": "ok", "samples": 250, "valid": 250, "invalid": {}, "saturated": 0}
+
+
+def late_mice(first: int, ports: int):
+    """A change of the stream: from the n-th sample on it carries mice at `ports` ports."""
+    decoder, count = StreamDecoder(), itertools.count()
+
+    def change(message: Message) -> Message:
+        if not isinstance(message, Sample) or next(count) < first:
+            return message
+        valid = sum(int(SampleFlags[f"MOUSE{port}_VALID"]) for port in range(1, ports + 1))
+        sections = message.sections & 0x0F | ports << 4
+        return message._replace(sections=sections, flags=message.flags | valid, mice=(1, 2) * ports)
+
+    return lambda data: b"".join(encode(change(message)) for message in decoder.feed(data))
+
+
+def test_a_mouse_without_columns_is_left_out_counted_and_reported_once(linkpose, tmp_path) -> None:
+    out = tmp_path / "r.csv"
+    with PtyBoard(tmp_path / "port", spoil=late_mice(30, 2)):
+        result = linkpose("record", out, "--port", tmp_path / "port", "--duration", 1, "--json")
+    assert result.status == 0
+    sensors = json.loads(result.out.splitlines()[-1])["sensors"]
+    for port in (1, 2):
+        assert sensors[f"mouse{port}"] == {"state": "left out", "left_out": 70}
+        [line] = [line for line in result.err.splitlines() if f"found at port {port}" in line]
+        assert "0.30 s" in line and "add a [[mouse]]" in line
+    closing = read_table(out, "recording").closing
+    assert closing is not None and closing["sensors"] == sensors

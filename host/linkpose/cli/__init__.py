@@ -6,6 +6,7 @@ import difflib
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -78,6 +79,8 @@ def group() -> None:
 
 def main() -> None:
     """Entry point. Every failure a user can cause ends here as one sentence and a status."""
+    if not os.environ.get("LINKPOSE_DEBUG"):
+        warnings.simplefilter("ignore", RuntimeWarning)  # of NumPy, on values that a message names or a filter drops
     with safe_streams():
         status = _run()
     sys.exit(status)

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.keys import Keys
     from linkpose.cli.live import Console
+    from linkpose.device.session import Health
     from linkpose.estimation import EstimateWriter, Estimator
     from linkpose.precompile import Precompilation
     from linkpose.sensors.measurements import Floats, Measurements
@@ -84,7 +85,8 @@ class Request:
     "targets",
     multiple=True,
     metavar="URL",
-    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT or lsl:NAME; may be repeated.",
+    help="Also send live estimates to udp://HOST:PORT (JSON), osc://HOST:PORT, ws://HOST:PORT (Foxglove) or lsl:NAME; "
+    "may be repeated.",
 )
 @options.as_json
 @options.verbosity
@@ -235,7 +237,7 @@ def _live(
 
         ended = live.run_board(connected, duration, handle)
         run.finish(ended)
-        live.show_summary(console, connected.health, request.json_lines, options.written(request.output))
+        live.show_summary(console, run.health, request.json_lines, options.written(request.output))
         if request.output:
             options.show_next(console.is_quiet, f"plot {request.output}")
         connected.check_usable()
@@ -275,17 +277,23 @@ class _LiveRun:
         if self._view.is_shown:
             self._exit.enter_context(console.through(self._view.report))
 
+    @property
+    def health(self) -> Health:
+        """Of the line and the sensors; a mouse that a filter excludes is "left out"."""
+        found = self._board.health
+        return replace(found, sensors=self._estimator.excluded.added_to(found.sensors))
+
     def process(self, block: Measurements) -> None:
         """Runs the filters over a block, which may be empty, and shows and writes what they give."""
         self._marker.advance(block)
         rows, newest = self._following.process(block)
         self._write(rows)
         if len(block):
-            self._view.show(newest, lambda: self._board.health, self._compiling.progress)
+            self._view.show(newest, lambda: self.health, self._compiling.progress)
         else:
-            self._view.redraw(lambda: self._board.health, self._compiling.progress)
+            self._view.redraw(lambda: self.health, self._compiling.progress)
         shown = newest if len(block) else newest[:0]
-        show_newest(self._page, shown, self._board, self._estimator, self._compiling)
+        show_newest(self._page, shown, lambda: self.health, self._estimator, self._compiling)
 
     def follow_keys(self) -> None:
         """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
@@ -300,7 +308,7 @@ class _LiveRun:
             self._console.report("The estimates of filters that are still being compiled follow.")
             self._compiling.wait(lambda text: self._console.progress(lambda: text))
         self._write(self._following.finish())
-        health = self._board.health
+        health = self.health
         closing = {"rows": health.samples, "lost": health.lost, "ended": ended, **_outcome(self._estimator)}
         if self._marks:
             closing["marks"] = [round(time_s, 6) for time_s in sorted(self._marks)]
@@ -320,7 +328,7 @@ class _LiveRun:
 
     def _write(self, rows: Floats) -> None:
         if len(rows):
-            self._sink.write(rows)
+            self._sink.write(rows, self._board.started_s)
             self._extremes.add(rows)
 
     def __enter__(self) -> _LiveRun:
@@ -361,6 +369,8 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     found = estimator.found_j2s
     if found:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+    if estimator.excluded.samples:
+        outcome["excluded_mice"] = estimator.excluded.samples
     if estimator.mice_scale:
         outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     return outcome
@@ -410,7 +420,8 @@ class _Sink:
             header = ",".join(estimator.columns) + "\n"
             _print(header if request.plain else csv_head("estimate", head, estimator.columns))
 
-    def write(self, estimates: Any) -> None:
+    def write(self, estimates: Any, start_s: float = 0.0) -> None:
+        """Puts out rows of estimates; `start_s` is the host's time (time.perf_counter, s) of `time_s` 0."""
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
@@ -419,7 +430,7 @@ class _Sink:
             rows = self._estimator.objects(estimates)
             for output in self._outputs:
                 for row in rows:
-                    output.send(row)
+                    output.send(row, start_s + (row["time_s"] or 0.0))
             if self._json:
                 _print("".join(json.dumps(row) + "\n" for row in rows))
 

@@ -64,6 +64,7 @@ def _ask_board(port: str | None, self_test: bool, console: Console) -> dict[str,
     from linkpose.board import open_session
 
     with open_session(port, console.report) as session:
+        session.wait_for_mice(0)
         tested = _self_test(session) if self_test else {}
         sensors = _observe(session, console)
         return _report(session, session.health()) | {"health": sensors} | tested
@@ -204,6 +205,7 @@ def _health_line(sensor: str, of: dict[str, Any]) -> str:
     counts = [f"{of['valid']} of {of['samples']} samples valid"] if "valid" in of else []
     counts += [f"{count} {cause}" for cause, count in of.get("invalid", {}).items()]
     counts += [f"{of['saturated']} saturated"] if of.get("saturated") else []
+    counts += [f"{of['left_out']} left out"] if of.get("left_out") else []
     return f"{sensor} {of['state']}" + (f": {', '.join(counts)}" if counts else "")
 
 

@@ -13,6 +13,7 @@ import click
 if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
+    from linkpose.device.session import Health
     from linkpose.estimation import Estimator
     from linkpose.page import Page
     from linkpose.page.history import Replay
@@ -85,19 +86,23 @@ class PageOptions:
 
             def show(block: Measurements) -> None:
                 _, newest = following.process(block)
-                show_newest(page, newest if len(block) else newest[:0], board, estimator, compiling)
+                show_newest(page, newest if len(block) else newest[:0], lambda: board.health, estimator, compiling)
 
             yield show
 
 
 def show_newest(
-    page: Page | None, newest: Floats, board: Board, estimator: Estimator, compiling: Precompilation
+    page: Page | None,
+    newest: Floats,
+    health: Callable[[], Health],
+    estimator: Estimator,
+    compiling: Precompilation,
 ) -> None:
     """Shows the newest row of a live run, which may be empty. Raises KeyboardInterrupt once "stop" was pressed."""
     from linkpose.page.status import Status
 
     if page is not None:
-        page.show(newest, lambda: Status(board.health, estimator.found_j2s, compiling.progress))
+        page.show(newest, lambda: Status(health(), estimator.found_j2s, compiling.progress))
         page.raise_if_stopped()
 
 

@@ -114,7 +114,6 @@ class Session:
         self._pings: dict[int, float] = {}
         self._token = 0
         self._status: Status | None = None
-        self._mouse_ports: int | None = None  # ports in the recording; None until wait_for_mice has run
         self._supply_reported = False
         self._started: Arrival | None = None  # what came together with the ACK of START
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
@@ -220,7 +219,7 @@ class Session:
     def wait_for_mice(self, count: int) -> None:
         """Wait until no mouse is being set up and `count` ports have mice, for at most MICE_TIMEOUT_S.
 
-        The recording then has the ports found; a mouse that appears later at another port is reported.
+        Notifies of the wait, and of each command that a mouse refused during its set-up.
         """
         deadline = time.perf_counter() + MICE_TIMEOUT_S
         notified = False
@@ -231,7 +230,6 @@ class Session:
             time.sleep(ASK_INTERVAL_S)
             self._connection.send(GetInfo())
             self.hello = self._await(Hello, "GET_INFO")
-        self._mouse_ports = max(BoardSettings.of(self.hello).mouse_ports, count)
         for remark in mouse_remarks(self.hello):
             self.notify(remark)
 
@@ -400,8 +398,6 @@ class Session:
         for message in arrival.messages:
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
-                if self._mouse_ports is not None and len(message.mice) > 2 * self._mouse_ports:
-                    self._report_new_mouse(len(message.mice) // 2)
                 self._unread_bytes = 0
                 self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
@@ -410,13 +406,6 @@ class Session:
             else:
                 self._hear(message, arrival, timeline)
         return placements
-
-    def _report_new_mouse(self, port: int) -> None:
-        self._mouse_ports = port
-        self.notify(
-            f"A mouse appeared at port {port}, which had none at the start: its movement is not recorded. "
-            "Plug mice in before the start, or add a [[mouse]] for each to the rig"
-        )
 
     def _check_supply(self, status: Status) -> None:
         if not 0 < status.vcc_mv < LOW_SUPPLY_MV or self._supply_reported:

@@ -23,6 +23,7 @@ from linkpose.sensors.measurements import Floats
 
 _METRES = {"m": 1.0, "meters": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, "mm": 0.001, "millimeters": 0.001}
 _FARTHEST_M = 1e6
+_LARGEST = 1e15  # of a coordinate in any unit; larger ones count as hidden
 _HEAD_LINES = 5  # of a TRC file, before its frames
 
 
@@ -50,7 +51,8 @@ def read_c3d(path: Path, up: str | None) -> Table:
         check_sizes(data)
         file = ezc3d.c3d(str(path))
         points: dict[str, Any] = file["parameters"]["POINT"]
-        positions = np.asarray(file["data"]["points"], dtype=np.float64)[:3].transpose(2, 1, 0)
+        positions = np.array(file["data"]["points"], dtype=np.float64)[:3].transpose(2, 1, 0)
+        positions[~(np.abs(positions) < _LARGEST)] = np.nan
         names = [str(name) for name in points["LABELS"]["value"]]
         rate_hz = float(points["RATE"]["value"][0])
         unit = str(points.get("UNITS", {}).get("value", ["mm"])[0])
@@ -91,6 +93,7 @@ def _trc_row(path: Path, line: str, number: int, width: int) -> Floats:
     cells = line.split("\t")[1 : 2 + width]
     try:
         found = [float(cell.replace(",", ".")) if cell.strip() else np.nan for cell in cells]
+        found = [value if abs(value) < _LARGEST else np.nan for value in found]
     except ValueError:
         raise FileFormatError(
             path, f"{path}, line {number}: a field is not a number; export the take again", number

@@ -57,6 +57,7 @@ class Table:
 
 
 Progress = Callable[[float], None]
+_LARGEST = 1e15  # of a value in any column; squares of larger ones exceed the range of numbers in later steps
 
 
 class TableFile:
@@ -99,6 +100,7 @@ class TableFile:
             if "time_s" in part.columns:
                 check_times(self.path, part.columns["time_s"], part.first_line, last_s)
                 last_s = part.columns["time_s"][-1]
+            _check_sizes(self.path, part)
             yield part
 
     def require(self, *names: str) -> None:
@@ -144,6 +146,24 @@ def require(path: Path, found: Collection[str], *names: str) -> None:
     missing = [name for name in names if name not in found]
     if missing:
         raise FileFormatError(path, f"{path} has no column {', '.join(missing)}; it has {', '.join(found)}")
+
+
+def _check_sizes(path: Path, part: Part) -> None:
+    """Makes infinite values missing ones, and raises FileFormatError for a number that no measurement is."""
+    for name, values in part.columns.items():
+        size = np.abs(values)
+        largest = size.max()
+        if largest <= _LARGEST or name == "time_s":
+            continue
+        values[np.isinf(values)] = np.nan
+        wrong = np.flatnonzero((size > _LARGEST) & np.isfinite(size))
+        if len(wrong):
+            line = part.first_line + int(wrong[0])
+            raise FileFormatError(
+                path,
+                f"{path}, line {line}: {name} is {values[wrong[0]]:g}, which no measurement is; correct that row",
+                line,
+            )
 
 
 def check_times(path: Path, time_s: Floats, first_line: int, before_s: float = -np.inf) -> None:

@@ -59,11 +59,15 @@ class Cause(IntEnum):
     OUT_OF_RANGE = 4
     STUCK = 5  # one axis repeats while the others change
     STARTING = 6  # being set up
+    ABSENT = 7  # never found so far
 
     @property
     def label(self) -> str:
         """As in the summary and the closing line."""
         return {Cause.STARTING: "being set up"}.get(self, self.name.lower().replace("_", " "))
+
+
+LEFT_OUT = "left out"  # state of a sensor whose valid readings are not used
 
 
 _REASON = {
@@ -92,8 +96,11 @@ class Change:
     sensor: str
     cause: Cause
     lasted_s: float  # of the state before
+    before: Cause | None = None  # the state before
 
     def __str__(self) -> str:
+        if self.cause == Cause.OK and self.before == Cause.ABSENT:
+            return f"{self.time_s:.2f} s: {_title(self.sensor)} was found"
         if self.cause == Cause.OK:
             return f"{self.time_s:.2f} s: {_title(self.sensor)} is back after {self.lasted_s:.2f} s"
         return f"{self.time_s:.2f} s: {_title(self.sensor)} {_REASON[self.cause]}. {_CURE[self.cause]}"
@@ -107,13 +114,16 @@ def _title(sensor: str) -> str:
 class SensorHealth:
     """State and counts of one sensor."""
 
-    def __init__(self, sensor: str, starting: bool) -> None:
+    def __init__(self, sensor: str, state: str) -> None:
+        """`state` at the start: "ok", "being set up" or "absent"."""
         self.sensor = sensor
         self.samples = 0
         self.saturated = 0
         self.invalid: dict[Cause, int] = {}
-        self.cause: Cause | None = None  # the state that was reported last; None before the first sample
-        self._starting = starting
+        self.left_out = 0  # samples whose valid readings were not used
+        # The state that was reported last; None before the first sample.
+        self.cause: Cause | None = Cause.ABSENT if state == Cause.ABSENT.label else None
+        self._starting = state == Cause.STARTING.label
         self._since_s = 0.0  # of the reported state
         self._pending: tuple[Cause, float] | None = None  # another state, and since when
 
@@ -128,6 +138,11 @@ class SensorHealth:
 
     def count(self, codes: Codes, time_s: Floats, saturated: Bools) -> list[Change]:
         """Count a block of samples by their Cause; the changes of state that it completes."""
+        if self.cause == Cause.ABSENT and self.samples == 0:  # counted from its first reading on
+            found = int(np.argmax(codes != Cause.SILENT))
+            if codes[found] == Cause.SILENT:
+                return []
+            codes, time_s, saturated = codes[found:], time_s[found:], saturated[found:]
         if self._starting:
             codes = self._excuse(codes, time_s)
         self.samples += len(codes)
@@ -159,14 +174,17 @@ class SensorHealth:
             self._pending = (cause, first_s)
         if last_s - self._pending[1] < REPORT_AFTER_S:
             return []
-        change = Change(self._pending[1], self.sensor, cause, self._pending[1] - self._since_s)
+        change = Change(self._pending[1], self.sensor, cause, self._pending[1] - self._since_s, self.cause)
         silent = self.cause is None and cause == Cause.OK  # it began well
         self.cause, self._since_s, self._pending = cause, change.time_s, None
         return [] if silent else [change]
 
     def as_dict(self) -> dict[str, Any]:
         """For the summary and the closing line."""
-        state = self._pending[0] if self.cause is None and self._pending else self.cause
+        if self.cause == Cause.ABSENT and not self.samples:
+            of: dict[str, Any] = {"state": Cause.ABSENT.label}
+            return of | {"state": LEFT_OUT, "left_out": self.left_out} if self.left_out else of
+        state = self._pending[0] if self.cause in (None, Cause.ABSENT) and self._pending else self.cause
         if state is None:
             state = Cause.STARTING if self.samples == 0 or self._starting else Cause.SILENT
         return {
@@ -240,6 +258,7 @@ _IMU_FIELDS = {
     "imu": ("accel_m_s2", "gyro_rad_s", "imu_temp_degC"),
     "imu2": ("accel2_m_s2", "gyro2_rad_s", "imu2_temp_degC"),
 }
+_FIRST_FIELD = {"imu": "accel_m_s2", "imu2": "accel2_m_s2", "baro": "pressure_Pa", "mag": "mag_uT"}
 _MAG_VALID, _MAG_SATURATED = int(SampleFlags.MAG_VALID), int(SampleFlags.MAG_SATURATED)
 _MOUSE_OVERFLOW = {f"mouse{port}": int(SampleFlags[f"MOUSE{port}_OVERFLOW"]) for port in range(1, MAX_MICE + 1)}
 
@@ -354,7 +373,7 @@ def expected_sensors(hello: Hello, mouse_ports: int) -> dict[str, str]:
     """The sensors of a board for HealthMonitor: all its devices, and the mouse ports that a recording has."""
     states = [device.state for device in hello.devices] + [mouse.state for mouse in hello.mice[:mouse_ports]]
     names = [*DEVICE_NAMES, *(f"mouse{port}" for port in range(1, len(hello.mice) + 1))]
-    words = {DeviceState.ABSENT: "absent", DeviceState.STARTING: "being set up"}
+    words = {DeviceState.ABSENT: Cause.ABSENT.label, DeviceState.STARTING: Cause.STARTING.label}
     return {name: words.get(DeviceState(state), "ok") for name, state in zip(names, states, strict=False)}
 
 
@@ -365,12 +384,7 @@ class HealthMonitor:
         """`sensors`: "imu", "imu2", "baro", "mag", "mouse1" ... with "ok", "being set up" or "absent"."""
         self._rate_hz = rate_hz
         self._samples = 0
-        self._absent = [name for name, state in sensors.items() if state == "absent"]
-        self.sensors = {
-            name: SensorHealth(name, starting=state == "being set up")
-            for name, state in sensors.items()
-            if state != "absent"
-        }
+        self.sensors = {name: SensorHealth(name, state) for name, state in sensors.items()}
         self._imus = {"imu": _Imu(_IMU_FLAGS), "imu2": _Imu(_IMU2_FLAGS)}
         self._baro = _Baro()
         self._mag = _Mag()
@@ -382,11 +396,11 @@ class HealthMonitor:
         self._samples += len(block)
         changes: list[Change] = []
         flags, time_s = block.flags.astype(np.int64), block.time_s
-        for name in [name for name in self._imus if name in self.sensors]:
+        for name in [name for name in self._imus if self._is_present(name, block)]:
             block = self._check_imu(name, block, flags, changes)
-        if "baro" in self.sensors:
+        if self._is_present("baro", block):
             block = self._check_baro(block, changes)
-        if "mag" in self.sensors:
+        if self._is_present("mag", block):
             block = self._check_mag(block, flags, changes)
         for port in range(block.mice_counts.shape[1]):
             name = f"mouse{port + 1}"
@@ -395,6 +409,19 @@ class HealthMonitor:
                 overflow = flags & _MOUSE_OVERFLOW[name] != 0
                 changes += health.count(silent, time_s, overflow)
         return block, changes
+
+    def _is_present(self, name: str, block: Measurements) -> bool:
+        """Whether a sensor was found at the start, or has a reading by now."""
+        health = self.sensors.get(name)
+        if health is None or health.cause != Cause.ABSENT or health.samples:
+            return health is not None
+        return bool(np.isfinite(getattr(block, _FIRST_FIELD[name])).any())
+
+    def leave_out(self, sensor: str, samples: int) -> bool:
+        """Count valid readings of a sensor that has no place in the measurements. True for the first of them."""
+        health = self.sensors.setdefault(sensor, SensorHealth(sensor, Cause.ABSENT.label))
+        health.left_out += samples
+        return health.left_out == samples
 
     def _check_imu(
         self, name: str, block: Measurements, flags: NDArray[np.int64], changes: list[Change]
@@ -442,8 +469,7 @@ class HealthMonitor:
 
     def as_dict(self) -> dict[str, dict[str, Any]]:
         """State and counts of every sensor, by name."""
-        absent: dict[str, dict[str, Any]] = {name: {"state": "absent"} for name in self._absent}
-        return absent | {name: health.as_dict() for name, health in self.sensors.items()}
+        return {name: health.as_dict() for name, health in self.sensors.items()}
 
     @property
     def is_usable(self) -> bool:

@@ -1,0 +1,109 @@
+"""Feeds damaged files to every reader for long.
+
+    python tests/fuzz.py [--inputs N] [--seed S] [NAME ...]
+
+Without NAME, every reader and every command gets N inputs (default 100 000; a fiftieth for commands). An input fails
+when it raises anything but a LinkposeError, takes more than 10 s, or needs more than 1 GB. Failing inputs are kept in
+fuzz-failures/, and the status is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent / "host"), str(Path(__file__).parents[1] / "host")]
+
+from fuzzing import Target, commands, mutate, read_mutated, targets  # noqa: E402
+
+LONGEST_S = 10
+MOST_BYTES = 1 << 30
+COMMAND_SHARE = 50
+
+
+class TooLong(BaseException):
+    """An input took longer than LONGEST_S; no reader may catch it."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("names", nargs="*")
+    chosen = parser.parse_args()
+    signal.signal(signal.SIGALRM, _alarm)
+    failures = 0
+    with tempfile.TemporaryDirectory() as folder:
+        readers = {name: (target, chosen.inputs) for name, target in targets(Path(folder)).items()}
+        for name, target in commands(Path(folder)).items():
+            readers[f"command {name}"] = (target, max(1, chosen.inputs // COMMAND_SHARE))
+        for name, (target, inputs) in readers.items():
+            if not chosen.names or name in chosen.names:
+                failures += _run(name, target, inputs, chosen.seed)
+    return 1 if failures else 0
+
+
+def _run(name: str, target: Target, inputs: int, seed: int) -> int:
+    rng = random.Random(f"{name} {seed}")
+    valid = target.valid.read_bytes()
+    read_mutated(target, valid)  # compiles and imports
+    _limit_memory()
+    failures, began, slowest = 0, time.monotonic(), 0.0
+    kinds: dict[str, int] = {}
+    for number in range(inputs):
+        data = mutate(valid, rng)
+        started = time.monotonic()
+        signal.alarm(LONGEST_S)
+        try:
+            read_mutated(target, data)
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            signal.alarm(0)
+            failures += 1
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            kind = f"{type(error).__name__} at {Path(place.filename).name}:{place.lineno}"
+            kinds[kind] = kinds.get(kind, 0) + 1
+            if kinds[kind] == 1:
+                _keep(name, number, target.valid.suffix, data)
+                traceback.print_exception(error)
+        signal.alarm(0)
+        slowest = max(slowest, time.monotonic() - started)
+    _limit_memory(unlimited=True)
+    took = time.monotonic() - began
+    print(
+        f"{name:22} {inputs} inputs, {failures} failures, {took:.0f} s, slowest {slowest:.2f} s {kinds or ''}",
+        flush=True,
+    )
+    return failures
+
+
+def _alarm(*_: object) -> None:
+    raise TooLong
+
+
+def _limit_memory(unlimited: bool = False) -> None:
+    """Address space: what is mapped now, and MOST_BYTES."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (hard if unlimited else used + MOST_BYTES, hard))
+
+
+def _keep(name: str, number: int, suffix: str, data: bytes) -> None:
+    folder = Path("fuzz-failures")
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name.replace(' ', '-')}-{number}{suffix}").write_bytes(data)
+
+
+if __name__ == "__main__":
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)  # NumPy's warnings must not reach a user
+        sys.exit(main())

@@ -1,0 +1,288 @@
+"""Damaged files for every reader: small valid files, and seeded mutations of them."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from click.testing import CliRunner
+from PIL import Image
+
+from linkpose.cli import group
+from linkpose.convert import convert
+from linkpose.errors import LinkposeError
+from linkpose.evaluation.references import read_any, read_for_picture
+from linkpose.evaluation.scores import evaluate
+from linkpose.flashing.image import read_image
+from linkpose.localization.carmen import read_carmen
+from linkpose.localization.events import read_events
+from linkpose.localization.maps import load_map
+from linkpose.localization.tables import read_beacons, read_truth
+from linkpose.recording.reader import RecordingFile, load_recording
+from linkpose.recording.summary import summarise
+from linkpose.recording.table import read_table
+from linkpose.recording.writer import write_recording
+from linkpose.sensors.rig import as_rig
+from linkpose.simulation import board
+from linkpose.simulation.link import LinkRun
+from linkpose.wire.frames import encode
+
+# What breaks parsers of numbers, of JSON, YAML and TOML, and what breaks programs that trust a number.
+TOKENS = [
+    b"nan", b"inf", b"-inf", b"-1", b"0", b"1e308", b"-1e308", b"1e400", b"1e-320", b"9" * 400, b"0x10",
+    b"1_000", b"1,5", b"", b'"', b"'", b"#", b";", b"\t", b"\n", b"\r", b"\0", b"\xff", b"\xfe\xff", b"\xef\xbb\xbf",
+    b"[" * 2000,
+    b"{" * 500, b"&a [*a,*a]", b"null", b"true", b"\x1b[31m", b"..", b"/dev/zero", b"%s", b"18446744073709551616",
+    b"NaN,", b"99999999999", b"1e9", b"[[[]]]", b"{}", b"[]", b"time_s", b"-0", b"\xed\xa0\x80", b"=1+1",
+]  # fmt: skip
+HOLDERS = (b",", b"\n", b" ", b":", b"=", b"\t", b"[", b"]")
+
+
+def mutate(data: bytes, rng: random.Random) -> bytes:
+    """One to four changes: bytes, pieces, lines or fields are replaced, removed, doubled, moved or cut."""
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        rng.choice(_CHANGES)(changed, rng)
+    return bytes(changed)
+
+
+def _flip(data: bytearray, rng: random.Random) -> None:
+    for _ in range(rng.choice((1, 1, 8))):
+        if data:
+            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+
+
+def _insert(data: bytearray, rng: random.Random) -> None:
+    at = rng.randint(0, len(data))
+    data[at:at] = rng.choice(TOKENS)
+
+
+def _replace_field(data: bytearray, rng: random.Random) -> None:
+    """A whole field, between two of the characters that hold fields."""
+    at = rng.randint(0, len(data))
+    start = max(data.rfind(holder, 0, at) for holder in HOLDERS) + 1
+    ends = [end for holder in HOLDERS if (end := data.find(holder, at)) >= 0]
+    data[start : min(ends, default=len(data))] = rng.choice(TOKENS)
+
+
+def _cut(data: bytearray, rng: random.Random) -> None:
+    del data[rng.randint(0, len(data)) :]
+
+
+def _remove(data: bytearray, rng: random.Random) -> None:
+    at = rng.randint(0, len(data))
+    del data[at : at + rng.choice((1, 2, 10, 100))]
+
+
+def _double(data: bytearray, rng: random.Random) -> None:
+    at = rng.randint(0, len(data))
+    data[at:at] = data[at : at + rng.choice((1, 10, 300))] * rng.choice((1, 3))
+
+
+def _line(data: bytearray, rng: random.Random) -> None:
+    """A line is removed, doubled, or exchanged with another."""
+    lines = bytes(data).split(b"\n")
+    a, b = rng.randrange(len(lines)), rng.randrange(len(lines))
+    kind = rng.randrange(3)
+    if kind == 0:
+        del lines[a]
+    elif kind == 1:
+        lines.insert(b, lines[a])
+    else:
+        lines[a], lines[b] = lines[b], lines[a]
+    data[:] = b"\n".join(lines)
+
+
+_CHANGES: list[Callable[[bytearray, random.Random], None]] = [
+    _flip, _insert, _replace_field, _replace_field, _cut, _remove, _double, _line,
+]  # fmt: skip
+
+
+class Target(NamedTuple):
+    """A reader: a valid file, and what reads it. The reading may raise LinkposeError, and nothing else."""
+
+    valid: Path
+    read: Callable[[Path], object]
+
+
+def targets(folder: Path) -> dict[str, Target]:
+    """All readers, with their valid files in `folder`."""
+    run = LinkRun(duration_s=3.0)
+    files = _Files(folder, run)
+    estimate, truth = files.estimate(), files.truth()
+    recording = files.recording()
+    parquet = folder / "run.parquet"
+    convert(recording, parquet)
+    c3d, trc = folder / "take.c3d", folder / "take.trc"
+    convert(estimate, c3d, "joint-inertial")
+    convert(estimate, trc, "joint-inertial")
+    reference = read_table(truth)
+    return {
+        "recording": Target(recording, _survey),
+        "raw": Target(files.raw(), _survey),
+        "parquet": Target(parquet, _survey),
+        "estimate": Target(estimate, lambda path: evaluate(read_any(path), reference)),
+        "truth": Target(truth, lambda path: evaluate(read_table(estimate), read_any(path))),
+        "picture": Target(estimate, read_for_picture),
+        "motive": Target(files.motive(), read_any),
+        "c3d": Target(c3d, read_any),
+        "trc": Target(trc, read_any),
+        "rig": Target(files.text("rig.toml", _RIG), as_rig),
+        "map": Target(files.map(), load_map),
+        "map-image": Target(files.map().with_suffix(".png"), lambda path: files.load_map_with(path)),
+        "carmen": Target(files.text("scans.log", _CARMEN), read_carmen),
+        "beacons": Target(files.text("beacons.csv", _BEACONS), read_beacons),
+        "events": Target(files.text("events.csv", _EVENTS), read_events),
+        "robot-truth": Target(files.text("robot.csv", _ROBOT), read_truth),
+        "hex": Target(files.hex(), read_image),
+    }
+
+
+def commands(folder: Path) -> dict[str, Target]:
+    """Whole commands on a damaged file."""
+    files = _Files(folder, LinkRun(duration_s=3.0))
+    estimate, recording = str(files.estimate()), files.recording()
+    truth, grid = str(files.truth()), str(files.map())
+    out, beacons = str(folder / "out"), str(files.text("beacons.csv", _BEACONS))
+    return {
+        "estimate": Target(recording, _command("estimate", "{}", "--filter", "tilt", "-o", f"{out}.csv", "--force")),
+        "info": Target(recording, _command("info", "{}", "--json")),
+        "evaluate": Target(Path(estimate), _command("evaluate", "{}", truth)),
+        "plot": Target(Path(estimate), _command("plot", "{}", "-o", f"{out}.svg", "--force")),
+        "convert": Target(Path(estimate), _command("convert", "{}", "-o", f"{out}.trc", "--force")),
+        "localize": Target(
+            files.text("scans.log", _CARMEN),
+            _command("localize", "{}", "--map", grid, "--filter", "ekf", "-o", f"{out}.csv", "--force"),
+        ),
+        "localize-beacons": Target(
+            files.text("events.csv", _EVENTS),
+            _command("localize", "{}", "--beacons", beacons, "-o", f"{out}.csv", "--force"),
+        ),
+    }
+
+
+def _survey(path: Path) -> None:
+    summarise(RecordingFile(path))
+    load_recording(path)
+
+
+def _command(*words: str) -> Callable[[Path], object]:
+    def run(path: Path) -> None:
+        result = CliRunner().invoke(group, [word.format(path) if word == "{}" else word for word in words])
+        if result.exception is not None and not isinstance(result.exception, SystemExit):
+            raise result.exception
+
+    return run
+
+
+def read_mutated(target: Target, data: bytes) -> None:
+    """Reads damaged bytes under the name of the valid file's kind. Raises whatever is not a LinkposeError."""
+    damaged = target.valid.with_name("damaged" + target.valid.suffix)
+    damaged.write_bytes(data)
+    with contextlib.suppress(LinkposeError):
+        target.read(damaged)
+
+
+_RIG = """[joint]
+j2s_m = [-0.09, -0.04, 1.65]
+j2s_std_m = 0.001
+[imu]
+gyro_bias_rad_s = [0.01, 0.0, 0.0]
+delay_s = 0.004
+[[mouse]]
+x_m = 0.1
+y_m = 0.0
+heading_rad = 0.5
+counts_per_m = 8000
+"""
+_CARMEN = "\n".join(
+    ["PARAM robot_length 0.5 0 host 0"]
+    + [
+        f"FLASER 8 {' '.join(['2.5'] * 8)} {0.1 * i:.2f} 1.0 0.0 {0.1 * i:.2f} 1.0 0.0 {i}.0 host {i}.0\n"
+        f"ODOM {0.1 * i:.2f} 1.0 0.0 0.1 0.0 0.0 {i}.5 host {i}.5"
+        for i in range(1, 8)
+    ]
+    + [""]
+)
+_BEACONS = "id,x_m,y_m\n1,0.0,0.0\n0xDD05,5.0,0.0\nA1,0.0,5.0\n"
+_EVENTS = "time_s,kind,a,b,c\n0,start,1.0,1.0,0.0\n" + "".join(
+    f"{0.1 * i:.1f},odometry,0.1,0.0,\n{0.1 * i:.1f},range,1,{1.4 + 0.01 * i:.3f},\n" for i in range(1, 12)
+)
+_ROBOT = "time_s,x_m,y_m,heading_rad\n" + "".join(f"{0.1 * i:.1f},{i},0,0.1\n" for i in range(12))
+
+
+class _Files:
+    """Writes small valid files."""
+
+    def __init__(self, folder: Path, run: LinkRun) -> None:
+        self._folder, self._run = folder, run
+
+    def text(self, name: str, content: str) -> Path:
+        path = self._folder / name
+        path.write_text(content)
+        return path
+
+    def recording(self) -> Path:
+        path = self._folder / "run.csv"
+        samples = [s for s in self._run.samples() if s.seq < 120]
+        write_recording(path, board.hello(board.DEFAULTS), samples, "sim", self._run.rig, force=True)
+        return path
+
+    def raw(self) -> Path:
+        path = self._folder / "run.bin"
+        frames = [encode(s) for s in self._run.samples()][:80]
+        path.write_bytes(encode(board.hello(board.DEFAULTS)) + b"".join(frames))
+        return path
+
+    def _rows(self, prefix: str, count: int) -> str:
+        t = np.arange(count) / 40
+        tilt = np.stack([0.4 * np.sin(2 * t), 0.3 * np.cos(3 * t)])
+        height = 1.65 * np.sqrt(1 - (tilt**2).sum(axis=0))
+        names = [
+            "time_s",
+            *(f"{prefix}{name}" for name in ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "x_m", "y_m")),
+        ]
+        table = np.column_stack([t, height, *np.degrees(tilt), 0 * t, 1.65 * tilt[1], -1.65 * tilt[0]])
+        return ",".join(names) + "\n" + "".join(",".join(f"{v:.6f}" for v in row) + "\n" for row in table.tolist())
+
+    def estimate(self) -> Path:
+        head = '# linkpose estimate 1\n# {"filters": ["joint-inertial"], "rig": {}}\n'
+        return self.text("est.csv", head + self._rows("joint_inertial_", 120) + '# {"rows": 120}\n')
+
+    def truth(self) -> Path:
+        return self.text("truth.csv", self._rows("", 120))
+
+    def motive(self) -> Path:
+        head = ["Format Version,1.23,Length Units,Meters", "", ",Type" + ",Marker" * 9]
+        head += [",Name" + "".join(f",P:{i}" * 3 for i in range(3)), "," + ",Position" * 9]
+        rows = ["Frame,Time (Seconds)" + ",X,Y,Z" * 3]
+        for i in range(60):
+            a, b = 0.3 * np.sin(0.1 * i), 0.2 * np.cos(0.17 * i)
+            place = np.array([a, np.sqrt(1 - a * a - b * b), b])
+            cells = np.concatenate([place, place + np.array([0.1, 0, 0]), place + np.array([0, 0, 0.1])])
+            rows.append(f"{i},{i / 50:.4f}," + ",".join(f"{value:.5f}" for value in cells))
+        return self.text("take.csv", "\n".join(head + rows) + "\n")
+
+    def map(self) -> Path:
+        cells = np.full((12, 16), 254, np.uint8)
+        cells[0] = cells[-1] = 0
+        cells[:, 0] = cells[:, -1] = 0
+        Image.fromarray(cells).save(self._folder / "map.png")
+        return self.text("map.yaml", "image: map.png\nresolution: 0.5\norigin: [-1.0, -1.0, 0.0]\nnegate: 0\n")
+
+    def load_map_with(self, image: Path) -> None:
+        load_map(self.text("damaged-map.yaml", f"image: {image.name}\nresolution: 0.5\norigin: [-1.0, -1.0, 0.0]\n"))
+
+    def hex(self) -> Path:
+        packaged = Path(__file__).parents[2] / "host" / "linkpose" / "flashing" / "firmware.hex"
+        if packaged.exists():
+            return self.text("firmware.hex", packaged.read_text())
+        lines = []
+        for at in range(0, 256, 16):
+            body = bytes([16, at >> 8, at & 255, 0, *range(16)])
+            lines.append(":" + (body + bytes([-sum(body) & 255])).hex().upper())
+        return self.text("firmware.hex", "\n".join([*lines, ":00000001FF"]) + "\n")
