@@ -166,13 +166,12 @@ class KalmanFilter:
         """Where x, y and heading are in the state."""
         return np.array([self.motion.states.index(name) for name in ("x_m", "y_m", "heading_rad")])
 
-    def place(self, pose: Floats, std: Floats) -> None:
-        """Sets x, y, heading to `pose` (3,) with standard deviations `std` (3,), uncorrelated with the other states."""
-        at = self.pose_indices
-        self.state[at] = pose
+    def place(self, at: NDArray[np.intp], values: Floats, covariance: Floats) -> None:
+        """Sets the states `at` (p,) to `values` with `covariance` (p, p), uncorrelated with the other states."""
+        self.state[at] = values
         self.covariance[at, :] = 0.0
         self.covariance[:, at] = 0.0
-        self.covariance[at, at] = std**2
+        self.covariance[np.ix_(at, at)] = covariance
 
     def _angles_of(self, measurement: Measurement) -> Bools:
         """Which of the states, and after them of the measurement's rows, are angles."""

@@ -17,6 +17,7 @@ from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
 from linkpose.localization.noise import check_correlation
+from linkpose.localization.relocation import Relocator
 from linkpose.localization.settings import Pose, Settings
 from linkpose.localization.smoother import History
 from linkpose.localization.tables import Beacons
@@ -143,6 +144,9 @@ class Localizer:
         self.applied = self.rejected = self.widened = self.relocated = 0
         self.rejected_ranges: set[tuple[float, str]] = set()
         self.consistency = Consistency()
+        self.relocator = Relocator(motion, self.sensors) if beacons else None
+        self.is_replaced = False  # by the last measurement
+        self.rivalry: Floats | None = None  # what a better pose adds to the covariance until it replaces this one
         self.known = start is not None
         self.history = History() if settings.smooth else None
         self.laser: ScanTracker | None = None
@@ -162,6 +166,9 @@ class Localizer:
             measurement = self.sensors.measurement(events)
         if self.laser:
             self.laser.predict(self.filter, interval, self.control, self.hold)
+        if self.relocator:
+            self.relocator.move(self.filter, interval, self.control)
+        self.is_replaced = False
         if self.history is not None:
             self.history.predict(self.filter, interval, self.control, self.hold)
             interval = 0.0
@@ -171,10 +178,11 @@ class Localizer:
             self._match(self.laser, event)
         elif measurement is not None and self.known:
             self._count(events, passed)
+            self._relocate(events)
         if isinstance(event, Event):
             self._steer(event, hold_s)
         if self.history is not None:
-            self.history.correct(self.filter, self.known)
+            self.history.correct(self.filter, self.known, self.is_replaced)
         return self._row()
 
     def track(self, rows: Sequence[Row]) -> Track:
@@ -202,6 +210,8 @@ class Localizer:
 
     def _row(self) -> Row:
         state, covariance = self.filter.state.copy(), self.filter.covariance.copy()
+        if self.rivalry is not None:
+            covariance += self.rivalry
         if not self.known:
             state[:], covariance[:] = np.nan, np.nan
         return self.finished(self.now, state, covariance)
@@ -237,6 +247,26 @@ class Localizer:
         if result.fit is not None:
             self.consistency.add("scan", 3, result.fit.d2)
         self.filter, self.known = result.filter, result.known
+
+    def _relocate(self, events: Sequence[Event | Scan]) -> None:
+        """Replaces the pose by a fit of the latest measurements, when they contradict the pose and agree on another."""
+        if self.relocator is None or events[0].kind not in NAMED:
+            return
+        self.rivalry = None
+        settling = self.relocator.settling_s is not None
+        found = self.relocator.see(self.filter, [event for event in events if isinstance(event, Event)])
+        if found is None:
+            return
+        if found.is_certain:
+            self.filter.place(found.at, found.values, found.covariance)
+            self.relocated += not settling
+            self.is_replaced = True
+            self.lately_rejected.clear()
+        else:
+            off = np.zeros(len(self.filter.state))
+            off[found.at] = found.values - self.filter.state[found.at]
+            off[self.filter.motion.is_angle] = 0.0
+            self.rivalry = np.outer(off, off)
 
     def _count(self, events: Sequence[Event | Scan], passed: NDArray[np.bool_]) -> None:
         kind, good = events[0].kind, int(passed.sum())

@@ -12,6 +12,7 @@ from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD
 from linkpose.localization.events import Event, Scan
 from linkpose.localization.kalman import Measurement, Motion
+from linkpose.localization.linalg import Floats
 from linkpose.localization.settings import CONSTANTS, Settings
 from linkpose.localization.tables import Beacons
 
@@ -57,6 +58,15 @@ class Sensors:
                 return self.states.index(name)
         return -1
 
+    def constants(self, beacon: str, state: Floats) -> tuple[float, float]:
+        """Scale error and bias (m) of a beacon's range in this state; 0 where they are not estimated."""
+        scale, bias = self._columns[beacon]
+        return float(state[scale]) if scale >= 0 else 0.0, float(state[bias]) if bias >= 0 else 0.0
+
+    def range_std(self, range_m: float) -> float:
+        """Standard deviation (m) of one range."""
+        return float(np.sqrt(self.settings.ranges.variances(np.array([range_m]), range_m)[0]))
+
     def measurement(self, events: Sequence[Event | Scan]) -> Measurement | None:
         """The measurement of events of one kind and instant; None for what is no measurement."""
         event, settings = events[0], self.settings
@@ -68,7 +78,9 @@ class Sensors:
             distance = np.array(event.values[:1])
             variance = settings.ranges.variances(distance, self._mean_range(event))[0]
             table = np.array([[*self.beacons[event.beacon][:2], *self._columns[event.beacon]]])
-            covariance = np.diag([variance, settings.bearing_std_rad**2]) * self._repetition(event)
+            repeats = self.repetition(event, self.last_sighting_s.get(event.beacon, -np.inf))
+            self.last_sighting_s[event.beacon] = event.time_s
+            covariance = np.diag([variance, settings.bearing_std_rad**2]) * repeats
             return Measurement(models.LANDMARK, np.array(event.values), covariance, table, 2, (False, True))
         if event.kind == "depth":
             return _direct(event.values, (settings.depth_std_m,), ((2, -1.0),), (False,))
@@ -78,11 +90,11 @@ class Sensors:
             return self._pose(event)
         return None
 
-    def _repetition(self, event: Event) -> float:
-        """Factor on the covariance of a sighting that repeats the error of the one before it."""
-        interval = event.time_s - self.last_sighting_s.get(event.beacon, -np.inf)
-        self.last_sighting_s[event.beacon] = event.time_s
-        return min(max(1.0, REPEATS_S / max(interval, 1e-3)), MOST_REPEATS)
+    def repetition(self, event: Event, last_s: float) -> float:
+        """Factor on the covariance of a sighting, as it repeats the error of the one at `last_s` of the same beacon."""
+        if event.kind != "bearing_range":
+            return 1.0
+        return min(max(1.0, REPEATS_S / max(event.time_s - last_s, 1e-3)), MOST_REPEATS)
 
     def _pose(self, event: Event) -> Measurement:
         far, turned = self.settings.start_std
