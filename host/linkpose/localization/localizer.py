@@ -43,6 +43,10 @@ Method = Literal["scan-match", "ekf", "ukf", "mcl"]
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
 
+# An unscented filter that predicts longer than this (s) places its sigma points anew before it corrects: the points of
+# one transform would be as far apart as the vehicle went. Sensors of the thesis measure at least every 0.2 s.
+LONGEST_UKF_S = 0.5
+
 
 class Row(NamedTuple):
     """The estimate after the measurements of one instant: state (n,) and covariance (n, n), NaN while not known."""
@@ -172,6 +176,9 @@ class Localizer:
         if self.history is not None:
             self.history.predict(self.filter, interval, self.control, self.hold)
             interval = 0.0
+        if self.filter.name == "ukf" and interval > LONGEST_UKF_S and self.laser is None:
+            self.filter.step(interval, self.control, self.hold)
+            interval = 0.0
         passed = self.filter.step(interval, self.control, self.hold, measurement if self.known else None)
         self.now = event.time_s
         if isinstance(event, Scan) and self.laser:
@@ -179,8 +186,11 @@ class Localizer:
         elif measurement is not None and self.known:
             self._count(events, passed)
             self._relocate(events)
-        if isinstance(event, Event):
-            self._steer(event, hold_s)
+        for one in events:
+            if isinstance(one, Event) and one.kind in NAMED:
+                self.sensors.note(one)
+            elif isinstance(one, Event):
+                self.steer(one, hold_s)
         if self.history is not None:
             self.history.correct(self.filter, self.known, self.is_replaced)
         return self._row()
@@ -226,7 +236,7 @@ class Localizer:
             self.laser.add_map_error(self.filter, covariance)
         return Row(time_s, state, covariance)
 
-    def _steer(self, event: Event, hold_s: float | None) -> None:
+    def steer(self, event: Event, hold_s: float | None) -> None:
         """A control holds from its own time on."""
         if event.kind == self.control_kind:
             self.control[: len(event.values)] = event.values
@@ -274,8 +284,12 @@ class Localizer:
         self.rejected += len(passed) - good
         block = {"bearing_range": 2, "pose": 3}.get(kind, 1)
         for i, d2 in enumerate(self.filter.d2):
-            self.consistency.add(kind, block, float(d2))
             event = events[min(i, len(events) - 1)]
+            if not self.sensors.is_independent(event):
+                continue
+            if isinstance(event, Event) and event.beacon:  # as if its variance had not been raised
+                d2 *= self.sensors.repetition(event)
+            self.consistency.add(kind, block, float(d2))
             if isinstance(event, Event) and event.beacon:
                 self.consistency.add(f"{kind}:{event.beacon}", block, float(d2))
         if kind == "range":

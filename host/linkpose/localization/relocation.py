@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.localization import models
-from linkpose.localization.events import NAMED, Event
+from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE, KalmanFilter, Motion
 from linkpose.localization.linalg import Floats

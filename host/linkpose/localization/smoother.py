@@ -66,6 +66,8 @@ class History:
             shift = later - after.predicted
             shift[is_angle] = [wrap_angle(float(value)) for value in shift[is_angle]]
             covariance = now.covariance + gain @ (later_covariance - after.predicted_covariance) @ gain.T
+            if (np.diagonal(covariance) < 0.0).any():  # rounding, where the next step adds next to nothing
+                covariance = now.covariance
             state = now.state + gain @ shift
             state[is_angle] = [wrap_angle(float(value)) for value in state[is_angle]]
             out[i] = state, 0.5 * (covariance + covariance.T)
