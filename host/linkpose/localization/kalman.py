@@ -148,7 +148,10 @@ class KalmanFilter:
             self.grid.blocked,
             self.grid.geometry,
         )
-        if self.name == "ekf":
+        # Readings of states are linear: at one instant both filters' corrections are equal, and the extended one also
+        # works for a heading whose sigma points spread around the circle.
+        is_linear = interval_s == 0.0 and measurement.model == models.DIRECT
+        if self.name == "ekf" or is_linear:
             sound = ekf_step(*arguments)
         else:
             sound = ukf_step(*arguments, self.transform.alpha, self.transform.beta, self.transform.kappa)
@@ -156,6 +159,12 @@ class KalmanFilter:
             raise NotPositiveDefinite("covariance", f"the filter {self.name}")
         self.d2 = d2
         return np.asarray(d2 <= threshold)
+
+    def predict_linearised(self, interval_s: float, control: Floats, hold_s: Floats) -> None:
+        """Moves on as `step` does, by the model's Jacobians, whatever the filter."""
+        name, self.name = self.name, "ekf"
+        self.step(interval_s, control, hold_s)
+        self.name = name
 
     def copy(self) -> KalmanFilter:
         """A filter with the same state that goes on by itself."""

@@ -43,8 +43,8 @@ Method = Literal["scan-match", "ekf", "ukf", "mcl"]
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
 
-# An unscented filter that predicts longer than this (s) places its sigma points anew before it corrects: the points of
-# one transform would be as far apart as the vehicle went. Sensors of the thesis measure at least every 0.2 s.
+# An unscented filter predicts longer intervals (s) by linearisation: the headings of its sigma points spread around the
+# circle then, and have no mean. Sensors of the thesis measure at least every 0.2 s.
 LONGEST_UKF_S = 0.5
 
 
@@ -177,7 +177,7 @@ class Localizer:
             self.history.predict(self.filter, interval, self.control, self.hold)
             interval = 0.0
         if self.filter.name == "ukf" and interval > LONGEST_UKF_S and self.laser is None:
-            self.filter.step(interval, self.control, self.hold)
+            self.filter.predict_linearised(interval, self.control, self.hold)
             interval = 0.0
         passed = self.filter.step(interval, self.control, self.hold, measurement if self.known else None)
         self.now = event.time_s

@@ -26,6 +26,7 @@ from linkpose.localization.measuring import Sensors
 # Of the latest so many measurements, so many contradict the pose: fewer are outliers, more delay the recovery.
 LATEST, CONTRADICTIONS = 4, 3
 CONTRADICTS = 0.997  # probability below which the χ² test calls an innovation possible
+EXPLAINS = 0.95  # the same for the sum of squares of a fit: it replaces a pose only if it is good
 # Most sightings of one fit, and the longest time (s) that they span. Dead reckoning links them, so that a longer window
 # adds its errors; a shorter one does not determine the heading.
 MOST_SIGHTINGS, WINDOW_S = 16, 20.0
@@ -151,11 +152,10 @@ class Relocator:
 
     def _contradicting(self) -> list[_Sighting]:
         """The sightings since the first that contradicts the pose, when most of the latest do; else none."""
-        latest = list(self.sightings)[-LATEST:]
-        if sum(sighting.contradicts for sighting in latest) < CONTRADICTIONS:
-            return []
-        now = latest[-1].time_s
+        now = self.sightings[-1].time_s
         recent = [sighting for sighting in self.sightings if sighting.time_s > now - WINDOW_S]
+        if sum(sighting.contradicts for sighting in recent[-LATEST:]) < CONTRADICTIONS:
+            return []
         first = next(i for i, sighting in enumerate(recent) if sighting.contradicts)
         # Accepted sightings before the robot was carried do not count: those of the run that most rejections form.
         while first < len(recent) - LATEST and not all(s.contradicts for s in recent[first : first + 2]):
@@ -176,10 +176,11 @@ class Relocator:
         spread = float(np.sqrt(covariance[0, 0] + covariance[1, 1]))
         far = np.hypot(*(found[:, :2] - found[best, :2]).T) > max(SAME_PLACE_M, 3.0 * spread)
         rival = float(np.min(costs[far], initial=np.inf))
-        explains = costs[best] < chi_square_quantile(CONTRADICTS, problem.rows)
+        surplus = problem.rows - len(self.at)
+        explains = surplus < SURPLUS or costs[best] < chi_square_quantile(EXPLAINS, surplus)
         wins = rival > costs[best] + UNIQUE and problem.cost(run.state[self.at][np.newaxis])[0] > costs[best] + LEAD
-        enough = problem.rows >= len(self.at) + SURPLUS
-        return Relocation(self.at, found[best], covariance, bool(explains and (settling or (wins and enough))))
+        certain = explains and (settling or (wins and surplus >= SURPLUS))
+        return Relocation(self.at, found[best], covariance, bool(certain))
 
     def _starts(self, sightings: list[_Sighting]) -> Floats:
         """A grid over the beacons and as far around them as the ranges reach, with headings all around."""
