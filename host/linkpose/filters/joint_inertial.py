@@ -46,8 +46,8 @@ class InertialParameters(NamedTuple):
     # (rad/s)/√s: twice the rate random walk of an MPU-6050 at constant temperature (its Allan deviation is 0.003 °/s at
     # 100 s), since it also warms up. Doubled, the heading drifts by 10 % more.
     gyro_bias_walk_rad_s: float = 2e-5
-    # (rad/s)/√s: upper bound, used where the residual of the constraint exceeds its floor. Chosen on a real pendulum: a quarter
-    # of it costs 5 % of the tilt there.
+    # (rad/s)/√s: upper bound, used where the residual of the constraint exceeds its floor. Chosen on a real pendulum:
+    # a quarter of it costs 5 % of the tilt there.
     most_bias_walk_rad_s: float = 4e-4
     # 1/√s, share of J2S's initial σ: lets an error of the model leave J2S again. Doubled, the height's σ grows by 10 %.
     j2s_walk: float = 0.001
@@ -158,7 +158,7 @@ class JointInertialFilter:
     def start_from(self, other_filter: JointInertialFilter, backwards: bool = False) -> None:
         """Begin with another filter's estimates of J2S and of the sensor errors; `backwards`: with time reversed.
 
-        The gyro bias drifts. The other filter's estimate belongs to the end of the recording, where reversed time starts.
+        The gyro bias drifts. The other filter's estimate belongs to the end of the recording, where this one starts.
         """
         first = BG if backwards else BA
         for own, other in zip(self.states, other_filter.states, strict=True):
