@@ -1,14 +1,15 @@
-"""`joint-inertial` over a whole recording: each estimate from what came before it and from what came after.
+"""`joint-inertial` over a whole recording: each estimate uses all samples, those before it and those after it.
 
-A fixed-interval smoother of two filters. One runs forward; the other runs from the end, where the same equations hold
-with t, ω, b_g and v of the opposite sign and s_A, Z, b_a, d and the matrices as they are: it is the same filter on the
-recording reversed. Both begin with what a pass ahead has found of J2S and of the sensors' errors, which are constants.
-At each sample the two are weighted by the inverse of their variances,
+A two-filter fixed-interval smoother. One filter runs forward, the other backward from the end. Backward, the same
+equations hold with the signs of t, ω, b_g and v reversed and s_A, Z, b_a, d and the matrices unchanged, so that the
+backward filter is the same filter on the reversed recording. A preceding pass estimates J2S (the vector from the joint
+centre to the sensor) and the sensor error parameters; both filters start from these. At each sample the two estimates
+are weighted with their inverse variances,
 
     h = (h_f/σ_f² + h_b/σ_b²) σ²,   1/σ² = 1/σ_f² + 1/σ_b²
 
-and σ is no less than what J2S alone leaves, which both have in common. What is kept is each filter's estimate, 64
-bytes a sample: 23 MB for an hour at 100 Hz.
+and σ is at least the part caused by J2S, an error that both filters have in common. Memory: both filters' estimates, 64
+bytes per sample, 23 MB for an hour at 100 Hz.
 
 Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE
 Trans. Automatic Control 14(4), 1969.
@@ -44,13 +45,13 @@ class JointInertialSmoother:
     columns = JointInertialFilter.columns
 
     def __init__(self, rig: Rig) -> None:
-        """The rig must know J2S, be it as roughly as `j2s_std_m` says."""
+        """Raises ValueError where the rig has no J2S; `j2s_std_m` of the rig states how uncertain it is."""
         self._rig = rig
         self._ahead = JointInertialFilter(rig)
 
     @property
     def rejected(self) -> int:
-        """Samples that the pass ahead could not use, or whose innovation its gate refused."""
+        """Number of samples in the first pass that were unusable or whose innovation the gate rejected."""
         return self._ahead.rejected
 
     @property
@@ -61,7 +62,7 @@ class JointInertialSmoother:
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 14) in the order of `columns`.
 
-        The block is the whole recording: it is not added to what came before.
+        The block is a whole recording; each call starts anew.
         """
         self._ahead = JointInertialFilter(self._rig)
         self._ahead.process(block)
@@ -79,7 +80,7 @@ def _reversed_rig(rig: Rig) -> Rig:
 
 
 def _reversed(block: Measurements) -> Measurements:
-    """The recording as it would have been, had time run backwards; only what the filter reads is turned."""
+    """The recording with time reversed. Only the arrays that the filter reads are changed."""
     at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
     accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
     accel_bit, gyro_bit = np.uint32(SampleFlags.ACCEL_SATURATED), np.uint32(SampleFlags.GYRO_SATURATED)
@@ -94,10 +95,10 @@ def _reversed(block: Measurements) -> Measurements:
 
 
 def _next_reading(time_s: Floats, values: Floats) -> NDArray[np.int64]:
-    """At each sample the one whose reading is to be held there when time runs backwards.
+    """Index, for each sample, of the sample whose reading applies to it with time reversed.
 
-    A reading that is held belongs to the first of its samples. Backwards it is therefore to last from there on, over
-    the samples before it, and not over those that repeat it.
+    A repeated reading was measured at the first of its samples. With time reversed it therefore holds over the samples
+    before that one, not over its repetitions.
     """
     n = len(time_s)
     own = np.arange(n)
@@ -108,7 +109,7 @@ def _next_reading(time_s: Floats, values: Floats) -> NDArray[np.int64]:
 
 
 def _combined(forward: Floats, backward: Floats, j2s_m: Floats, j2s_covariance: Floats) -> Floats:
-    """The mean of both, weighted by the inverse variances of the height; one filter's estimate where the other is NaN.
+    """The mean, weighted by the inverse variances of the height; where one filter is NaN, the other's estimate.
 
     The heading is that of the forward filter: both headings are relative to their own first sample, and the forward
     filter already uses the biases of the whole recording.
