@@ -42,6 +42,7 @@ CURVE_ROWS, MAP_ROWS = 5, 8
 POINT_INTERVAL_S = 0.05  # between two points of a curve: a column of dots is wider
 PATH_POINTS = 4000  # of the map; older ones are thinned out
 WIDEST = 78
+BLOCKS = 250  # of estimates whose extremes are found at once
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 
 
@@ -308,11 +309,20 @@ class Extremes:
         self._high = dict.fromkeys(self._of, -math.inf)
         self._squares = dict.fromkeys(self._of, 0.0)
         self._count = dict.fromkeys(self._of, 0)
+        self._waiting: list[Floats] = []  # blocks not yet in these
 
     def add(self, estimates: Floats) -> None:
         """Adds a block of estimates (N, columns)."""
+        self._waiting.append(estimates)
+        if len(self._waiting) >= BLOCKS:
+            self._fold()
+
+    def _fold(self) -> None:
+        """Adds the waiting blocks at once: NumPy takes 0.3 ms for one row as for a thousand."""
         import numpy as np
 
+        estimates = np.concatenate(self._waiting)
+        self._waiting.clear()
         for name, (value_at, std_at) in self._of.items():
             known = np.isfinite(estimates[:, value_at])
             if not known.any():
@@ -325,6 +335,8 @@ class Extremes:
 
     def summary(self) -> dict[str, tuple[float, float, float]]:
         """Filter -> (lowest, highest, RMS of σ), of filters that estimated a height."""
+        if self._waiting:
+            self._fold()
         return {
             name: (
                 low,
