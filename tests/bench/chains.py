@@ -3,12 +3,11 @@
     python tests/bench/chains.py [--data FOLDER] [--only TEXT] [--json]
 
 FOLDER (../shared/data beside the checkout) holds diodem_chain, openaxes_robot and mpu6050_encoder, each as its authors
-published it; a missing one is named and skipped. Our filter is causal and is given the kind of the joint alone; its
-`--smooth` row uses the whole recording.
+published it; a missing one is named and skipped. Our filter is causal and is given the kind of the joint alone.
 
 Peers: two VQF without and with a magnetometer (`vqf_6d`, `vqf_9d`), and for hinges qmt's heading correction of the
-former, with windows that end at the estimate (`qmt_causal`) or lie around it (`qmt_batch`); both use axes that qmt finds
-from the whole recording. qmt's correction of ball joints needs the ranges of the joint's angles, which are not known.
+former, with windows that end at the estimate (`qmt_causal`) or lie around it (`qmt_batch`); both use axes that qmt
+finds from the whole recording. qmt's correction of ball joints needs the ranges of the joint's angles: not known here.
 
 The error is the root mean square angle between the relative rotations after a constant alignment on either side,
 without the first 5 s. The reference is read
@@ -28,7 +27,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ from real_data import ENCODER_DELAY_S, Pair, matrices, read_encoder, read_robot
 from vqf import VQF
 
 import linkpose as lp
+from linkpose import filters
 from linkpose.sensors.measurements import Floats
 
 SKIPPED_S = 5.0
@@ -136,7 +137,7 @@ class Found(NamedTuple):
     sample_us: float
 
 
-def ours(case: Case, smooth: bool = False) -> Found:
+def ours(case: Case) -> Found:
     """The chain filter, with nothing known but the kind of the joint."""
     accel, gyro = case.pair.accel_m_s2, case.pair.gyro_rad_s
     measured = lp.Measurements.from_imu(
@@ -144,7 +145,7 @@ def ours(case: Case, smooth: bool = False) -> Found:
     )
     began = time.perf_counter()
     joint = "hinge" if case.joint == "hinge" else "ball"
-    estimates = lp.estimate(measured, filters=["chain"], joint=joint, smooth=smooth)
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint)
     took = time.perf_counter() - began
     quaternion = np.column_stack([estimates[f"chain_q{axis}"] for axis in "wxyz"])
     return Found(quaternion, estimates["chain_rotation_std_deg"], 1e6 * took / len(accel))
@@ -165,7 +166,9 @@ def peers(case: Case) -> Iterator[tuple[str, Found]]:
         began = time.perf_counter()
         axis1, axis2 = _hinge_axes(case)
         turned = qmt.qmult(first, _onto_z(axis1)), qmt.qmult(second, _onto_z(axis2))
-        rates = [qmt.rotate(qmt.qinv(_onto_z(axis)), case.pair.gyro_rad_s[:, k]) for k, axis in ((0, axis1), (1, axis2))]
+        rates = [
+            qmt.rotate(qmt.qinv(_onto_z(axis)), case.pair.gyro_rad_s[:, k]) for k, axis in ((0, axis1), (1, axis2))
+        ]
         at = np.arange(len(first)) * step
         axes_took = time.perf_counter() - began
         for name, alignment in (("qmt_causal", "backward"), ("qmt_batch", "center")):
@@ -194,7 +197,8 @@ def _found(first: Floats, second: Floats, took: float) -> Found:
 def _hinge_axes(case: Case) -> tuple[Floats, Floats]:
     """Axis of the hinge in either sensor's axes; qmt leaves the sense between the two open in slow motion."""
     accel, gyro = case.pair.accel_m_s2, case.pair.gyro_rad_s
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints each step
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():  # it prints each step
+        warnings.simplefilter("ignore")
         found = qmt.jointAxisEstHingeOlsson(
             accel[:, 0], accel[:, 1], gyro[:, 0], gyro[:, 1], {"useSampleSelection": True}
         )
@@ -257,12 +261,10 @@ def scores(case: Case, found: Found) -> dict[str, object]:
     return out
 
 
-def rows(case: Case, smooth: bool) -> Iterator[dict[str, object]]:
+def rows(case: Case) -> Iterator[dict[str, object]]:
     """The scores of each filter on a pair of sensors."""
     about = {"set": case.data, "data": case.name, "joint": case.joint, "chosen_on": case.chosen_on}
     yield {**about, "filter": "chain", **scores(case, ours(case))}
-    if smooth:
-        yield {**about, "filter": "chain --smooth", **scores(case, ours(case, smooth=True))}
     for name, found in peers(case):
         yield {**about, "filter": name, **scores(case, found)}
 
@@ -273,13 +275,14 @@ def main() -> None:
     parser.add_argument("--only", default="", help="only pairs with this text in their name")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    filters.warm_up(["chain"])
     for name, read in SETS.items():
         if not (options.data / name).is_dir():
             print(f"{options.data / name} is missing: skipped", file=sys.stderr)
             continue
         for case in read(options.data / name):
             if options.only in case.name:
-                for row in rows(case, smooth=False):
+                for row in rows(case):
                     print(json.dumps(row) if options.json else _text(row), flush=True)
 
 
