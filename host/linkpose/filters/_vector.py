@@ -129,6 +129,12 @@ def load(a: Floats) -> Vec:
 
 
 @inner
+def row(a: Floats, i: int) -> Vec:
+    """Row i of an (N, 3) array."""
+    return (a[i, 0], a[i, 1], a[i, 2])
+
+
+@inner
 def store(a: Floats, value: Vec) -> None:
     """Store a vector in the first three elements of an array."""
     a[0], a[1], a[2] = value
