@@ -54,6 +54,7 @@ class Case(NamedTuple):
     errors_deg: Callable[[Floats], Floats]  # of tilts (N, 3): one per sample of the reference, NaN where unknown
     joint: Joint | None
     delay_s: float
+    truth: Floats | None = None  # tilts (N, 3) at the samples, NaN where unknown
 
     def error_deg(self, tilt: Floats) -> float:
         """Root mean square error of tilts (N, 3)."""
@@ -79,7 +80,7 @@ def pendulum(folder: Path) -> Iterator[Case]:
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         name = "pendulum " + path.stem[13:23]
-        yield Case("repoimu_pendulum", name, time_s, accel, gyro, _against(tilt), PENDULUM_J2S, PENDULUM_DELAY_S)
+        yield Case("repoimu_pendulum", name, time_s, accel, gyro, _against(tilt), PENDULUM_J2S, PENDULUM_DELAY_S, tilt)
 
 
 def broad(folder: Path) -> Iterator[Case]:
@@ -90,7 +91,7 @@ def broad(folder: Path) -> Iterator[Case]:
         tilt = _matrices(data["opt_quat"])[:, 2, :]
         tilt[~data["movement"].ravel().astype(bool)] = np.nan
         time_s = np.arange(len(accel)) / float(data["sampling_rate"].item())
-        yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, _against(tilt), None, BROAD_DELAY_S)
+        yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, _against(tilt), None, BROAD_DELAY_S, tilt)
 
 
 def encoder(folder: Path) -> Iterator[Case]:
@@ -127,7 +128,7 @@ def robot(folder: Path) -> Iterator[Case]:
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         yield Case(
-            "openaxes_robot", "robot " + path.stem[:-4], time_s, accel, gyro, _against(tilt), None, ROBOT_DELAY_S
+            "openaxes_robot", "robot " + path.stem[:-4], time_s, accel, gyro, _against(tilt), None, ROBOT_DELAY_S, tilt
         )
 
 
@@ -215,7 +216,12 @@ def tilt_of(name: str, case: Case) -> Floats:
     """A filter's tilts (N, 3)."""
     rig = Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))
     made = JointInertialSmoother(rig) if name == "--smooth" else filters.create(name, rig)
-    roll, pitch = np.radians(made.process(block_of(case))[:, 2:4]).T
+    return tilt_from(made.process(block_of(case)))
+
+
+def tilt_from(estimate: Floats) -> Floats:
+    """Tilts (N, 3) of estimates whose third and fourth columns are roll and pitch (°)."""
+    roll, pitch = np.radians(estimate[:, 2:4]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
 
 

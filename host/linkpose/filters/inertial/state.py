@@ -74,6 +74,7 @@ _FIELDS = np.dtype(
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
+        ("rest_force_sum", *_VECTOR),  # ∫ force over the rest (m/s)
         ("rest_rate_sum", *_VECTOR),  # ∫ rate over the rest (rad)
         ("steady_force", *_VECTOR),  # force without its noise (m/s²)
         ("residual_square", "f8"),  # mean square of the joint constraint's excess residual (m²/s²)
