@@ -23,14 +23,17 @@ from linkpose.filters.inertial.state import (
     BA,
     BG,
     ESTIMATE,
+    HEIGHT,
     MA,
     PSI,
+    ROLL,
+    YAW,
     D,
     Floats,
     SensorErrors,
+    X,
     fresh_state,
     record_of,
-    roll_pitch_deg,
 )  # fmt: skip
 from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
@@ -101,6 +104,11 @@ class JointInertialFilter:
         "joint_inertial_x_m",
         "joint_inertial_y_m",
         "joint_inertial_z_m",
+        "joint_inertial_roll_std_deg",
+        "joint_inertial_pitch_std_deg",
+        "joint_inertial_x_std_m",
+        "joint_inertial_y_std_m",
+        "joint_inertial_z_std_m",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -170,7 +178,7 @@ class JointInertialFilter:
                 own.start_covariance[:, BG:BA] *= -1
 
     def process(self, block: Measurements) -> Floats:
-        """Estimates at each of the N samples: (N, 9) in the order of `columns`; NaN where unknown so far."""
+        """Estimates at each of the N samples: (N, 14) in the order of `columns`; NaN where unknown so far."""
         n = len(block)
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
         estimates = [np.empty(n, ESTIMATE) for _ in self._states]
@@ -179,10 +187,13 @@ class JointInertialFilter:
                 block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
                 self._imu, self._record, states, estimate,
             )  # fmt: skip
-        found = mix(*estimates)
+        values, stds = mix(*estimates)
+        for found in (values, stds):
+            found[:, ROLL:] = np.degrees(found[:, ROLL:])
+        height, std = values[:, HEIGHT], stds[:, HEIGHT]
         return np.column_stack(
             [
-                found["height"], found["height_std"], *roll_pitch_deg(found["tilt"]),
-                np.degrees(found["yaw"]), np.degrees(found["yaw_std"]), found["x"], found["y"], found["height"],
+                height, std, values[:, ROLL:YAW], values[:, YAW], stds[:, YAW], values[:, X:ROLL], height,
+                stds[:, ROLL:YAW], stds[:, X:ROLL], std,
             ]
         )  # fmt: skip

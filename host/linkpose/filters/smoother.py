@@ -23,11 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.filters.inertial.process import LONGEST_HOLD_S
-from linkpose.filters.inertial.state import roll_pitch_deg
+from linkpose.filters.inertial.state import roll_pitch
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig, Vector
 from linkpose.wire.messages import SampleFlags
+
+_HEIGHT, _STD, _ROLL, _PITCH, _YAW, _X, _Y, _Z, _ROLL_STD, _PITCH_STD, _Z_STD = (
+    JointInertialFilter.columns.index(f"joint_inertial_{name}")
+    for name in (
+        "height_m", "height_std_m", "roll_deg", "pitch_deg", "yaw_deg", "x_m", "y_m", "z_m", "roll_std_deg",
+        "pitch_std_deg", "z_std_m",
+    )
+)  # fmt: skip
 
 
 class JointInertialSmoother:
@@ -52,7 +60,7 @@ class JointInertialSmoother:
         return self._ahead.j2s_m
 
     def process(self, block: Measurements) -> Floats:
-        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
+        """Estimates at each of the N samples: (N, 14) in the order of `columns`.
 
         The block is a whole recording; each call starts anew.
         """
@@ -106,21 +114,25 @@ def _combined(forward: Floats, backward: Floats, j2s_m: Floats, j2s_covariance: 
     The heading is that of the forward filter: both headings are relative to their own first sample, and the forward
     filter already uses the biases of the whole recording.
     """
-    both = np.flatnonzero(~np.isnan(forward[:, 4]) & ~np.isnan(backward[:, 4]))
+    both = np.flatnonzero(~np.isnan(forward[:, _YAW]) & ~np.isnan(backward[:, _YAW]))
     if len(both):
-        backward[:, 4] += forward[both[0], 4] - backward[both[0], 4]
-    forward = np.where(np.isnan(forward[:, 2:3]), backward, forward)
-    backward = np.where(np.isnan(backward[:, 2:3]), forward, backward)
-    before, after = forward[:, 1] ** 2, backward[:, 1] ** 2
+        backward[:, _YAW] += forward[both[0], _YAW] - backward[both[0], _YAW]
+    forward = np.where(np.isnan(forward[:, _ROLL : _ROLL + 1]), backward, forward)
+    backward = np.where(np.isnan(backward[:, _ROLL : _ROLL + 1]), forward, backward)
+    before, after = forward[:, _STD] ** 2, backward[:, _STD] ** 2
     share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
     tilt = share[:, None] * _tilt(forward) + (1 - share[:, None]) * _tilt(backward)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     common = np.einsum("ni,ij,nj->n", tilt, j2s_covariance, tilt)
-    height = share * forward[:, 0] + (1 - share) * backward[:, 0]
-    roll, pitch = roll_pitch_deg(tilt)
-    x, y = _horizontal(np.radians(roll), np.radians(pitch), np.radians(forward[:, 4]), j2s_m)
-    std = np.sqrt(np.maximum(share * before, common))
-    return np.column_stack([height, std, roll, pitch, forward[:, 4], forward[:, 5], x, y, height])
+    found = forward.copy()
+    roll, pitch = roll_pitch(tilt)
+    found[:, _ROLL], found[:, _PITCH] = np.degrees(roll), np.degrees(pitch)
+    for column in (_ROLL_STD, _PITCH_STD):
+        found[:, column] = np.hypot(share * forward[:, column], (1 - share) * backward[:, column])
+    found[:, _X], found[:, _Y] = _horizontal(roll, pitch, np.radians(forward[:, _YAW]), j2s_m)
+    found[:, _HEIGHT] = found[:, _Z] = share * forward[:, _HEIGHT] + (1 - share) * backward[:, _HEIGHT]
+    found[:, _STD] = found[:, _Z_STD] = np.sqrt(np.maximum(share * before, common))
+    return found
 
 
 def _horizontal(roll: Floats, pitch: Floats, yaw: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -132,5 +144,5 @@ def _horizontal(roll: Floats, pitch: Floats, yaw: Floats, d: Floats) -> tuple[Fl
 
 def _tilt(estimate: Floats) -> Floats:
     """Z (N, 3) from roll and pitch."""
-    roll, pitch = np.radians(estimate[:, 2:4]).T
+    roll, pitch = np.radians(estimate[:, [_ROLL, _PITCH]]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])

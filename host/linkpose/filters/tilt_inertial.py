@@ -21,11 +21,13 @@ from linkpose.filters.inertial.state import (
     BA,
     BG,
     ESTIMATE,
+    HEIGHT,
+    ROLL,
+    YAW,
     Floats,
     SensorErrors,
     fresh_state,
     record_of,
-    roll_pitch_deg,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
 from linkpose.sensors.frozen import FrozenDetector
@@ -52,6 +54,8 @@ class TiltInertialFilter:
         "tilt_inertial_height_std_m",
         "tilt_inertial_roll_deg",
         "tilt_inertial_pitch_deg",
+        "tilt_inertial_roll_std_deg",
+        "tilt_inertial_pitch_std_deg",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -86,13 +90,15 @@ class TiltInertialFilter:
         return np.asarray(self.state.nominal[BG:BA].copy())
 
     def process(self, block: Measurements) -> Floats:
-        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
+        """Estimates at each of the N samples: (N, 6) in the order of `columns`; NaN where not known yet."""
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
         estimates = np.empty(len(block), ESTIMATE)
         process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
             self._imu, self._record, self._states, estimates,
         )  # fmt: skip
+        values, stds = estimates["value"], estimates["std"]
         if not self._has_height:
-            estimates["height"] = estimates["height_std"] = np.nan
-        return np.column_stack([estimates["height"], estimates["height_std"], *roll_pitch_deg(estimates["tilt"])])
+            values[:, HEIGHT] = stds[:, HEIGHT] = np.nan
+        tilts, their_stds = np.degrees(values[:, ROLL:YAW]), np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi))
+        return np.column_stack([values[:, HEIGHT], stds[:, HEIGHT], tilts, their_stds])

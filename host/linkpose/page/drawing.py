@@ -12,7 +12,7 @@ from linkpose import quantities
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
 from linkpose.presentation import Row, RowReader, best_filter
-from linkpose.quantities import ANGLE, HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from linkpose.page.scene import Surroundings
 
-_SHOWN_BY = (HEIGHT, HEADING, ROLL, ANGLE, QW)  # the first that is known selects the best filter
+_SHOWN_BY = (QW, HEIGHT, HEADING, ROLL)  # the first that is known selects the best filter
 
 
 class Drawing:

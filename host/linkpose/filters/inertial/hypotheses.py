@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.filters.inertial.state import Floats, SensorErrors
+from linkpose.filters.inertial.state import HEIGHT, PITCH, ROLL, YAW, Floats, SensorErrors, roll_pitch
 
 # What a calibration leaves (simulated twelve-position calibration, ../simulation/link.py), and what the MPU-6050's data
 # sheet allows (zero-rate output ±20 °/s after a rough subtraction, zero-g output ±50 mg, scale ±3 %, cross-axis ±2 %).
@@ -37,31 +37,34 @@ def log_odds(first: Floats, second: Floats) -> Floats:
     return np.clip(_LOG_ODDS + _OCCAM * second - first, -_MOST, _MOST)
 
 
-def mix(a: NDArray[Any], b: NDArray[Any]) -> dict[str, Floats]:
-    """The mean of two filters' estimates (arrays (N,) of ESTIMATE) as arrays (N,); `tilt` is (N, 3), not normalised.
+def mix(a: NDArray[Any], b: NDArray[Any]) -> tuple[Floats, Floats]:
+    """The mean of two filters' estimates (arrays (N,) of ESTIMATE): values and σ (N, 6), in the order of ESTIMATE.
 
-    A variance includes how far the filters differ. Where one filter has no height, the other's counts alone.
+    A variance includes how far the filters differ. Where one filter has no position, the other's counts alone.
     """
-    share = 1.0 / (1.0 + np.exp(-log_odds(a["distance"], b["distance"])))
-    unknown_a, unknown_b = np.isnan(a["height"]), np.isnan(b["height"])
-    lone = np.where(unknown_b & ~unknown_a, 1.0, share)
-    lone = np.where(unknown_a & ~unknown_b, 0.0, lone)
-    found: dict[str, Floats] = {"tilt": a["tilt"] * share[:, None] + b["tilt"] * (1.0 - share)[:, None]}
-    for name in ("height", "x", "y"):
-        found[name] = _mixed(lone, a[name], b[name])
-    found["height_std"] = _mixed_std(lone, a["height"], a["height_std"], b["height"], b["height_std"])
-    turn = (b["yaw"] - a["yaw"] + np.pi) % (2 * np.pi) - np.pi
-    found["yaw"] = (a["yaw"] + (1.0 - share) * turn + np.pi) % (2 * np.pi) - np.pi
-    found["yaw_std"] = np.minimum(_mixed_std(share, 0.0 * turn, a["yaw_std"], turn, b["yaw_std"]), np.pi)
-    return found
+    probability = 1.0 / (1.0 + np.exp(-log_odds(a["distance"], b["distance"])))
+    share = np.repeat(probability[:, None], YAW + 1, axis=1)
+    unknown_a, unknown_b = np.isnan(a["value"][:, HEIGHT]), np.isnan(b["value"][:, HEIGHT])
+    share[unknown_b & ~unknown_a, :ROLL] = 1.0
+    share[unknown_a & ~unknown_b, :ROLL] = 0.0
+    apart = b["value"] - a["value"]
+    apart[:, ROLL:] = wrapped(apart[:, ROLL:])
+    values = _mixed(share, a["value"], np.where(share == 0.0, b["value"], a["value"] + apart))
+    # Roll and pitch of the mean tilt: near the vertical, the mean of two angles is not that of their tilts.
+    values[:, ROLL], values[:, PITCH] = roll_pitch(_mixed(probability[:, None], a["tilt"], b["tilt"]))
+    values[:, YAW] = wrapped(values[:, YAW])
+    both = share * (1.0 - share)
+    between = np.where(both == 0.0, 0.0, both * np.square(apart))
+    stds = np.sqrt(_mixed(share, np.square(a["std"]), np.square(b["std"])) + between)
+    stds[:, ROLL:] = np.minimum(stds[:, ROLL:], np.pi)
+    return values, stds
+
+
+def wrapped(angle: Floats) -> Floats:
+    """An angle (rad) between −π and π."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _mixed(share: Floats, a: Floats, b: Floats) -> Floats:
+    """`share` of a and the rest of b; one alone where its share is 1, whatever the other is."""
     return np.where(share == 1.0, a, np.where(share == 0.0, b, share * a + (1.0 - share) * b))
-
-
-def _mixed_std(share: Floats, a: Floats, a_std: Floats, b: Floats, b_std: Floats) -> Floats:
-    """Standard deviation of a mixture of two."""
-    apart = _mixed(share, np.square(a - b), 0.0 * a) * (1.0 - share)
-    apart = np.where(share * (1.0 - share) == 0.0, 0.0, apart)
-    return np.sqrt(_mixed(share, np.square(a_std), np.square(b_std)) + apart)

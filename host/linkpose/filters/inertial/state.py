@@ -88,6 +88,7 @@ _FIELDS = np.dtype(
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
+        ("gradient", "f8", (7,)),  # of a reported value with respect to Z, d and ψ
         ("work", "f8", (7, SIZE)),
         # Counters.
         ("rejected", "i8"),
@@ -115,15 +116,14 @@ def _with_parts(dtype: np.dtype[Any], whole: str, parts: dict[str, int]) -> np.d
 
 STATE = _with_parts(_FIELDS, "nominal", {"tilt": Z, "velocity": V, "gyro_bias": BG, "accel_bias": BA, "j2s": D})
 
+# Places of the reported values.
+HEIGHT, X, Y, ROLL, PITCH, YAW = (_index(k) for k in range(6))
+
 ESTIMATE = np.dtype(
     [
-        ("height", "f8"),  # Zᵀd (m)
-        ("height_std", "f8"),
+        ("value", "f8", (6,)),  # height Zᵀd, x, y (m); roll, pitch, yaw (rad)
+        ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
-        ("x", "f8"),  # m
-        ("y", "f8"),
-        ("yaw", "f8"),  # rad
-        ("yaw_std", "f8"),
         ("distance", "f8"),  # `distance` of the state
     ],
     align=True,
@@ -173,7 +173,7 @@ def fresh_state(
     return states
 
 
-def roll_pitch_deg(tilt: Floats) -> tuple[Floats, Floats]:
-    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖) (degrees, (N,)) of tilts (N, 3) of any length."""
+def roll_pitch(tilt: Floats) -> tuple[Floats, Floats]:
+    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖) (rad, (N,)) of tilts (N, 3) of any length."""
     roll = np.arctan2(tilt[:, 1], tilt[:, 2])
-    return np.degrees(roll), np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2])))
+    return roll, np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))
