@@ -133,7 +133,7 @@ class Estimator:
         Raises as the constructor does.
         """
         settings = BoardSettings.of(board.hello)
-        rig = with_chain_joint(board.rig.with_delay_of(settings.dlpf), chain_joint)
+        rig = with_chain_joint(board.rig.with_delay(settings.imu_delay_s), chain_joint)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
@@ -395,9 +395,9 @@ def estimate(
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError.
     """
     recording = load_recording(source) if isinstance(source, str | PathLike) else source
-    own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
+    own, delay_s = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.imu_delay_s)
     measurements = recording if isinstance(recording, Measurements) else recording.measurements
-    in_force = as_rig(rig, own).with_delay_of(dlpf)
+    in_force = as_rig(rig, own).with_delay(delay_s)
     first_joint = _joint(j2s_m, j2s_std_m)
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)

@@ -18,7 +18,7 @@ from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import Status
 from linkpose.presentation import Exclusions, RowReader, best_filter, fault_lines, working_sensors
-from linkpose.quantities import ANGLE, EXCLUDED, HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.quantities import EXCLUDED, HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -139,7 +139,7 @@ class Page:
         self._panel = Panel(server, self._columns, self._changed.set)
         self._scene: LinkScene | RobotScene | ChainScene
         if any(QW in of for of in filters):
-            self._scene = ChainScene(server)
+            self._scene = ChainScene(server, rig)
         elif any(HEADING in of for of in filters) and not any(HEIGHT in of for of in filters):
             self._scene = RobotScene(server, surroundings)
         else:
@@ -233,7 +233,7 @@ class Page:
             self._panel.draw_charts(self._history.window(), name)
 
     def _best(self, row: Any) -> str | None:
-        for quantity in (HEIGHT, HEADING, ROLL, ANGLE, QW):
+        for quantity in (QW, HEIGHT, HEADING, ROLL):
             name = best_filter(row, self._rows.filters, quantity)
             if name is not None:
                 return name
