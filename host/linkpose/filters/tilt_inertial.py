@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
@@ -30,7 +30,6 @@ from linkpose.filters.inertial.state import (
     record_of,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -67,7 +66,6 @@ class TiltInertialFilter:
             declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def state(self) -> Any:
@@ -91,14 +89,10 @@ class TiltInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 6) in the order of `columns`; NaN where not known yet."""
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.empty(len(block), ESTIMATE)
-        process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-            self._imu, self._record, self._states, estimates,
-        )  # fmt: skip
+        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 6))
+        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
         values, stds = estimates["value"], estimates["std"]
-        if not self._has_height:
-            values[:, HEIGHT] = stds[:, HEIGHT] = np.nan
-        tilts, their_stds = np.degrees(values[:, ROLL:YAW]), np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi))
-        return np.column_stack([values[:, HEIGHT], stds[:, HEIGHT], tilts, their_stds])
+        table[:, 0], table[:, 1] = (values[:, HEIGHT], stds[:, HEIGHT]) if self._has_height else (np.nan, np.nan)
+        np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
+        np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi), out=table[:, 4:])
+        return table

@@ -10,12 +10,12 @@ import math
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     ImuCalibration,
+    ImuSamples,
     blind_for,
     is_bounded,
     read_accel,
@@ -24,6 +24,7 @@ from linkpose.filters._imu import (
     unknown_accel,
 )
 from linkpose.filters._vector import Vec
+from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
 from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
 from linkpose.filters.inertial.joint_velocity import update_joint_velocity
@@ -55,7 +56,6 @@ from linkpose.filters.inertial.state import (
     SIZE,
     YAW,
     D,
-    Floats,
     Record,
     V,
     X,
@@ -85,32 +85,31 @@ _UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the h
 
 @compiled
 def process(
-    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint32], dead: NDArray[np.bool_],
-    imu: ImuCalibration, parameters: Record, states: Record, out: Record,
+    samples: ImuSamples, imu: ImuCalibration, parameters: Record, states: Record, out: Record
 ) -> None:  # fmt: skip
-    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
-
-    Shapes: time_s (N,) s; accel (N, 3) m/s²; gyro (N, 3) rad/s; flags (N,); dead (N,), True where the sensor is frozen.
-    """
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate."""
     s, q = states[0], parameters[0]
-    for i in range(len(time_s)):
-        has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
-        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        has_force, has_rate = has_force and not dead[i], has_rate and not dead[i]
-        good, first, h = has_force and has_rate, math.isnan(s.time), time_s[i] - s.time
-        if good and first and math.isfinite(time_s[i]):
+    for i in range(len(samples.time_s)):
+        time_s, flags = samples.time_s[i], samples.flags[i]
+        accel, gyro = vec.load(samples.accel[i]), vec.load(samples.gyro[i])
+        dead = is_frozen(s.last_readings, time_s, accel, gyro)
+        has_force, force = read_accel(accel, flags, imu)
+        has_rate, rate = read_gyro(gyro, flags, imu)
+        has_force, has_rate = has_force and not dead, has_rate and not dead
+        good, first, h = has_force and has_rate, math.isnan(s.time), time_s - s.time
+        if good and first and math.isfinite(time_s):
             _begin(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+            _take_sample(s, time_s, force, rate)
         elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
             _bridge(s, h, rate, imu)
             _align(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+            _take_sample(s, time_s, force, rate)
         elif 0.0 < h < math.inf:
-            good = _advance(s, time_s[i], dead[i], has_force, force, has_rate, rate, imu, q) and good
+            good = _advance(s, time_s, dead, has_force, force, has_rate, rate, imu, q) and good
         else:
             good = False
         s.rejected += 0 if good else 1
-        _report(s, time_s[i], imu, out[i])
+        _report(s, time_s, imu, out[i])
 
 
 @inner
