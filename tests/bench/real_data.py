@@ -76,7 +76,7 @@ def pendulum(folder: Path) -> Iterator[Case]:
         rows = np.array([[float(c.replace(",", ".")) for c in line.split(";") if c] for line in lines if line.strip()])
         time_s = np.linspace(0, rows[-1, 0] - rows[0, 0], len(rows))
         accel, gyro = np.ascontiguousarray(rows[:, 5:8]), np.ascontiguousarray(rows[:, 8:11])
-        rotation = _matrices(rows[:, 1:5])
+        rotation = matrices(rows[:, 1:5])
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         name = "pendulum " + path.stem[13:23]
@@ -88,22 +88,39 @@ def broad(folder: Path) -> Iterator[Case]:
     for path in sorted(folder.glob("*.mat")):
         data = loadmat(path)
         accel, gyro = (np.ascontiguousarray(data[name], dtype=np.float64) for name in ("imu_acc", "imu_gyr"))
-        tilt = _matrices(data["opt_quat"])[:, 2, :]
+        tilt = matrices(data["opt_quat"])[:, 2, :]
         tilt[~data["movement"].ravel().astype(bool)] = np.nan
         time_s = np.arange(len(accel)) / float(data["sampling_rate"].item())
         yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, _against(tilt), None, BROAD_DELAY_S, tilt)
+
+
+class Pair(NamedTuple):
+    """Readings of two sensors at the same times: accel (N, 2, 3) m/s², gyro (N, 2, 3) rad/s."""
+
+    time_s: Floats
+    accel_m_s2: Floats
+    gyro_rad_s: Floats
+
+
+def read_encoder(path: Path) -> tuple[Pair, Floats]:
+    """Both MPU-6050, the fixed one first, and the shaft's angle (N,) rad; rows with impossible readings are dropped."""
+    data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
+    gyro, accel = (
+        np.stack([np.column_stack([data[f"all_{kind}_{k}_{axis}"] for axis in "xyz"]) for k in (1, 2)], axis=1)
+        for kind in ("gyro", "accel")
+    )
+    time_s = data["all_time"]
+    in_range = (np.abs(gyro).max(axis=(1, 2)) < 2000) & (np.abs(accel).max(axis=(1, 2)) < 16)
+    use = np.concatenate([[True], np.diff(time_s) > 0]) & in_range
+    pair = Pair(time_s[use] - time_s[use][0], STANDARD_GRAVITY * accel[use], np.radians(gyro[use]))
+    return pair, np.radians(data["all_encoder"][use])
 
 
 def encoder(folder: Path) -> Iterator[Case]:
     """An MPU-6050 on a motor's shaft, with an encoder: the angle about the shaft, less its mean error."""
     for path in sorted(folder.glob("raw_[rp]*.mat")):  # yaw is no tilt
         across = 0 if "pitch" in path.stem else 1  # the shaft lies along y in the trials of pitch, else along x
-        data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
-        gyro = np.column_stack([data[f"all_gyro_2_{axis}"] for axis in "xyz"])
-        accel = np.column_stack([data[f"all_accel_2_{axis}"] for axis in "xyz"])
-        time_s = data["all_time"]
-        use = np.concatenate([[True], np.diff(time_s) > 0]) & (np.abs(gyro).max(1) < 2000) & (np.abs(accel).max(1) < 16)
-        angle = np.radians(data["all_encoder"][use])
+        pair, angle = read_encoder(path)
 
         def errors_deg(tilt: Floats, angle: Floats = angle, across: int = across) -> Floats:
             measured = np.arctan2(tilt[:, across], tilt[:, 2])
@@ -111,20 +128,25 @@ def encoder(folder: Path) -> Iterator[Case]:
             both = [np.angle(np.exp(1j * (e - np.angle(np.nanmean(np.exp(1j * e)))))) for e in both]
             return np.degrees(min(both, key=lambda e: float(np.nanmean(np.square(e)))))
 
-        force, rate = STANDARD_GRAVITY * accel[use], np.radians(gyro[use])
-        name, start = "encoder " + path.stem[4:], time_s[use][0]
-        yield Case("mpu6050_encoder", name, time_s[use] - start, force, rate, errors_deg, None, ENCODER_DELAY_S)
+        force, rate = (np.ascontiguousarray(values[:, 1]) for values in pair[1:])
+        name = "encoder " + path.stem[4:]
+        yield Case("mpu6050_encoder", name, pair.time_s, force, rate, errors_deg, None, ENCODER_DELAY_S)
+
+
+def read_robot(path: Path) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of a `_imu.csv` beside its `_truth.csv`: time (N,) s, accel and gyro (N, 3), the link's rotation (N, 3, 3)."""
+    read = np.loadtxt(path, delimiter=",", skiprows=1)
+    truth = np.loadtxt(path.with_name(path.name.replace("_imu", "_truth")), delimiter=",", skiprows=1)
+    n = min(len(read), len(truth))
+    accel, gyro = np.ascontiguousarray(read[:n, 1:4]), np.ascontiguousarray(read[:n, 4:7])
+    return (truth[:n, 0] - truth[0, 0]) * 1e-6, accel, gyro, matrices(truth[:n, 1:5])
 
 
 def robot(folder: Path) -> Iterator[Case]:
     """A robot arm, encoder truth; the sensor's mounting on its link, and the upward direction, are fitted."""
     for path in sorted(folder.glob("*_imu.csv")):
-        read = np.loadtxt(path, delimiter=",", skiprows=1)
-        truth = np.loadtxt(path.with_name(path.name.replace("_imu", "_truth")), delimiter=",", skiprows=1)
-        n = min(len(read), len(truth))
-        accel, gyro = np.ascontiguousarray(read[:n, 1:4]), np.ascontiguousarray(read[:n, 4:7])
-        time_s = (truth[:n, 0] - truth[0, 0]) * 1e-6
-        rotation = _mounted(_matrices(truth[:n, 1:5]), gyro, time_s)
+        time_s, accel, gyro, link = read_robot(path)
+        rotation = _mounted(link, gyro, time_s)
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         yield Case(
@@ -145,7 +167,7 @@ def diodem(folder: Path) -> Iterator[Case]:
         accel, gyro = (np.column_stack([read[f"seg{k}_{kind}_{a}"] for a in "xyz"]) for kind in ("acc", "gyr"))
         quaternion = np.column_stack([omc[f"seg{k}_quat_{a}"] for a in "wxyz"])
         use = np.isfinite(quaternion).all(axis=1) & (at_s > 0)
-        rotation = _mounted(_matrices(quaternion[use]), _at(at_s[use], time_s, gyro), at_s[use])
+        rotation = _mounted(matrices(quaternion[use]), _at(at_s[use], time_s, gyro), at_s[use])
         up = np.median(np.einsum("nij,nj->ni", rotation, _at(at_s[use], time_s, accel)), axis=0)
         errors = _against(np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up)))
 
@@ -186,7 +208,7 @@ SETS = {
 }
 
 
-def _matrices(quaternion: Floats) -> Floats:
+def matrices(quaternion: Floats) -> Floats:
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
@@ -232,7 +254,7 @@ def vqf_tilt(case: Case, offline: bool) -> Floats:
         found = offlineVQF(case.gyro_rad_s, case.accel_m_s2, None, step)
     else:
         found = VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)
-    tilt = _matrices(found["quat6D"])[:, 2, :]
+    tilt = matrices(found["quat6D"])[:, 2, :]
     turned = tilt - np.cross(case.delay_s * (case.gyro_rad_s - found["bias"]), tilt)
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 
