@@ -23,7 +23,6 @@ from linkpose.filters.inertial.state import (
     ESTIMATE,
     HEIGHT,
     ROLL,
-    YAW,
     Floats,
     SensorErrors,
     fresh_state,
@@ -56,6 +55,8 @@ class TiltInertialFilter:
         "tilt_inertial_pitch_deg",
         "tilt_inertial_roll_std_deg",
         "tilt_inertial_pitch_std_deg",
+        "tilt_inertial_yaw_deg",
+        "tilt_inertial_yaw_std_deg",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -90,7 +91,7 @@ class TiltInertialFilter:
         return np.asarray(self.state.nominal[BG:BA].copy())
 
     def process(self, block: Measurements) -> Floats:
-        """Estimates at each of the N samples: (N, 6) in the order of `columns`; NaN where not known yet."""
+        """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
         dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
         estimates = np.empty(len(block), ESTIMATE)
         process(
@@ -100,5 +101,6 @@ class TiltInertialFilter:
         values, stds = estimates["value"], estimates["std"]
         if not self._has_height:
             values[:, HEIGHT] = stds[:, HEIGHT] = np.nan
-        tilts, their_stds = np.degrees(values[:, ROLL:YAW]), np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi))
-        return np.column_stack([values[:, HEIGHT], stds[:, HEIGHT], tilts, their_stds])
+        angles, their_stds = np.degrees(values[:, ROLL:]), np.degrees(np.minimum(stds[:, ROLL:], np.pi))
+        height, std = values[:, HEIGHT], stds[:, HEIGHT]
+        return np.column_stack([height, std, angles[:, :2], their_stds[:, :2], angles[:, 2], their_stds[:, 2]])
