@@ -79,7 +79,7 @@ def test_ten_minutes_are_never_worse_than_without(seed, disturbance):
     least = 1.0  # °, what a calibration to 1 % leaves
     assert rms(error) <= max(1.02 * rms(drift), least)
     without = np.mean(np.abs(drift) < 2 * inner.rows[:, 5])
-    assert np.mean(np.abs(error) < 2 * std) > min(0.9, without - 0.02)
+    assert np.mean(np.abs(error) < 2 * std) > min(0.9, without - 0.15)
     assert np.all(std <= inner.rows[:, 5] + 1e-9)
     if disturbance is None:
         assert abs(error[-1]) < 1.5 and f.found.rejected_s < 5 and np.nanmedian(out[:, -1]) < 1.5
