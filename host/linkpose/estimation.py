@@ -205,7 +205,7 @@ class Estimator:
                     return factor, std
         return None
 
-    def text(self, estimates: Floats) -> str:
+    def text(self, estimates: Floats) -> bytes:
         """Estimates as lines of CSV."""
         return format_rows(estimates, self._decimals)
 

@@ -425,7 +425,7 @@ class _Sink:
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
-            _print(self._estimator.text(estimates))
+            _print(self._estimator.text(estimates).decode())
         if self._json or self._outputs:
             rows = self._estimator.objects(estimates)
             for output in self._outputs:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from linkpose.evaluation.scores import (
     window_of,
 )
 from linkpose.evaluation.scoring import Compared, Score, Scorer, Window
-from linkpose.evaluation.series import SPARSER, Lag, interval, paired, strongest_lag
+from linkpose.evaluation.series import SPARSER, Lag, interval, paired, strongest_lag, usual
 from linkpose.quantities import HEIGHT, by_filter, split
 from linkpose.recording import thinned
 from linkpose.recording.ahead import ahead
@@ -40,7 +40,7 @@ from linkpose.sensors.measurements import Floats
 # from which the second pass starts.
 _COARSE_ROWS = 1_000_000
 # Stretches of this many rows show the offset exactly: 100 of 10 s at 100 Hz. Twice of either doubles the memory.
-_STRETCHES, _STRETCH_ROWS, _FEWEST_ROWS = 100, 1000, 20
+_STRETCHES, _STRETCH_ROWS = 100, 1000
 _FAR_S = 1e300  # stamps beyond are infinite
 # Rows that are scored at once, and rows of the other file that may belong to them. Twice of it doubles the memory.
 _PIECE_ROWS, _MOST_OTHER_ROWS = 50_000, 200_000
@@ -112,7 +112,7 @@ class _Source:
 class _Scan(NamedTuple):
     """Facts on a whole file."""
 
-    time_s: Floats  # (N,) of all rows
+    rows: int
     coarse: dict[str, Floats]  # some columns of rows at equal distances
     presence: dict[str, Floats]  # one row: 0 for a column with a value, NaN for one without
     interval_s: float  # the usual step between two rows
@@ -128,20 +128,21 @@ def _scan(source: _Source, wanted: Collection[str], progress: Progress) -> _Scan
         progress(read)
 
     kept = {name: _Growing() for name in wanted}
-    times = _Growing()
+    steps = _Growing()
     presence = {name: np.full(1, np.nan) for name in source.names}
-    every = 0
+    rows = every = 0
     for part in source.parts(note):
         total = len(part) / max(share, 1e-6)
         every = every or max(1, math.ceil(total / _COARSE_ROWS))
         for name, values in part.columns.items():
             if name in kept:
-                kept[name].add(values[-len(times) % every :: every], total / every)
+                kept[name].add(values[-rows % every :: every], total / every)
             if np.isnan(presence[name][0]) and np.isfinite(values).any():
                 presence[name][0] = 0.0
-        times.add(part.columns["time_s"], total)
+        steps.add(np.diff(part.columns["time_s"])[::every], total / every)
+        rows += len(part)
     coarse = {name: column.values for name, column in kept.items()}
-    return _Scan(times.values, coarse, presence, interval(times.values))
+    return _Scan(rows, coarse, presence, usual(steps.values))
 
 
 class _Growing:
@@ -150,9 +151,6 @@ class _Growing:
     def __init__(self) -> None:
         self._held: Floats = np.empty(0)
         self._size = 0
-
-    def __len__(self) -> int:
-        return self._size
 
     def add(self, values: Floats, expected: float) -> None:
         """The next values; `expected` is about how many there are in all."""
@@ -170,57 +168,56 @@ class _Growing:
         return self._held[: self._size]
 
 
-class _Rows:
-    """Reads ranges of a file's rows, each beginning no earlier than the one before."""
+class _Span(NamedTuple):
+    """A stretch of time on a file's clock (s)."""
+
+    start: float
+    stop: float
+
+
+class _Reader:
+    """Reads stretches of time from a file, each beginning no earlier than the one before."""
 
     def __init__(self, source: _Source, progress: Progress) -> None:
         self._parts = source.parts(progress)
-        self._held: list[tuple[int, Part]] = []  # with the number of the first row
-        self._end = 0  # rows read so far
+        self._held: list[Part] = []
 
-    def between(self, rows: _Range) -> dict[str, Floats]:
-        """The columns of these rows, at least one."""
-        self._held = [(first, part) for first, part in self._held if first + len(part) > rows.start]
-        while self._end < rows.stop and (part := next(self._parts, None)) is not None:
-            if self._end + len(part) > rows.start:
-                self._held.append((self._end, part))
-            self._end += len(part)
-        pieces = [
-            {
-                name: values[max(0, rows.start - first) : max(0, rows.stop - first)]
-                for name, values in part.columns.items()
-            }
-            for first, part in self._held
-        ]
+    def within(self, span: _Span) -> dict[str, Floats]:
+        """The columns of the rows in this stretch, and of one more row on either side."""
+        while len(self._held) > 1 and self._held[1].columns["time_s"][0] < span.start:
+            del self._held[0]
+        while not self._held or self._held[-1].columns["time_s"][-1] <= span.stop:
+            part = next(self._parts, None)
+            if part is None:
+                break
+            if self._held and part.columns["time_s"][0] < span.start:
+                self._held.clear()
+            self._held.append(part)
+        columns = {name: np.concatenate([part.columns[name] for part in self._held]) for name in self._held[0].columns}
+        time_s = columns["time_s"]
+        first, last = int(np.searchsorted(time_s, span.start)), int(np.searchsorted(time_s, span.stop, "right"))
+        return {name: values[max(0, first - 1) : last + 1] for name, values in columns.items()}
+
+    def all_of(self, spans: Iterable[_Span]) -> dict[str, Floats]:
+        """The columns of the rows in these stretches, each row once."""
+        pieces: list[dict[str, Floats]] = []
+        last_s = -np.inf
+        for span in _merged(spans):
+            found = self.within(span)
+            new = found["time_s"] > last_s
+            pieces.append({name: values[new] for name, values in found.items()})
+            last_s = found["time_s"][-1]
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def all_of(self, ranges: Sequence[_Range]) -> dict[str, Floats]:
-        """The columns of the rows in these ranges."""
-        pieces = [self.between(rows) for rows in ranges]
-        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-
-class _Range(NamedTuple):
-    """Rows from `start` up to `stop`."""
-
-    start: int
-    stop: int
-
-
-def _near(time_s: Floats, from_s: float, to_s: float) -> _Range:
-    """The rows between two times, and one more on either side."""
-    start, stop = np.searchsorted(time_s, [from_s, to_s])
-    return _Range(max(0, int(start) - 1), min(len(time_s), int(stop) + 2))
-
-
-def _merged(ranges: Sequence[_Range]) -> list[_Range]:
-    """The same rows in ascending order, each once."""
-    merged: list[_Range] = []
-    for rows in sorted(ranges):
-        if merged and rows.start <= merged[-1].stop:
-            merged[-1] = _Range(merged[-1].start, max(merged[-1].stop, rows.stop))
+def _merged(spans: Iterable[_Span]) -> list[_Span]:
+    """The same stretches in ascending order, without overlaps."""
+    merged: list[_Span] = []
+    for span in sorted(spans):
+        if merged and span.start <= merged[-1].stop:
+            merged[-1] = _Span(merged[-1].start, max(merged[-1].stop, span.stop))
         else:
-            merged.append(rows)
+            merged.append(span)
     return merged
 
 
@@ -239,9 +236,10 @@ class _Comparison:
     def evaluate(self, window: Window) -> Evaluation:
         """The scores of all filters."""
         near = self._find_lag()
+        stamps = self._scans[0].coarse["time_s"]
         for scan in self._scans:
             scan.coarse.clear()
-        tables = self._stretches(near)
+        tables = self._stretches(stamps[np.isfinite(stamps)], near)
         compared = pairs_of(*tables)
         offset_s, residual = common_offset(compared.values(), near)
         remarks = mismatches(*tables, compared.values(), offset_s, residual)
@@ -253,7 +251,7 @@ class _Comparison:
 
     def _tables(self, ours: dict[str, Floats], theirs: dict[str, Floats]) -> tuple[Table, Table]:
         """Some rows of both files, with the usual step between the rows of the whole files."""
-        wholes = [Whole(len(scan.time_s), scan.interval_s, 0, 0) for scan in self._scans]
+        wholes = [Whole(scan.rows, scan.interval_s, 0, 0) for scan in self._scans]
         return self._sources[0].table(ours, wholes[0]), self._sources[1].table(theirs, wholes[1])
 
     # ---- the offset between the clocks ----
@@ -274,27 +272,27 @@ class _Comparison:
     def _find_lag(self) -> Lag | None:
         """About where the offset is; None where nothing can be compared."""
         ours, theirs = (
-            source.table(scan.coarse, Whole(len(scan.time_s), interval(scan.coarse["time_s"]), 0, 0))
+            source.table(scan.coarse, Whole(scan.rows, interval(scan.coarse["time_s"]), 0, 0))
             for source, scan in zip(self._sources, self._scans, strict=True)
         )
         (both,) = pairs_of(ours, theirs).values()
         pairs = comparable(both)
         return strongest_lag(pairs) if pairs else None
 
-    def _stretches(self, near: Lag | None) -> tuple[Table, Table]:
-        """Short stretches of the estimate, and of the reference at their instants with and without the lag."""
+    def _stretches(self, stamps: Floats, near: Lag | None) -> tuple[Table, Table]:
+        """Short stretches of the estimate, and of the reference at their instants with and without the lag.
+
+        `stamps` are some of the estimate's stamps, at equal distances.
+        """
         ours, theirs = self._scans
-        rows = int(np.clip(_STRETCH_ROWS * theirs.interval_s / max(ours.interval_s, 1e-9), _FEWEST_ROWS, _STRETCH_ROWS))
-        starts = np.linspace(0, max(0, len(ours.time_s) - rows), _STRETCHES).astype(np.int64).tolist()
-        ranges = _merged([_Range(start, min(start + rows, len(ours.time_s))) for start in starts])
+        length = _STRETCH_ROWS * min(ours.interval_s, theirs.interval_s)
+        last = int(np.searchsorted(stamps, stamps[-1] - length))
+        spans = [_Span(stamps[i], stamps[i] + length) for i in np.linspace(0, last, _STRETCHES).astype(np.int64)]
         margin = LONGEST_HOLE * max(ours.interval_s, theirs.interval_s) + (3 * near.step_s if near else 0.0)
-        wanted = [
-            _near(theirs.time_s, ours.time_s[start] + lag_s - margin, ours.time_s[stop - 1] + lag_s + margin)
-            for start, stop in ranges
-            for lag_s in {0.0, near.lag_s if near else 0.0}
-        ]
-        our_rows, their_rows = (_Rows(source, self._share(2 + i, 6)) for i, source in enumerate(self._sources))
-        return self._tables(our_rows.all_of(ranges), their_rows.all_of(_merged(wanted)))
+        lags = {0.0, near.lag_s if near else 0.0}
+        wanted = [_Span(span.start + lag_s - margin, span.stop + lag_s + margin) for span in spans for lag_s in lags]
+        our_rows, their_rows = (_Reader(source, self._share(2 + i, 6)) for i, source in enumerate(self._sources))
+        return self._tables(our_rows.all_of(spans), their_rows.all_of(wanted))
 
     # ---- scores ----
 
@@ -302,7 +300,7 @@ class _Comparison:
         """Scores all filters over all rows."""
         starts = self._common_starts(compared, offset_s)
         present = pairs_of(*self._tables(*(scan.presence for scan in self._scans)))
-        instants = len(self._scans[self._sparser].time_s)
+        instants = self._scans[self._sparser].rows
         paths = self._sources[0].path, self._sources[1].path
         scorers = {
             name: Scorer(
@@ -336,22 +334,20 @@ class _Comparison:
 
     def _pieces(self, offset_s: float, progress: Progress) -> Generator[dict[str, Compared]]:
         """What can be compared, piece by piece; each instant of the sparser file is in one of them."""
-        instants, other = self._scans[self._sparser].time_s, self._scans[1 - self._sparser].time_s
+        other = 1 - self._sparser
         ahead_s = -offset_s if self._sparser else offset_s  # of the other file's clock
-        margin = LONGEST_HOLE * self._scans[1 - self._sparser].interval_s
-        readers = [_Rows(source, lambda _: None) for source in self._sources]
-        at, end = np.searchsorted(instants, [-_FAR_S, _FAR_S]).tolist()
-        while at < end:
-            stop = min(end, at + _PIECE_ROWS)
-            while True:
-                rows = _near(other, instants[at] + ahead_s - margin, instants[stop - 1] + ahead_s + margin)
-                if rows.stop - rows.start <= _MOST_OTHER_ROWS or stop - at == 1:
-                    break
-                stop = at + (stop - at) // 2
-            ranges = [_Range(at, stop), rows]
-            if self._sparser:
-                ranges.reverse()
-            ours, theirs = (reader.between(some) for reader, some in zip(readers, ranges, strict=True))
-            yield pairs_of(*self._tables(ours, theirs))
-            at = stop
-            progress(at / end)
+        margin = LONGEST_HOLE * self._scans[other].interval_s
+        longest = max(_MOST_OTHER_ROWS * self._scans[other].interval_s, 1e-6)
+        reader = _Reader(self._sources[other], lambda _: None)
+        for part in self._sources[self._sparser].parts(progress):
+            time_s = part.columns["time_s"]
+            at, end = np.searchsorted(time_s, [-_FAR_S, _FAR_S]).tolist()
+            while at < end:
+                stop = min(end, at + _PIECE_ROWS, int(np.searchsorted(time_s, time_s[at] + longest, "right")))
+                piece = {name: values[at:stop] for name, values in part.columns.items()}
+                span = _Span(time_s[at] + ahead_s - margin, time_s[stop - 1] + ahead_s + margin)
+                both = [piece, reader.within(span)]
+                if self._sparser:
+                    both.reverse()
+                yield pairs_of(*self._tables(*both))
+                at = stop

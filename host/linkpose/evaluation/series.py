@@ -78,7 +78,11 @@ class Lag(NamedTuple):
 def interval(time_s: Floats) -> float:
     """The usual step between two stamps (s); of very many stamps, by some of the steps."""
     every = max(1, len(time_s) // _MOST_STEPS)
-    steps = time_s[1::every] - time_s[: len(time_s) - 1 : every]
+    return usual(time_s[1::every] - time_s[: len(time_s) - 1 : every])
+
+
+def usual(steps: Floats) -> float:
+    """The usual one of the steps between two stamps (s); 0 where none is positive."""
     steps = steps[steps > 0]
     return float(np.median(steps)) if len(steps) else 0.0
 
