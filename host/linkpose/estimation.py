@@ -133,7 +133,7 @@ class Estimator:
         Raises as the constructor does.
         """
         settings = BoardSettings.of(board.hello)
-        rig = with_chain_joint(board.rig.with_delay_of(settings.dlpf), chain_joint)
+        rig = with_chain_joint(board.rig.with_delay(settings.imu_delay_s), chain_joint)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
@@ -173,12 +173,13 @@ class Estimator:
 
     def process(self, block: Measurements) -> Floats:
         """The estimates (N, columns) at the next N samples. The filters run in parallel over a long block."""
-        workers = min(os.cpu_count() or 1, len(self.filters))
-        if len(block) < _LONG_BLOCK or workers < 2:
-            estimates = np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+        workers = 1 if len(block) < _LONG_BLOCK else min(os.cpu_count() or 1, len(self.filters))
+        if workers < 2:
+            parts = [f.process(block) for f in self.filters]
         else:
             with ThreadPoolExecutor(workers) as pool:
-                estimates = np.column_stack([block.time_s, *pool.map(lambda f: f.process(block), self.filters)])
+                parts = list(pool.map(lambda f: f.process(block), self.filters))
+        estimates = _side_by_side(block.time_s, parts)
         self.excluded.count(block, estimates)
         return estimates
 
@@ -262,7 +263,7 @@ class LiveEstimator:
         if not count or not self._is_ready(TEXT):
             return np.empty((0, 1 + sum(self._width)))
         rows = [
-            np.column_stack([block.time_s, *(results[i] for results in self._results)])
+            _side_by_side(block.time_s, [results[i] for results in self._results])
             for i, block in enumerate(self._blocks[:count])
         ]
         for block, estimates in zip(self._blocks, rows, strict=False):
@@ -270,7 +271,7 @@ class LiveEstimator:
         del self._blocks[:count]
         for results in self._results:
             del results[:count]
-        return np.concatenate(rows)
+        return rows[0] if count == 1 else np.concatenate(rows)
 
     def _newest_row(self) -> Floats:
         if not self._blocks:
@@ -394,9 +395,9 @@ def estimate(
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError.
     """
     recording = load_recording(source) if isinstance(source, str | PathLike) else source
-    own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
+    own, delay_s = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.imu_delay_s)
     measurements = recording if isinstance(recording, Measurements) else recording.measurements
-    in_force = as_rig(rig, own).with_delay_of(dlpf)
+    in_force = as_rig(rig, own).with_delay(delay_s)
     first_joint = _joint(j2s_m, j2s_std_m)
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)
@@ -442,6 +443,11 @@ def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | N
     if not 0 < j2s_std_m < np.inf:
         raise InvalidValue("j2s_std_m", f"is {j2s_std_m!r}; it must be above 0 (m)")
     return Joint(to_vector(vector), j2s_std_m)
+
+
+def _side_by_side(time_s: Floats, parts: Sequence[Floats]) -> Floats:
+    """Times (N,) and the columns (N, K) of each filter as one table."""
+    return np.concatenate([time_s[:, None], *parts], axis=1)
 
 
 def _decimals(column: str) -> int:

@@ -31,6 +31,7 @@ class Precompilation:
         """
         self._names = list(names)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter
+        self._ready: set[str] = set()  # filters once found ready: the question comes with each sample
         if not compiling.can_keep_code():
             return
         order = list(reversed(self._names))
@@ -46,8 +47,11 @@ class Precompilation:
 
     def is_ready(self, name: str) -> bool:
         """Whether a filter can run without waiting for the compiler; also if nothing compiles it any more."""
-        process = self._processes.get(name)
-        return process is None or compiling.is_compiled(name) or process.poll() is not None
+        if name not in self._ready:
+            process = self._processes.get(name)
+            if process is None or compiling.is_compiled(name) or process.poll() is not None:
+                self._ready.add(name)
+        return name in self._ready
 
     @property
     def waiting(self) -> list[str]:

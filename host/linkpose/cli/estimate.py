@@ -160,7 +160,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     from linkpose.recording.reader import RecordingFile
 
     recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay(recording.imu_delay_s)
     for remark in [*recording.remarks, *recording.contradictions(rig)]:
         console.report(remark)
     if recording.unusable and not request.filter_names:

@@ -216,7 +216,7 @@ class _Repeats:
         """Whether each value (N, K) equals the one before."""
         before = np.full((1, values.shape[1]), np.nan) if self._last is None else self._last
         self._last = values[-1:].copy()
-        return np.asarray(values == np.concatenate([before, values[:-1]]))
+        return np.asarray(values == (before if len(values) == 1 else np.concatenate([before, values[:-1]])))
 
     def restart(self, time_s: Floats) -> None:
         """As `run` of a block in which nothing repeats."""
@@ -236,11 +236,14 @@ class _Repeats:
         size, columns = same.shape
         count = self._count if self._count is not None else np.zeros(columns, np.int64)
         begin_s = self._begin_s if self._begin_s is not None else np.full(columns, np.nan)
-        rows = np.arange(size)[:, None]
-        start = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
-        inside = start >= 0
-        counts = np.where(inside, rows - start, rows + 1 + count)
-        begins = np.where(inside, time_s[start], begin_s)
+        if size == 1:  # live
+            counts, begins = np.where(same, count + 1, 0), np.where(same, begin_s, time_s)
+        else:
+            rows = np.arange(size)[:, None]
+            start = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
+            inside = start >= 0
+            counts = np.where(inside, rows - start, rows + 1 + count)
+            begins = np.where(inside, time_s[start], begin_s)
         self._count, self._begin_s = counts[-1], begins[-1]
         with np.errstate(invalid="ignore"):
             return counts, time_s[:, None] - begins
