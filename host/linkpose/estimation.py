@@ -133,7 +133,7 @@ class Estimator:
         Raises as the constructor does.
         """
         settings = BoardSettings.of(board.hello)
-        rig = with_chain_joint(board.rig.with_delay_of(settings.dlpf), chain_joint)
+        rig = with_chain_joint(board.rig.with_delay(settings.imu_delay_s), chain_joint)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
@@ -234,7 +234,7 @@ class Estimator:
                     return factor, std
         return None
 
-    def text(self, estimates: Floats) -> str:
+    def text(self, estimates: Floats) -> bytes:
         """Estimates as lines of CSV."""
         return format_rows(estimates, self._decimals)
 
@@ -427,9 +427,9 @@ def estimate(
         NoMagnetometer, UncalibratedMagnetometer, CannotRun (no filter estimates a yaw).
     """
     recording = load_recording(source) if isinstance(source, str | PathLike) else source
-    own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
+    own, delay_s = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.imu_delay_s)
     measurements = recording if isinstance(recording, Measurements) else recording.measurements
-    in_force = as_rig(rig, own).with_delay_of(dlpf)
+    in_force = as_rig(rig, own).with_delay(delay_s)
     first_joint = _joint(j2s_m, j2s_std_m)
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)

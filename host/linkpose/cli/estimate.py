@@ -165,7 +165,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     from linkpose.recording.reader import RecordingFile
 
     recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay(recording.imu_delay_s)
     for remark in [*recording.remarks, *recording.contradictions(rig)]:
         console.report(remark)
     if recording.unusable and not request.filter_names:
@@ -456,7 +456,7 @@ class _Sink:
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
-            _print(self._estimator.text(estimates))
+            _print(self._estimator.text(estimates).decode())
         if self._json or self._outputs:
             rows = self._estimator.objects(estimates)
             for output in self._outputs:

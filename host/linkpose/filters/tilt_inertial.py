@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
@@ -23,13 +23,13 @@ from linkpose.filters.inertial.state import (
     ESTIMATE,
     HEIGHT,
     ROLL,
+    YAW,
     Floats,
     SensorErrors,
     fresh_state,
     record_of,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -68,7 +68,6 @@ class TiltInertialFilter:
             declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def state(self) -> Any:
@@ -92,15 +91,13 @@ class TiltInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.empty(len(block), ESTIMATE)
-        process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-            self._imu, self._record, self._states, estimates,
-        )  # fmt: skip
-        values, stds = estimates["value"], estimates["std"]
-        if not self._has_height:
-            values[:, HEIGHT] = stds[:, HEIGHT] = np.nan
-        angles, their_stds = np.degrees(values[:, ROLL:]), np.degrees(np.minimum(stds[:, ROLL:], np.pi))
-        height, std = values[:, HEIGHT], stds[:, HEIGHT]
-        return np.column_stack([height, std, angles[:, :2], their_stds[:, :2], angles[:, 2], their_stds[:, 2]])
+        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 8))
+        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
+        values, stds = estimates["value"], np.minimum(estimates["std"], np.pi)
+        height, height_std = values[:, HEIGHT], estimates["std"][:, HEIGHT]
+        table[:, 0], table[:, 1] = (height, height_std) if self._has_height else (np.nan, np.nan)
+        np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
+        np.degrees(stds[:, ROLL:YAW], out=table[:, 4:6])
+        np.degrees(values[:, YAW], out=table[:, 6])
+        np.degrees(stds[:, YAW], out=table[:, 7])
+        return table

@@ -10,12 +10,13 @@ import math
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
+    GRAVITY,
     ImuCalibration,
+    ImuSamples,
     blind_for,
     is_bounded,
     read_accel,
@@ -24,6 +25,7 @@ from linkpose.filters._imu import (
     unknown_accel,
 )
 from linkpose.filters._vector import Vec
+from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
 from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
 from linkpose.filters.inertial.joint_velocity import update_joint_velocity
@@ -43,6 +45,7 @@ from linkpose.filters.inertial.rest import (
     follow_steadiness,
     update_bias_from_rest,
     update_bias_from_steadiness,
+    update_tilt_from_rest,
 )
 from linkpose.filters.inertial.state import (
     BA,
@@ -55,7 +58,6 @@ from linkpose.filters.inertial.state import (
     SIZE,
     YAW,
     D,
-    Floats,
     Record,
     V,
     X,
@@ -76,6 +78,7 @@ _NO_JUMP = cast(bool, np.bool_(False))  # the compiler would take a Python const
 _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 # Start in motion: angular acceleration (rad/s²) at rest, and per rad/s of rate (1/s).
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
+_START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
 _LOST, _LOST_M2_S2 = 0.5, 0.01
 _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
@@ -85,32 +88,31 @@ _UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the h
 
 @compiled
 def process(
-    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint32], dead: NDArray[np.bool_],
-    imu: ImuCalibration, parameters: Record, states: Record, out: Record,
+    samples: ImuSamples, imu: ImuCalibration, parameters: Record, states: Record, out: Record
 ) -> None:  # fmt: skip
-    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
-
-    Shapes: time_s (N,) s; accel (N, 3) m/s²; gyro (N, 3) rad/s; flags (N,); dead (N,), True where the sensor is frozen.
-    """
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate."""
     s, q = states[0], parameters[0]
-    for i in range(len(time_s)):
-        has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
-        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        has_force, has_rate = has_force and not dead[i], has_rate and not dead[i]
-        good, first, h = has_force and has_rate, math.isnan(s.time), time_s[i] - s.time
-        if good and first and math.isfinite(time_s[i]):
+    for i in range(len(samples.time_s)):
+        time_s, flags = samples.time_s[i], samples.flags[i]
+        accel, gyro = vec.load(samples.accel[i]), vec.load(samples.gyro[i])
+        dead = is_frozen(s.last_readings, time_s, accel, gyro)
+        has_force, force = read_accel(accel, flags, imu)
+        has_rate, rate = read_gyro(gyro, flags, imu)
+        has_force, has_rate = has_force and not dead, has_rate and not dead
+        good, first, h = has_force and has_rate, math.isnan(s.time), time_s - s.time
+        if good and first and math.isfinite(time_s):
             _begin(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+            _take_sample(s, time_s, force, rate)
         elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
             _bridge(s, h, rate, imu)
             _align(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+            _take_sample(s, time_s, force, rate)
         elif 0.0 < h < math.inf:
-            good = _advance(s, time_s[i], dead[i], has_force, force, has_rate, rate, imu, q) and good
+            good = _advance(s, time_s, dead, has_force, force, has_rate, rate, imu, q) and good
         else:
             good = False
         s.rejected += 0 if good else 1
-        _report(s, time_s[i], imu, out[i])
+        _report(s, time_s, imu, out[i])
 
 
 @inner
@@ -157,8 +159,9 @@ def _align(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         accel = imu.accel_variance + reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
         align_to_gravity(s, force, accel, vec.cross(rotation, d), speed * reach + 1e-4)
         return
-    s.speed_square = max(q.first_speed_m_s**2, s.speed_square)  # what has been measured of it stays
-    align_to_gravity(s, force, imu.accel_variance + unknown_accel(force, rate), (0.0, 0.0, 0.0), s.speed_square)
+    accel = unknown_accel(force, rate)
+    s.speed_square = max(q.first_speed_m_s**2, s.speed_square, _START_SWING_S**2 * accel)
+    align_to_gravity(s, force, imu.accel_variance + accel, (0.0, 0.0, 0.0), s.speed_square)
     vec.store(s.swing, (0.0, 0.0, 0.0))
     vec.store(s.mean_force, force)
     vec.store(s.mean_rate, rate)
@@ -263,17 +266,18 @@ def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu
     lasting = max(2.0 * correlation_time(s, q) / h, 1.0)
     rotation = lasting * q.gyro_misfit**2 * vec.dot(vec.load(s.turned), vec.load(s.turned))
     velocity = lasting * q.accel_misfit**2 * vec.dot(impulse, impulse)
-    force = _steady_force(s, vec.scale(1.0 / h, impulse), imu)
+    force = _steady_force(s, vec.scale(1.0 / h, impulse), imu, q)
     propagate_covariance(s, force, rotation, velocity, _bias_walk(s, q) ** 2 * h)
     clear_increments(s)
     for i in range(D, PSI):
         s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[D, D] * h
     decay_to_prior(s, h)
+    update_bias_from_rest(s, h, imu)
     if q.has_joint:
-        update_bias_from_rest(s, h, imu)
         if has_rate:
             taken = update_joint_velocity(s, jumped, before, rate, h, imu, q)
     else:
+        update_tilt_from_rest(s, h, imu)
         update_free_velocity(s, h, q)
         if has_rate and s.no_force_s + s.clipped_s == 0.0:
             update_bias_from_steadiness(s, rate, h, imu, q)
@@ -295,11 +299,15 @@ def _bias_walk(s: Record, q: Record) -> float:
 
 
 @inner
-def _steady_force(s: Record, force: Vec, imu: ImuCalibration) -> Vec:
-    """The force, as far as it has moved by more than noise does.
+def _steady_force(s: Record, force: Vec, imu: ImuCalibration, q: Record) -> Vec:
+    """The part of the force that may update the accelerometer's matrix M_a.
 
-    At rest, a force with its noise would update the accelerometer's matrix: the same noise is in v.
+    What is in v too would be explained by M_a = 1, whatever it is (errors in variables). At rest that is the noise: the
+    force counts as far as it has moved by more than noise does. Without a joint it is all acceleration, since the model
+    0 = v + e has the true velocity in e: gravity alone counts.
     """
+    if not q.has_joint:
+        return vec.scale(GRAVITY, vec.load(s.tilt))
     slack = _STEADY_SIGMAS * math.sqrt(imu.accel_variance)
     steady = vec.load(s.steady_force)
     ahead = vec.minus(force, steady)
