@@ -46,7 +46,7 @@ class ChainParameters(NamedTuple):
     # at which the force turns in the sensor's axes. [O]; doubled, ball joints of [D] lose a third of their accuracy.
     accel_scale: float = 0.02
     accel_scale_s: float = 0.5  # over which that rate is averaged (s)
-    accel_walk_m_s2_sqrts: float = 0.02  # of the accelerometer bias. [O, E]; halved, σ is too small on a slow robot.
+    accel_walk_m_s2_sqrts: float = 0.001  # of the accelerometer bias: [MPU-6050]'s 35 mg over 65 K, 10 K in 10 min
     accel_misfit: float = 0.02  # share of the linear acceleration that is noise, correlated over 0.05 s
     gyro_walk_rad_s_sqrts: float = 3e-4  # 1 °/s in the hour in which a sensor warms up
     lever_walk_m_sqrts: float = 1e-4  # lets an error of the model leave r_k again
@@ -78,6 +78,10 @@ class ChainParameters(NamedTuple):
     # The heading follows from accelerations that both sensors measure. Slower motion of either (rms velocity gained in
     # 1 s) is what errors of an accelerometer look like (0.1 m/s²), and gives no heading. [E]: at 0, σ is too small.
     heading_speed_m_s: float = 0.1
+    # Scale and cross-axis errors of the accelerometer (data sheet: 3 %, 2 %) while gravity turns in the sensor's axes
+    # look like motion, too.
+    heading_scale: float = 0.02
+    swing_memory_s: float = 4.0  # over which the mean direction of gravity in the sensor's axes is taken
     shared_motion: float = 2.0  # both sensors measure the same motion: variance × 2
     swing_s: float = 1.0  # over which acceleration is integrated to measure that σ (s)
     speed_memory_s: float = 2.0  # over which the result is averaged (s)
@@ -113,6 +117,7 @@ STATE = np.dtype(
         ("lever", "f8", (2, 3)),  # r_k
         ("axis", "f8", (2, 3)),  # j_k
         ("start", *_Q),  # R_0
+        ("start_up", *_V3),  # Z of n in sensor 1's axes at the first sample
         ("lever0", *_V3),  # r_0
         ("covariance", "f8", (MAX_SIZE, MAX_SIZE)),
         ("correction", "f8", MAX_SIZE),  # of the errors, by the updates since the last `apply_correction`
@@ -126,8 +131,13 @@ STATE = np.dtype(
         ("velocity_variance", "f8", 2),
         ("force_rate_square", "f8", 2),  # mean ‖ω × f‖²
         # Memory of the measurement models.
-        ("swing", "f8", (2, 3)),
+        ("swing", "f8", (2, 3)),  # velocity gained in 1 s,
+        ("swing_mean", "f8", (2, 3)),  # and its mean, which an error of the tilt adds
         ("heading_share", "f8"),  # of the horizontal force that tells the heading, 0 to 1
+        ("shared_square", "f8", 2),  # mean square of the velocity gained in 1 s, from zero
+        ("up", "f8", (2, 3)),  # mean of Z of n in either sensor's axes,
+        ("up_swing", "f8", (2, 3)),  # and its distance from that mean, integrated like the velocity (s),
+        ("up_spread", "f8", 2),  # and its mean square
         ("speed_square", "f8", 2),
         ("accel_square", "f8", 2),
         ("excess_square", "f8"),  # mean square residual of the joint beyond its floor (m²/s²)
@@ -159,6 +169,7 @@ STATE = np.dtype(
 BANK = np.dtype(
     [
         ("begun", "i8"),
+        ("spread", "i8"),  # whether the headings have been spread over the hypotheses
         ("length", "i8"),  # of the error state
         ("hinge", "i8"),  # first index of a hinge's errors, or −1
         ("fixed", "i8"),  # first index of the error of r_0, or −1
