@@ -15,6 +15,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
 from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
+from linkpose.filters.chain.stops import wrapped
 from linkpose.filters.chain.update import clear_row, expected_square, update
 
 # The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
@@ -139,13 +140,12 @@ def hinge_angle(s: Record) -> float:
     x = q[0] * r[1] - q[1] * r[0] - (q[2] * r[3] - q[3] * r[2])
     y = q[0] * r[2] - q[2] * r[0] - (q[3] * r[1] - q[1] * r[3])
     z = q[0] * r[3] - q[3] * r[0] - (q[1] * r[2] - q[2] * r[1])
-    angle = 2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w)
-    return float(angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi)))
+    return wrapped(2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w))
 
 
 @inner
 def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
-    """σ of that angle (rad): of the rotations now and at the start about the axis."""
+    """σ of that angle (rad): of the rotations now and at the start about the axis; H of the angle in `row`."""
     to_matrix(s.start, s.m)
     rotate(s.m, s.axis[1], s.a)  # the axis in sensor 1's axes
     rotate(s.rotation[0], s.a, s.b)

@@ -20,6 +20,7 @@ from linkpose.filters.chain.motion import follow_rest, update_rest, update_veloc
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, R, Record, V
+from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop, wrapped
 from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
 
 
@@ -69,6 +70,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
         s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
         s.play_square = q.first_play_rad**2
+        clear_stops(s)
         s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = int(i == 0), 0.0, 0.0, math.pi, math.pi
         if bank.hinge >= 0 and not bank.begun:
             _begin_start(s, bank.length, bank.hinge)
@@ -213,6 +215,10 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
         else:
             follow_axis(s, size, hinge, bank.spread, gyro, h, q)
         s.angle_std = hinge_angle_std(s, size, hinge)
+        if s.has_axis > 0.0:
+            update_stop(s, size, hinge_angle(s), q)
+            apply_correction(s, size, hinge, base)
+        s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
@@ -307,14 +313,12 @@ def _report_angle(best: Record, states: Record, out: Record) -> None:
         s = states[i]
         if s.alive and s.has_axis > 0.0:
             weight = math.exp(s.odds)
-            turned = hinge_angle(s) - first
-            turned -= 2 * math.pi * math.floor((turned + math.pi) / (2 * math.pi))
+            turned = wrapped(hinge_angle(s) - first)
             weights += weight
             mean += weight * turned
             square += weight * (turned * turned + s.angle_std**2)
     mean /= weights
-    angle = first + mean
-    out.angle = angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
+    out.angle = wrapped(first + mean)
     out.angle_std = min(math.sqrt(max(square / weights - mean * mean, 0.0)), math.pi)
 
 

@@ -148,6 +148,18 @@ STATE = np.dtype(
         ("play_square", "f8"),
         ("relative_spread", "f8", (3, 3)),  # ∫ ω_rel ω_relᵀ dt
         ("has_axis", "f8"),
+        # Turning points of a hinge: angle without wraps, side (0, 1) of the next one, farthest angle on that side and
+        # its σ, the last one of each side.
+        ("turn_angle", "f8"),
+        ("turn_side", "i8"),
+        ("turn_farthest", "f8"),
+        ("turn_std", "f8"),
+        ("turn_last", "f8", 2),
+        # End stops by side: repeats, first angle, its σ, whether it is used.
+        ("stop_count", "i8", 2),
+        ("stop_angle", "f8", 2),
+        ("stop_std", "f8", 2),
+        ("stop_used", "i8", 2),
         # Hypothesis.
         ("alive", "i8"),
         ("log_likelihood", "f8"),
