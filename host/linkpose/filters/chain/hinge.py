@@ -133,9 +133,10 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
 
 @inner
 def hinge_angle(s: Record) -> float:
-    """Angle (rad, ±π) about j_2 since the first sample: the twist of R_0ᵀ R_1ᵀ R_2."""
+    """Angle (rad, ±π) about j_2 since the first sample: the twist of S_2ᵀ S_1 R_1ᵀ R_2."""
     between(s.attitude[0], s.attitude[1], s.relative)
-    q, r, axis = s.start, s.relative, s.axis[1]
+    between(s.start[0], s.start[1], s.first)
+    q, r, axis = s.first, s.relative, s.axis[1]
     w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
     x = q[0] * r[1] - q[1] * r[0] - (q[2] * r[3] - q[3] * r[2])
     y = q[0] * r[2] - q[2] * r[0] - (q[3] * r[1] - q[1] * r[3])
@@ -146,10 +147,13 @@ def hinge_angle(s: Record) -> float:
 @inner
 def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
     """σ of that angle (rad): of the rotations now and at the start about the axis; H of the angle in `row`."""
-    to_matrix(s.start, s.m)
-    rotate(s.m, s.axis[1], s.a)  # the axis in sensor 1's axes
-    rotate(s.rotation[0], s.a, s.b)
+    to_matrix(s.start[1], s.m)
+    rotate(s.m, s.axis[1], s.b)  # the axis in n at the first sample
+    to_matrix(s.start[0], s.m)
+    rotate_back(s.m, s.b, s.a)
+    rotate(s.rotation[0], s.a, s.c)  # and now
     clear_row(s)
     for i in range(3):
-        s.row[i], s.row[OF_SENSOR + i], s.row[hinge + START + i] = -s.b[i], s.b[i], -s.a[i]
+        s.row[i], s.row[OF_SENSOR + i] = -s.c[i], s.c[i]
+        s.row[hinge + START + i], s.row[hinge + START + 3 + i] = s.b[i], -s.b[i]
     return math.sqrt(max(expected_square(s, size), 0.0))

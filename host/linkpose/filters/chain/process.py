@@ -39,6 +39,7 @@ def _align(s: Record, k: int, accel: Floats, std: float, heading_std: float, q: 
         attitude[0], attitude[1], attitude[2], attitude[3] = w, y / norm, -x / norm, 0.0
     else:
         attitude[0], attitude[1], attitude[2], attitude[3] = 0.0, 1.0, 0.0, 0.0
+    turn(attitude, 0.0, 0.0, 0.0, 1.0)  # which normalises
     to_matrix(attitude, s.rotation[k])
     for i in range(6):
         s.velocity[k, i % 3] = 0.0
@@ -62,7 +63,8 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             s.has_axis *= bank.spread  # an axis in sensor 1's axes came with the heading
         for k in range(2):
             force = math.sqrt(accel[k, 0] ** 2 + accel[k, 1] ** 2 + accel[k, 2] ** 2)
-            std = q.tilt_rad + abs(force / GRAVITY - 1)
+            rate = math.sqrt(gyro[k, 0] ** 2 + gyro[k, 1] ** 2 + gyro[k, 2] ** 2)
+            std = q.tilt_rad + abs(force / GRAVITY - 1) + q.tilt_moving_s * rate
             _align(s, k, accel, std, 0.8 * math.pi / count * k, q)
             s.speed_square[k], s.accel_square[k], s.shared_square[k] = 0.25, 1.0, 0.0
             s.up_spread[k] = 0.0
@@ -102,12 +104,12 @@ def _turn_link(s: Record, bank: Record, heading: float, gyro: Floats, q: Record)
         for i in range(3):
             s.axis[0, i] = s.a[i]
         _turn_block(p, size, hinge + AXES, m, s.a, s.b)
-        turn(s.start, heading * s.start_up[0], heading * s.start_up[1], heading * s.start_up[2], 1.0)
-        _about(s.start_up, heading, m)
-        _turn_block(p, size, hinge + START, m, s.a, s.b)
+        turn(s.start[1], 0.0, 0.0, heading, 1.0)
     s.a[0], s.a[1], s.a[2] = 0.0, 0.0, 1.0
     _about(s.a, heading, m)
     _turn_block(p, size, OF_SENSOR, m, s.a, s.b)
+    if hinge >= 0:
+        _turn_block(p, size, hinge + START + 3, m, s.a, s.b)
     for k in range(2):
         for i in range(3):
             s.a[i] = gyro[k, i] - s.gyro_bias[k, i]
@@ -159,10 +161,9 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
             s.lever[k, i], s.axis[k, i] = best.lever[k, i], best.axis[k, i]
     for i in range(3):
         s.lever0[i] = best.lever0[i]
-    for i in range(4):
-        s.start[i] = best.start[i]
-    for i in range(3):
-        s.start_up[i] = best.start_up[i]
+    for k in range(2):
+        for i in range(4):
+            s.start[k, i] = best.start[k, i]
     s.has_axis = best.has_axis
     for i in range(size):
         for j in range(size):
@@ -171,27 +172,18 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
 
 @inner
 def _begin_start(s: Record, size: int, hinge: int) -> None:
-    """R_0 is the relative rotation now, with its error: δφ_0 = R_1ᵀ (δθ_2 − δθ_1)."""
+    """S_k is the attitude now, with its error."""
     p = s.covariance
-    between(s.attitude[0], s.attitude[1], s.start)
-    for i in range(3):
-        s.start_up[i] = s.rotation[0, 2, i]
-    for j in range(size):
+    for k in range(2):
+        for i in range(4):
+            s.start[k, i] = s.attitude[k, i]
         for i in range(3):
-            s.a[i] = p[OF_SENSOR + i, j] - p[i, j]
-        rotate_back(s.rotation[0], s.a, s.b)
+            for j in range(size):
+                p[hinge + START + 3 * k + i, j] = p[OF_SENSOR * k + i, j]
+    for k in range(2):
         for i in range(3):
-            p[hinge + START + i, j] = s.b[i]
-    for j in range(size):
-        if hinge <= j < hinge + 3:
-            for i in range(3):
-                s.a[i] = p[hinge + START + j - hinge, OF_SENSOR + i] - p[hinge + START + j - hinge, i]
-            rotate_back(s.rotation[0], s.a, s.b)
-            for i in range(3):
-                p[hinge + START + i, j] = s.b[i]
-        else:
-            for i in range(3):
-                p[j, hinge + START + i] = p[hinge + START + i, j]
+            for j in range(size):
+                p[j, hinge + START + 3 * k + i] = p[j, OF_SENSOR * k + i]
 
 
 @inner

@@ -2,9 +2,9 @@
 
 Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
 sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
-centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and R_0, the relative
-rotation at the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
-joint to sensor 1. Errors of rotations are in n (of R_0: in sensor 1's axes): R = exp([δθ×]) R̂.
+centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and S_k, the R_k at
+the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
+joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TH, V, BG, BA, R = 0, 3, 6, 9, 12
 OF_SENSOR = 15
 BALL_SIZE = 2 * OF_SENSOR
 # Errors of the parts that only some chains have, relative to their first index.
-START, AXES, HINGE_SIZE = 0, 3, 9
+START, AXES, HINGE_SIZE = 0, 6, 12
 MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
 # Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
 # openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
@@ -100,6 +100,7 @@ class ChainParameters(NamedTuple):
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
     # Prior standard deviations.
     tilt_rad: float = 0.1
+    tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
     speed_m_s: float = 0.3
     gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a rest of 0.3 s finds any larger one
     accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
@@ -116,8 +117,7 @@ STATE = np.dtype(
         ("accel_bias", "f8", (2, 3)),
         ("lever", "f8", (2, 3)),  # r_k
         ("axis", "f8", (2, 3)),  # j_k
-        ("start", *_Q),  # R_0
-        ("start_up", *_V3),  # Z of n in sensor 1's axes at the first sample
+        ("start", "f8", (2, 4)),  # quaternions of S_k
         ("lever0", *_V3),  # r_0
         ("covariance", "f8", (MAX_SIZE, MAX_SIZE)),
         ("correction", "f8", MAX_SIZE),  # of the errors, by the updates since the last `apply_correction`
@@ -173,6 +173,7 @@ STATE = np.dtype(
         ("c", *_V3),
         ("m", "f8", (3, 3)),
         ("relative", *_Q),
+        ("first", *_Q),
     ],
     align=True,
 )
