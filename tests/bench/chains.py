@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 import qmt
 from _report import RECORDINGS
-from real_data import ENCODER_DELAY_S, Pair, matrices, read_encoder, read_robot
+from real_data import ENCODER_DELAY_S, OMC_LATE_S, Pair, matrices, read_encoder, read_robot
 from vqf import VQF
 
 import linkpose as lp
@@ -44,7 +44,6 @@ from linkpose.sensors.measurements import Floats
 
 SKIPPED_S = 5.0
 DIODEM_JOINTS = {(1, 2): "ball", (2, 3): "hinge", (3, 4): "hinge", (4, 5): "hinge"}
-DIODEM_DELAY_S = -0.015  # the cameras are the later ones: lag of the gyros of all five segments
 LATER_STARTS_S = (0.0, 10.0, 20.0, 30.0)
 CHOSEN_STARTS_S = (0.0, 20.0)
 LONGEST_CHOSEN_S = 400.0  # of mpu6050_encoder
@@ -78,7 +77,7 @@ def diodem(folder: Path) -> Iterator[Case]:
                 for kind in ("acc", "gyr", "mag")
             )
             first, second = (np.column_stack([seen[f"seg{k}_quat_{c}"] for c in "wxyz"]) for k in (a, b))
-            truth, known = _interpolated(seen_s, qmt.qmult(qmt.qinv(first), second), time_s - DIODEM_DELAY_S)
+            truth, known = _interpolated(seen_s, qmt.qmult(qmt.qinv(first), second), time_s + OMC_LATE_S)
             for start_s in LATER_STARTS_S:
                 pair = _from(Pair(time_s, accel, gyro), start_s)
                 cut = slice(len(time_s) - len(pair.time_s), None)
