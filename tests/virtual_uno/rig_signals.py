@@ -62,6 +62,13 @@ def air_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
     return time_s, np.column_stack([pressure, truth.temp_degC])
 
 
+def room_rows(seed: int, first: int, count: int) -> tuple[Floats, Floats]:
+    """As `air_rows`, in a room in which a robot drives: 1013.25 hPa and 25 °C."""
+    noise = imu.white((seed, _AIR_NOISE_STREAM), first, count, 1)[:, 0]
+    time_s = np.arange(first, first + count) / RATE_HZ
+    return time_s, np.column_stack([101_325 + PRESSURE_NOISE_PA * noise, np.full(count, 25.0)])
+
+
 def mouse_rows(run: MiceRun, first: int, count: int) -> tuple[Floats, list[Floats]]:
     """Times (N,) s and for each mouse its path (N, 2) in mm for `Mouse.feed`.
 
@@ -95,6 +102,8 @@ class RigFeed:
         self._uno.imu.feed(*imu_rows(self._run, first, count), start_s=self.start_s)
         if isinstance(self._run, LinkRun):
             self._feed_air(self._run, first, count)
+        else:
+            self._uno.baro.feed(*room_rows(self._run.seed, first, count), start_s=self.start_s)
         if self._drive is not None:
             self._feed_mice(self._drive, first, count)
         self._fed_until = self.start_s + (first + count) / RATE_HZ

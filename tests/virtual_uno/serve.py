@@ -65,7 +65,7 @@ def main() -> int:
             VirtualUno(
                 program,
                 seed=options.seed,
-                bootloader_s=options.bootloader,
+                bootloader_s=0.0 if boot_address else options.bootloader,
                 boot_address=boot_address,
                 **_parts(options),
             ) as uno,
@@ -107,7 +107,9 @@ def _parse() -> argparse.Namespace:
     pace.add_argument("--flat-out", dest="paced", action="store_false", help="as fast as the host reads")
     parser.add_argument("--clock-ppm", type=float, default=0.0, metavar="PPM", help="how fast the board's clock is")
     parser.add_argument("--no-reset-on-open", dest="reset_on_open", action="store_false", help="as without DTR")
-    parser.add_argument("--bootloader", type=float, default=0.0, metavar="S", help="its wait after a reset (an UNO: 1)")
+    parser.add_argument(
+        "--bootloader", type=float, default=1.0, metavar="S", help="its wait after a reset (default: 1)"
+    )
     parser.add_argument("--disturbance", type=float, default=30.0, metavar="PA", help="what traffic adds to the BMP180")
     parser.add_argument("--fault", action="append", default=[], metavar="SECONDS:FAULT", help="see below")
     options = parser.parse_args()

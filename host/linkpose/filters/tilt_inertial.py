@@ -55,6 +55,8 @@ class TiltInertialFilter:
         "tilt_inertial_pitch_deg",
         "tilt_inertial_roll_std_deg",
         "tilt_inertial_pitch_std_deg",
+        "tilt_inertial_yaw_deg",
+        "tilt_inertial_yaw_std_deg",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -88,11 +90,14 @@ class TiltInertialFilter:
         return np.asarray(self.state.nominal[BG:BA].copy())
 
     def process(self, block: Measurements) -> Floats:
-        """Estimates at each of the N samples: (N, 6) in the order of `columns`; NaN where not known yet."""
-        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 6))
+        """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
+        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 8))
         process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
-        values, stds = estimates["value"], estimates["std"]
-        table[:, 0], table[:, 1] = (values[:, HEIGHT], stds[:, HEIGHT]) if self._has_height else (np.nan, np.nan)
+        values, stds = estimates["value"], np.minimum(estimates["std"], np.pi)
+        height, height_std = values[:, HEIGHT], estimates["std"][:, HEIGHT]
+        table[:, 0], table[:, 1] = (height, height_std) if self._has_height else (np.nan, np.nan)
         np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
-        np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi), out=table[:, 4:])
+        np.degrees(stds[:, ROLL:YAW], out=table[:, 4:6])
+        np.degrees(values[:, YAW], out=table[:, 6])
+        np.degrees(stds[:, YAW], out=table[:, 7])
         return table

@@ -80,6 +80,7 @@ _REASON = {
     Cause.FROZEN: "repeats the same reading",
     Cause.OUT_OF_RANGE: "gives impossible readings",
     Cause.STUCK: "repeats one axis while the others change",
+    Cause.STARTING: "is still being set up",
 }
 _WIRING = "Check its wiring and its supply"
 _POWER = "Unplug the board and plug it in again; if it happens again, check the wiring or replace the sensor"

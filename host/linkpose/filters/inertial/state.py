@@ -74,6 +74,11 @@ _FIELDS = np.dtype(
         ("impulse", *_VECTOR),  # ∫ force (m/s)
         ("rotation_variance", "f8"),  # each axis (rad²)
         ("velocity_variance", "f8"),  # each axis (m²/s²)
+        # Noise of the readings.
+        ("force_differences", "f8", (4, 3)),  # last force and its differences up to the third
+        ("rate_differences", "f8", (4, 3)),
+        ("force_noise", "f8"),  # measured variance of each axis (m²/s⁴)
+        ("rate_noise", "f8"),  # rad²/s²
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
