@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import http.client
 import json
@@ -15,8 +16,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+import zstandard
 from browser import Browser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -192,6 +195,25 @@ def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
         browser.open(page.url)
         browser.wait_for_text("+30.0° ±1.2°")
         leave_without_error(browser)
+
+
+def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Path, linkpose: Any) -> None:
+    """A robot's tilt filter has columns of the height without a value: the robot is drawn, not a link."""
+    estimate = tmp_path / "e.csv"
+    rows = [f"{0.1 * at:.1f},,{0.1 * at:.2f},0.5,0.1\n" for at in range(20)]
+    estimate.write_text("time_s,tilt_height_m,mice_x_m,mice_y_m,mice_heading_rad\n" + "".join(rows))
+    assert linkpose("plot", estimate, "-o", tmp_path / "e.html").status == 0
+    text = (tmp_path / "e.html").read_text()
+    payload = base64.b64decode(text.split('__VISER_EMBED_DATA__="')[1].split('"')[0])
+    inner = zstandard.ZstdDecompressor().decompress(payload[8:], int.from_bytes(payload[:8], "little"))
+    recorded = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
+    assert recorded["durationSeconds"] == pytest.approx(1.9)
+    places = [m["position"] for _, m in recorded["messages"] if m.get("name") == "/robot" and "position" in m]
+    assert places[-1][:2] == pytest.approx([1.9, 0.5])
+    browser.open((tmp_path / "e.html").as_uri())
+    browser.wait_for("!!document.querySelector('canvas') && !!document.querySelector('input')")
+    leave_without_error(browser)
+    assert linkpose("plot", estimate, "-o", tmp_path / "e.gif").status == 2
 
 
 def test_what_is_not_excited_yet_is_shown() -> None:

@@ -113,12 +113,13 @@ class Session:
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = 0
-        self._status: Status | None = None
+        self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
-        self._started: Arrival | None = None  # what came together with the ACK of START
+        self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
         self._last_stamp: tuple[int, int] | None = None  # seq and t_us of the last sample
+        self._arrived_s = 0.0  # s, the connection's clock: of the last sample
         self._still = 0  # samples in a row with the same t_us
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
@@ -317,7 +318,7 @@ class Session:
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
-        self._began_s = self._connection.now()
+        self._arrived_s = self._connection.now()
         while not timeline.is_over:
             try:
                 placements = self._next(timeline)
@@ -339,9 +340,11 @@ class Session:
             )
 
     def _end_when_due(self, timeline: Timeline) -> None:
-        """End the timeline when the duration has passed without a sample that would have ended it."""
-        first_s = timeline.start_s if timeline.samples else self._began_s
-        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
+        """End the timeline when the duration has passed without a sample that would have ended it.
+
+        What has passed is counted from the last sample's arrival: a board whose samples come late goes on to the end.
+        """
+        timeline.end_if_past(timeline.duration_s + self._connection.now() - self._arrived_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
@@ -349,8 +352,8 @@ class Session:
         for _ in range(ATTEMPTS):
             self._clock = DeviceClock()
             self._tie_clocks()
-            self._started = self._start(wanted)
-            if self._started is not None:
+            self._unhandled = self._start(wanted)
+            if self._unhandled is not None:
                 break
             self._connection.send(Stop())
             self.configure(wanted)
@@ -383,7 +386,7 @@ class Session:
         return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
+        arrival, self._unhandled = self._unhandled or self._connection.receive(RECEIVE_TIMEOUT_S), None
         now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
@@ -394,17 +397,22 @@ class Session:
             self._silent_s += min(waited_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
             self._ask_when_silent()
             return []
-        placements = []
-        for message in arrival.messages:
+        placements: list[Placement] = []
+        for at, message in enumerate(arrival.messages):
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
                 self._unread_bytes = 0
+                self._arrived_s = arrival.time_s
                 self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
-            else:
-                self._hear(message, arrival, timeline)
+            elif placements and isinstance(message, Hello | OtherProtocol):
+                # It may end the connection, and the samples before it must not be lost then.
+                self._unhandled = Arrival(arrival.time_s, arrival.messages[at:], b"")
+                break
+            elif self._hear(message, arrival, timeline):
+                break
         return placements
 
     def _check_supply(self, status: Status) -> None:
@@ -444,11 +452,13 @@ class Session:
             self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
-    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
+    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> bool:
+        """Act on a message other than a sample. True if the board was reset and has been started again: what arrived
+        together with its HELLO is older than that."""
         if isinstance(message, Pong):
             self._hear_pong(message, arrival.time_s)
         elif isinstance(message, Status):
-            self._status = message
+            self.status = message
             self._check_supply(message)
         elif isinstance(message, OtherProtocol):
             raise _other_protocol(message)
@@ -462,6 +472,8 @@ class Session:
                 raise
             except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
                 raise NotResumed(self.port, error) from error
+            return True
+        return False
 
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
@@ -545,7 +557,7 @@ class Session:
             rate_hz=timeline.samples / duration if duration else 0.0,
             drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
-            status=self._status,
+            status=self.status,
         )
 
 

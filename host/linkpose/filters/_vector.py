@@ -221,6 +221,12 @@ def turn_back_sym(r: Vec, s: Sym) -> Sym:
 
 
 @inner
+def wrapped(angle: float) -> float:
+    """The angle (rad) in [−π, π)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@inner
 def roll_pitch(tilt: Vec) -> tuple[float, float]:
     """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖), degrees."""
     roll, pitch = math.atan2(tilt[1], tilt[2]), math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))

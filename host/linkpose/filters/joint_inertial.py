@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
@@ -25,21 +25,30 @@ from linkpose.filters.inertial.state import (
     ESTIMATE,
     HEIGHT,
     MA,
+    PITCH,
     PSI,
     ROLL,
+    SIGMA,
     YAW,
     D,
     Floats,
     SensorErrors,
     X,
+    Y,
     fresh_state,
     record_of,
 )  # fmt: skip
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Imu, Rig
 
 _HYPOTHESES = (CALIBRATED, DATA_SHEET)
+# Of `mix`'s table, in the order of the columns below.
+_COLUMNS = np.array(
+    [
+        HEIGHT, SIGMA + HEIGHT, ROLL, PITCH, YAW, SIGMA + YAW, X, Y, HEIGHT,
+        SIGMA + ROLL, SIGMA + PITCH, SIGMA + X, SIGMA + Y, SIGMA + HEIGHT,
+    ]
+)  # fmt: skip
 
 
 class InertialParameters(NamedTuple):
@@ -121,7 +130,6 @@ class JointInertialFilter:
             fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
         ]
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def states(self) -> tuple[Any, Any]:
@@ -179,21 +187,10 @@ class JointInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 14) in the order of `columns`; NaN where unknown so far."""
-        n = len(block)
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = [np.empty(n, ESTIMATE) for _ in self._states]
-        for states, estimate in zip(self._states, estimates, strict=True):
-            process(
-                block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-                self._imu, self._record, states, estimate,
-            )  # fmt: skip
-        values, stds = mix(*estimates)
-        for found in (values, stds):
-            found[:, ROLL:] = np.degrees(found[:, ROLL:])
-        height, std = values[:, HEIGHT], stds[:, HEIGHT]
-        return np.column_stack(
-            [
-                height, std, values[:, ROLL:YAW], values[:, YAW], stds[:, YAW], values[:, X:ROLL], height,
-                stds[:, ROLL:YAW], stds[:, X:ROLL], std,
-            ]
-        )  # fmt: skip
+        samples = ImuSamples.of(block)
+        first, second = np.empty(len(block), ESTIMATE), np.empty(len(block), ESTIMATE)
+        process(samples, self._imu, self._record, self._states[0], first)
+        process(samples, self._imu, self._record, self._states[1], second)
+        mixed = np.empty((len(block), 2 * SIGMA))
+        mix(first, second, mixed)
+        return mixed.take(_COLUMNS, axis=1)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
@@ -30,7 +30,6 @@ from linkpose.filters.inertial.state import (
     record_of,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -56,6 +55,8 @@ class TiltInertialFilter:
         "tilt_inertial_pitch_deg",
         "tilt_inertial_roll_std_deg",
         "tilt_inertial_pitch_std_deg",
+        "tilt_inertial_yaw_deg",
+        "tilt_inertial_yaw_std_deg",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -67,7 +68,6 @@ class TiltInertialFilter:
             declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def state(self) -> Any:
@@ -90,15 +90,14 @@ class TiltInertialFilter:
         return np.asarray(self.state.nominal[BG:BA].copy())
 
     def process(self, block: Measurements) -> Floats:
-        """Estimates at each of the N samples: (N, 6) in the order of `columns`; NaN where not known yet."""
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.empty(len(block), ESTIMATE)
-        process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-            self._imu, self._record, self._states, estimates,
-        )  # fmt: skip
-        values, stds = estimates["value"], estimates["std"]
-        if not self._has_height:
-            values[:, HEIGHT] = stds[:, HEIGHT] = np.nan
-        tilts, their_stds = np.degrees(values[:, ROLL:YAW]), np.degrees(np.minimum(stds[:, ROLL:YAW], np.pi))
-        return np.column_stack([values[:, HEIGHT], stds[:, HEIGHT], tilts, their_stds])
+        """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
+        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 8))
+        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
+        values, stds = estimates["value"], np.minimum(estimates["std"], np.pi)
+        height, height_std = values[:, HEIGHT], estimates["std"][:, HEIGHT]
+        table[:, 0], table[:, 1] = (height, height_std) if self._has_height else (np.nan, np.nan)
+        np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
+        np.degrees(stds[:, ROLL:YAW], out=table[:, 4:6])
+        np.degrees(values[:, YAW], out=table[:, 6])
+        np.degrees(stds[:, YAW], out=table[:, 7])
+        return table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,8 +11,9 @@ import numpy as np
 
 from linkpose.page import geometry
 from linkpose.presentation import Row, best_filter
-from linkpose.quantities import CHAIN_ROTATION, HEADING, PITCH, QW, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import CHAIN_ROTATION, HEADING, HEIGHT, PITCH, QW, ROLL, YAW, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
+from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     import viser
@@ -264,6 +265,19 @@ def _add_cone(scene: viser.SceneApi, name: str) -> viser.MeshHandle:
     return scene.add_mesh_simple(
         name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
     )
+
+
+def scene_of(
+    server: viser.ViserServer, filters: Iterable[Mapping[Quantity, str]], rig: Rig, surroundings: Surroundings | None
+) -> LinkScene | RobotScene | ChainScene:
+    """The scene for the quantities that the filters estimate."""
+    estimated = {quantity for of in filters for quantity in of}
+    if QW in estimated:
+        return ChainScene(server, rig)
+    j2s = rig.joint.known_j2s_m
+    if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
+        return RobotScene(server, surroundings)
+    return LinkScene(server, None if j2s is None else np.array(j2s))
 
 
 def _ground(scene: viser.SceneApi, size_m: float) -> None:

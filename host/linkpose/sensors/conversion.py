@@ -68,6 +68,11 @@ class BoardSettings:
         return {name: getattr(self, name) for name in names}
 
     @property
+    def imu_delay_s(self) -> float:
+        """Mean age (s) of the first inertial sensor's readings at their timestamps."""
+        return mpu6050.delay_s(self.dlpf, self.imu_families[0])
+
+    @property
     def has_imu2(self) -> bool:
         """Whether the board has, or had, a second inertial sensor."""
         return self.imu_families[1] != DeviceFamily.NONE

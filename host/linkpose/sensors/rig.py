@@ -164,13 +164,11 @@ class Rig:
         """The rig with another J2S, assumed accurate to 0.1 mm (1σ)."""
         return replace(self, joint=Joint(j2s_m))
 
-    def with_delay_of(self, dlpf: int | None) -> Rig:
-        """The rig for readings with this low-pass setting (DLPF_CFG, 0 to 6); a delay that the rig states is kept."""
-        from linkpose.sensors.mpu6050 import DLPF_DELAY_S
-
-        if dlpf is None or self.imu.delay_s is not None:
+    def with_delay(self, delay_s: float | None) -> Rig:
+        """The rig for inertial readings of this mean age (s), None: unknown. A delay that the rig states is kept."""
+        if delay_s is None or self.imu.delay_s is not None:
             return self
-        return replace(self, imu=replace(self.imu, delay_s=DLPF_DELAY_S[dlpf]))
+        return replace(self, imu=replace(self.imu, delay_s=delay_s))
 
     def as_dict(self) -> dict[str, Any]:
         """The rig as plain tables, for JSON and TOML."""

@@ -20,7 +20,7 @@ from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Noise, Rig, Vector
+from linkpose.sensors.rig import Imu, Joint, Mag, Noise, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
@@ -134,10 +134,12 @@ class LinkRun:
         rests: bool = False,
         imu2: bool = False,
         mag: bool = False,
+        mag_disturbance: str | None = None,
         noise_of: Rig | None = None,
         swing_rad: float | None = None,
     ) -> None:
-        """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer.
+        """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer,
+        whose field `mag_disturbance` (a key of mag.DISTURBANCES) disturbs.
 
         `duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
         swinging the link, as `calibrate imu` asks for. `noise_of` is a rig whose noise and remaining biases the sensors
@@ -170,6 +172,12 @@ class LinkRun:
             self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw_from(noise_of, rng, rate_hz) for rng in rngs)
         noise = noise_of.noise if noise_of is not None else Noise()
         self._drifts = {s: imu.BiasDrift(noise, (seed, s, _DRIFT, test)) for s in (_IMU_NOISE, _IMU2_NOISE)}
+        if mag_disturbance is not None and (mag_disturbance not in mag_model.DISTURBANCES or not mag):
+            known = ", ".join(mag_model.DISTURBANCES)
+            raise LinkposeError(
+                f"there is no magnetic disturbance {mag_disturbance!r}: take {known}, and a magnetometer"
+            )
+        self.mag_disturbance = mag_disturbance
         self._hard_iron_uT = mag_model.hard_iron(errors, np.random.default_rng([seed, _MAG_ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
@@ -192,7 +200,8 @@ class LinkRun:
     @property
     def rig(self) -> Rig:
         """The rig file that belongs to the run. Nothing filters its readings: they have no delay."""
-        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0))
+        mag = mag_model.calibration(self.errors) if self.hello_sensors & Sensors.MAG else Mag()
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), mag=mag)
 
     def at(self, time_s: Floats) -> LinkTruth:
         """The truth at any instants (N,), s. After the end the link stays at rest."""
@@ -253,7 +262,11 @@ class LinkRun:
         """Field that the magnetometer measures (N, 3), µT, in the link's axes; `first` as for `imu_counts`."""
         noise = imu.white((self.seed, _MAG_NOISE, self.test), first, len(time_s), 3)
         noise = mag_model.NOISE_UT * (self.errors != "none") * noise
-        return mag_model.field(self._motion.at(time_s)) + self._hard_iron_uT + noise
+        moving = self._motion.at(time_s)
+        field = mag_model.field(moving) + self._hard_iron_uT + noise
+        if self.mag_disturbance is not None:
+            field = field + mag_model.disturbance(self.mag_disturbance, moving, time_s)
+        return field
 
     def _imu_counts(
         self, time_s: Floats, first: int, felt: tuple[Floats, Floats], errors: imu.ImuErrors, stream: int

@@ -1,6 +1,6 @@
 """`sim://...`: simulated boards as pyserial ports, for any code that opens a port.
 
-    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&drift_ppm=0&speed=1
+    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&mag_disturbance=desk&drift_ppm=0&speed=1
     sim://chain?joint=hinge&seed=0&errors=calibrated&drift_ppm=0&speed=1
     sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8&drift_ppm=0&speed=1
 
@@ -151,6 +151,7 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
     if len(words) != 3:
         raise LinkposeError("j2s must be three numbers: j2s=X,Y,Z in metres")
     x, y, z = (_number({"j2s": word}, "j2s", 0) for word in words)
+    disturbance = options.pop("mag_disturbance", None)
     imu2, mag = (_number(options, name, 0) != 0 for name in ("imu2", "mag"))
 
     def make_run(settings: Configure) -> LinkRun:
@@ -165,7 +166,8 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
             gyro_range_deg_s=settings.gyro_range_deg_s,
             oversampling=settings.baro_oversampling,
             imu2=imu2,
-            mag=mag,
+            mag=mag or disturbance is not None,
+            mag_disturbance=disturbance,
         )
 
     return make_run
@@ -217,7 +219,7 @@ def _mice(options: dict[str, str]) -> Callable[[Configure], Run]:
 
 # Simulated board -> what makes it from its options, and their names.
 _RIGS: dict[str, tuple[Callable[[dict[str, str]], Callable[[Configure], Run]], str]] = {
-    "link": (_link, "test, seed, errors, j2s, imu2, mag"),
+    "link": (_link, "test, seed, errors, j2s, imu2, mag, mag_disturbance"),
     "chain": (_chain, "joint, seed, errors"),
     "mice": (_mice, "seed, mice, path, errors, fault"),
 }

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import compiled, inner
-from linkpose.filters._imu import GRAVITY
+from linkpose.filters import _vector as vec
+from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
@@ -21,6 +22,20 @@ from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
 from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
+from linkpose.filters.frozen import is_frozen
+from linkpose.wire.messages import SampleFlags
+
+_NEEDED = int(SampleFlags.IMU_VALID | SampleFlags.IMU2_VALID)
+_CLIPPED = int(
+    SampleFlags.ACCEL_SATURATED
+    | SampleFlags.GYRO_SATURATED
+    | SampleFlags.ACCEL2_SATURATED
+    | SampleFlags.GYRO2_SATURATED
+)
+# Readings of a sensor at rest may repeat to the last bit (low-pass filter, little noise): below this rate of all axes
+# they do not show a frozen sensor.
+_RESTING_RAD_S = 0.05
+_LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
 
 
 @inner
@@ -258,31 +273,50 @@ def _height(s: Record, k: int, size: int, base: int) -> tuple[float, float]:
 
 @compiled
 def process(
-    time: Floats, accel: Floats, gyro: Floats, valid: Floats, bank_of: Record, states: Record, q_of: Record,
+    first: ImuSamples, second: ImuSamples, calibration: Floats, bank_of: Record, states: Record, q_of: Record,
     noise: Floats, estimates: Record,
 ) -> None:  # fmt: skip
-    """N samples: time (N,) s; accel (N, 2, 3) m/s²; gyro (N, 2, 3) rad/s; valid (N,) 1 or 0; estimates (N,).
+    """Estimates (N,) of ESTIMATE at N samples of both sensors; NaN where a sensor has no usable reading.
 
-    `noise`: variances of one reading of gyro and accelerometer. Rows of invalid samples are NaN.
+    `calibration` (2, 3, 3): offset (m/s²) and scale of each accelerometer, bias (rad/s) of each gyro. `noise`:
+    variances of one reading of gyro and accelerometer.
     """
     bank, q = bank_of[0], q_of[0]
-    for n in range(time.shape[0]):
-        out = estimates[n]
-        if valid[n] == 0.0:
+    for n in range(first.time_s.shape[0]):
+        out, time_s, flags = estimates[n], first.time_s[n], first.flags[n]
+        is_usable = flags & _NEEDED == _NEEDED and flags & _CLIPPED == 0
+        is_usable = _read(bank, 0, time_s, first.accel[n], first.gyro[n], calibration) and is_usable
+        is_usable = _read(bank, 1, time_s, second.accel[n], second.gyro[n], calibration) and is_usable
+        if not is_usable:
             bank.rejected += 1
             _blank(out)
             continue
-        h = time[n] - bank.time
+        gyro, accel = bank.new_gyro, bank.new_accel
+        h = time_s - bank.time
         if not bank.begun or h > q.longest_gap_s:
             bank.restarts += bank.begun
-            _begin(bank, states, accel[n], q)
-            _remember(bank, time[n], gyro[n], accel[n], True)
+            _begin(bank, states, accel, q)
+            _remember(bank, time_s, gyro, accel, True)
             bank.since_update = 0.0
         elif h > 0.0:
-            _step(bank, states, gyro[n], accel[n], h, q, noise)
-            _remember(bank, time[n], gyro[n], accel[n], False)
+            _step(bank, states, gyro, accel, h, q, noise)
+            _remember(bank, time_s, gyro, accel, False)
         _report(bank, states, out, q)
         _report_covariance(states[bank.best], out)
+
+
+@inner
+def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, calibration: Floats) -> bool:
+    """Calibrates the readings of sensor k into the bank. False where they are frozen, missing or impossible."""
+    frozen = is_frozen(bank.last_readings[k], time_s, vec.load(accel), vec.load(gyro))
+    is_possible, turns = True, False
+    for i in range(3):
+        force = (accel[i] - calibration[k, 0, i]) / calibration[k, 1, i]
+        rate = gyro[i] - calibration[k, 2, i]
+        bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
+        is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
+        turns = turns or abs(gyro[i]) > _RESTING_RAD_S
+    return is_possible and not (frozen and turns)
 
 
 @inner

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters.frozen import MEMORY, fresh_memory
 from linkpose.sensors.rig import Chain, Rig, Vector
 
 Floats = NDArray[np.float64]
@@ -169,6 +170,9 @@ BANK = np.dtype(
         ("mean_gyro", "f8", (2, 3)),
         ("mean_accel", "f8", (2, 3)),
         ("still_s", "f8", 2),
+        ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
+        ("new_accel", "f8", (2, 3)),
+        ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
         ("best", "i8"),
         ("rejected", "i8"),
         ("restarts", "i8"),
@@ -201,6 +205,7 @@ def fresh_bank(rig: Rig) -> Any:
     """The shared record of a chain that begins."""
     banks = np.zeros(1, BANK).view(np.recarray)
     bank: Any = banks[0]
+    bank.last_readings[:] = fresh_memory()
     bank.length, bank.hinge, bank.fixed = BALL_SIZE, -1, -1
     if rig.chain.joint == "hinge":
         bank.hinge, bank.length = bank.length, bank.length + HINGE_SIZE

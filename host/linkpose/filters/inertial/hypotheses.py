@@ -11,12 +11,11 @@ Source: D. T. Magill, "Optimal adaptive estimation of sampled stochastic process
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from linkpose.filters.inertial.state import HEIGHT, PITCH, ROLL, YAW, Floats, SensorErrors, roll_pitch
+from linkpose.compiling import compiled, inner
+from linkpose.filters import _vector as vec
+from linkpose.filters.inertial.state import HEIGHT, PITCH, ROLL, SIGMA, Floats, Record, SensorErrors
 
 # What a calibration leaves (simulated twelve-position calibration, ../simulation/link.py), and what the MPU-6050's data
 # sheet allows (zero-rate output ±20 °/s after a rough subtraction, zero-g output ±50 mg, scale ±3 %, cross-axis ±2 %).
@@ -32,39 +31,49 @@ _OCCAM = 8.0
 _MOST = 50.0  # log odds beyond which the other filter has no weight
 
 
-def log_odds(first: Floats, second: Floats) -> Floats:
+def log_odds(first: float, second: float) -> float:
     """Log odds of the first hypothesis, from half the χ² of the sensor errors that each filter has estimated."""
-    return np.clip(_LOG_ODDS + _OCCAM * second - first, -_MOST, _MOST)
+    return min(max(_LOG_ODDS + _OCCAM * second - first, -_MOST), _MOST)
 
 
-def mix(a: NDArray[Any], b: NDArray[Any]) -> tuple[Floats, Floats]:
-    """The mean of two filters' estimates (arrays (N,) of ESTIMATE): values and σ (N, 6), in the order of ESTIMATE.
+_log_odds = inner(log_odds)
+
+
+@compiled
+def mix(first: Record, second: Record, out: Floats) -> None:
+    """The mean of two filters' estimates (N,) of ESTIMATE: values and then σ (N, 12), in its order; angles in degrees.
 
     A variance includes how far the filters differ. Where one filter has no position, the other's counts alone.
     """
-    probability = 1.0 / (1.0 + np.exp(-log_odds(a["distance"], b["distance"])))
-    share = np.repeat(probability[:, None], YAW + 1, axis=1)
-    unknown_a, unknown_b = np.isnan(a["value"][:, HEIGHT]), np.isnan(b["value"][:, HEIGHT])
-    share[unknown_b & ~unknown_a, :ROLL] = 1.0
-    share[unknown_a & ~unknown_b, :ROLL] = 0.0
-    apart = b["value"] - a["value"]
-    apart[:, ROLL:] = wrapped(apart[:, ROLL:])
-    values = _mixed(share, a["value"], np.where(share == 0.0, b["value"], a["value"] + apart))
-    # Roll and pitch of the mean tilt: near the vertical, the mean of two angles is not that of their tilts.
-    values[:, ROLL], values[:, PITCH] = roll_pitch(_mixed(probability[:, None], a["tilt"], b["tilt"]))
-    values[:, YAW] = wrapped(values[:, YAW])
+    for i in range(len(first)):
+        a, b = first[i], second[i]
+        probability = 1.0 / (1.0 + math.exp(-_log_odds(a.distance, b.distance)))
+        unknown_a, unknown_b = math.isnan(a.value[HEIGHT]), math.isnan(b.value[HEIGHT])
+        share = 1.0 if unknown_b and not unknown_a else 0.0 if unknown_a and not unknown_b else probability
+        for k in range(ROLL):
+            out[i, k], out[i, SIGMA + k] = _mixed(share, a, b, k, b.value[k] - a.value[k])
+        for k in range(ROLL, SIGMA):
+            angle, std = _mixed(probability, a, b, k, vec.wrapped(b.value[k] - a.value[k]))
+            out[i, k], out[i, SIGMA + k] = math.degrees(vec.wrapped(angle)), math.degrees(min(std, math.pi))
+        # Near the vertical, the mean of two angles is not that of their tilts.
+        tilt = (
+            _mean(probability, a.tilt[0], b.tilt[0]),
+            _mean(probability, a.tilt[1], b.tilt[1]),
+            _mean(probability, a.tilt[2], b.tilt[2]),
+        )
+        out[i, ROLL], out[i, PITCH] = vec.roll_pitch(tilt)
+
+
+@inner
+def _mixed(share: float, a: Record, b: Record, k: int, apart: float) -> tuple[float, float]:
+    """Mean and σ of value k, where b's is `apart` from a's."""
+    mean = _mean(share, a.value[k], b.value[k] if share == 0.0 else a.value[k] + apart)
     both = share * (1.0 - share)
-    between = np.where(both == 0.0, 0.0, both * np.square(apart))
-    stds = np.sqrt(_mixed(share, np.square(a["std"]), np.square(b["std"])) + between)
-    stds[:, ROLL:] = np.minimum(stds[:, ROLL:], np.pi)
-    return values, stds
+    between = 0.0 if both == 0.0 else both * (apart * apart)
+    return mean, math.sqrt(_mean(share, a.std[k] * a.std[k], b.std[k] * b.std[k]) + between)
 
 
-def wrapped(angle: Floats) -> Floats:
-    """An angle (rad) between −π and π."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
-def _mixed(share: Floats, a: Floats, b: Floats) -> Floats:
+@inner
+def _mean(share: float, a: float, b: float) -> float:
     """`share` of a and the rest of b; one alone where its share is 1, whatever the other is."""
-    return np.where(share == 1.0, a, np.where(share == 0.0, b, share * a + (1.0 - share) * b))
+    return a if share == 1.0 else b if share == 0.0 else share * a + (1.0 - share) * b
