@@ -252,7 +252,7 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
             state.lever[k] = (0.0, 0.0, 0.0) if lever is None else lever
             variance[first + BG : first + BA] = (gyro_std if k == 0 else parameters.gyro_bias_rad_s) ** 2
             variance[first + BA : first + R] = (accel_std if k == 0 else parameters.accel_bias_m_s2) ** 2
-            variance[first + R : first + OF_SENSOR] = (parameters.lever_m if lever is None else std) ** 2
+            variance[first + R : first + OF_SENSOR] = np.square(parameters.lever_m if lever is None else std)
         if bank.fixed >= 0:
             state.lever0 = rig.joint.j2s_m
             variance[bank.fixed : bank.fixed + 3] = np.square(rig.joint.j2s_std_m)
