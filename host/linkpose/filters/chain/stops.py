@@ -1,8 +1,8 @@
 """End stops of a hinge as a measurement of its angle.
 
-About a vertical hinge, nothing but the gyros measures the angle, and it drifts with their bias. Many hinges turn back at
-the same two angles, e.g. a motor between its limits or a knee at full extension. Where successive turning points on one
-side agree, the filter takes them as an end stop, and from then on the angle there as that of the first:
+About a vertical hinge, nothing but the gyros measures the angle, and it drifts with their bias. Many hinges turn back
+at the same two angles, e.g. a motor between its limits or a knee at full extension. Where successive turning points on
+one side agree, the filter takes them as an end stop, and from then on the angle there as that of the first:
 
     0 = φ − φ_first + e
 
