@@ -57,7 +57,7 @@ class Board:
         """Connects to the board.
 
         Args:
-            port: device, pyserial URL or `sim://link`, `sim://mice`; None: the only UNO connected.
+            port: device, pyserial URL or `sim://link`, `sim://chain`, `sim://mice`; None: the only UNO connected.
             settings: fields of CONFIGURE to change, such as {"sample_rate_hz": 200, "accel_range_g": 16}.
             rig: sensor placement and calibration, or the path of a rig.toml; a simulated board has its own.
             joint: replaces the joint of the rig.

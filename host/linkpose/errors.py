@@ -220,6 +220,22 @@ class SensorMissing(CannotRun):
         self.filter, self.sensor = name, sensor
 
 
+class UncalibratedMagnetometer(CannotRun):
+    """The heading is to be held by a magnetometer whose hard iron is unknown."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the magnetometer is not calibrated: the iron of the board itself would turn the heading by tens of degrees"
+        )
+
+
+class NoMagnetometer(CannotRun):
+    """The heading is to be held by a magnetometer, and none gives a value."""
+
+    def __init__(self) -> None:
+        super().__init__("no magnetometer gives a value: check its wiring, or leave it out")
+
+
 class FilterCannotRun(LinkposeError):
     """A filter that was asked for cannot run. `filter` is its name, `reason` the error that explains it."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from linkpose import filters, quantities
-from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns
+from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns, NoMagnetometer
 from linkpose.precompile import TEXT
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
@@ -28,12 +28,14 @@ if TYPE_CHECKING:
     import pandas
 
     from linkpose.board import Board
+    from linkpose.filters.magnetic_heading import FieldRecord
 
 
 def sensors_of(measurements: Measurements) -> Sensors:
     """Those that ever gave a value in these measurements."""
     imu = Sensors.MPU6050 if np.isfinite(measurements.gyro_rad_s).any() else Sensors(0)
     imu |= Sensors.IMU2 if measurements.has_imu2 else Sensors(0)
+    imu |= Sensors.MAG if measurements.mag_fresh.any() else Sensors(0)
     return imu | (Sensors.BMP180 if measurements.baro_fresh.any() else Sensors(0))
 
 
@@ -110,7 +112,7 @@ class Estimator:
         Raises UnknownFilter, FilterCannotRun when a named filter cannot run, NoFilterRuns when none can. `left_out`
         maps each filter that cannot run to the reason.
         """
-        self._rig = rig
+        self._rig, self._sensors = rig, sensors
         self.left_out: dict[str, CannotRun] = {}
         self.filters: list[filters.Filter] = []
         for name in dict.fromkeys(name.replace("_", "-") for name in names or filters.NAMES):
@@ -122,9 +124,7 @@ class Estimator:
                 self.left_out[name] = reason
         if not self.filters:
             raise NoFilterRuns(self.left_out)
-        self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
-        self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
-        self.excluded = ExcludedMice(self.columns)
+        self._set_columns()
 
     @staticmethod
     def for_board(names: Sequence[str], board: Board, chain_joint: str | None = None) -> Estimator:
@@ -133,7 +133,7 @@ class Estimator:
         Raises as the constructor does.
         """
         settings = BoardSettings.of(board.hello)
-        rig = with_chain_joint(board.rig.with_delay_of(settings.dlpf), chain_joint)
+        rig = with_chain_joint(board.rig.with_delay(settings.imu_delay_s), chain_joint)
         return Estimator(names, rig, found(board.hello), settings.mouse_ports)
 
     @staticmethod
@@ -142,12 +142,18 @@ class Estimator:
         survey = recording.survey
         sensors = Sensors.MPU6050 if survey.has_gyro else Sensors(0)
         sensors |= Sensors.IMU2 if survey.has_gyro2 else Sensors(0)
+        sensors |= Sensors.MAG if survey.has_mag else Sensors(0)
         return Estimator(names, rig, sensors | (Sensors.BMP180 if survey.has_pressure else Sensors(0)), survey.mice)
 
     @staticmethod
     def for_measurements(names: Sequence[str], rig: Rig, measurements: Measurements) -> Estimator:
         """An estimator for the sensors and mice that gave values. Raises as the constructor does."""
         return Estimator(names, rig, sensors_of(measurements), mice_of(measurements))
+
+    def _set_columns(self) -> None:
+        self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
+        self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
+        self.excluded = ExcludedMice(self.columns)
 
     @property
     def rig(self) -> Rig:
@@ -166,6 +172,27 @@ class Estimator:
             raise LinkposeError(f"no filter that can be smoothed ({', '.join(smoothable)}) runs{reasons}")
         self.filters = [filters.create_smoother(f.name, self._rig) if f.name in smoothable else f for f in self.filters]
 
+    def hold_heading(self) -> None:
+        """Lets the magnetometer hold the yaw of each filter that estimates one; after `smooth`, before `process`.
+
+        Raises NoMagnetometer, UncalibratedMagnetometer, and CannotRun where no filter estimates a yaw.
+        """
+        from linkpose.filters.magnetic_heading import MagneticHeading, has_yaw
+
+        if not self._sensors & Sensors.MAG:
+            raise NoMagnetometer
+        if not any(map(has_yaw, self.filters)):
+            raise CannotRun("none of the filters that run estimates a yaw since the start")
+        self.filters = [MagneticHeading(f, self._rig.mag) if has_yaw(f) else f for f in self.filters]
+        self._set_columns()
+
+    @property
+    def magnetic_field(self) -> FieldRecord | None:
+        """What the first filter that the magnetometer holds has found of the field; None without any."""
+        from linkpose.filters.magnetic_heading import MagneticHeading
+
+        return next((f.found for f in self.filters if isinstance(f, MagneticHeading)), None)
+
     def warm_up(self) -> None:
         """Compiles all that `process` and `text` need, or loads it compiled: no sample waits for a compiler."""
         filters.warm_up(f.name for f in self.filters)
@@ -173,12 +200,13 @@ class Estimator:
 
     def process(self, block: Measurements) -> Floats:
         """The estimates (N, columns) at the next N samples. The filters run in parallel over a long block."""
-        workers = min(os.cpu_count() or 1, len(self.filters))
-        if len(block) < _LONG_BLOCK or workers < 2:
-            estimates = np.column_stack([block.time_s, *(f.process(block) for f in self.filters)])
+        workers = 1 if len(block) < _LONG_BLOCK else min(os.cpu_count() or 1, len(self.filters))
+        if workers < 2:
+            parts = [f.process(block) for f in self.filters]
         else:
             with ThreadPoolExecutor(workers) as pool:
-                estimates = np.column_stack([block.time_s, *pool.map(lambda f: f.process(block), self.filters)])
+                parts = list(pool.map(lambda f: f.process(block), self.filters))
+        estimates = _side_by_side(block.time_s, parts)
         self.excluded.count(block, estimates)
         return estimates
 
@@ -188,6 +216,7 @@ class Estimator:
         if self._rig.joint.known_j2s_m is not None:
             return None
         for f in self.filters:
+            f = getattr(f, "inner", f)
             if isinstance(f, filters.FindsJ2s):
                 return FoundJ2s.of(*f.j2s_m)
         return None
@@ -205,7 +234,7 @@ class Estimator:
                     return factor, std
         return None
 
-    def text(self, estimates: Floats) -> str:
+    def text(self, estimates: Floats) -> bytes:
         """Estimates as lines of CSV."""
         return format_rows(estimates, self._decimals)
 
@@ -262,7 +291,7 @@ class LiveEstimator:
         if not count or not self._is_ready(TEXT):
             return np.empty((0, 1 + sum(self._width)))
         rows = [
-            np.column_stack([block.time_s, *(results[i] for results in self._results)])
+            _side_by_side(block.time_s, [results[i] for results in self._results])
             for i, block in enumerate(self._blocks[:count])
         ]
         for block, estimates in zip(self._blocks, rows, strict=False):
@@ -270,7 +299,7 @@ class LiveEstimator:
         del self._blocks[:count]
         for results in self._results:
             del results[:count]
-        return np.concatenate(rows)
+        return rows[0] if count == 1 else np.concatenate(rows)
 
     def _newest_row(self) -> Floats:
         if not self._blocks:
@@ -327,6 +356,7 @@ class Estimates:
     left_out: dict[str, CannotRun]  # filter -> why it did not run
     excluded_mice: dict[str, int]  # "mouse1", ... -> samples whose valid counts a filter excluded
     found_j2s: FoundJ2s | None  # J2S where it was to be estimated
+    magnetic_field: FieldRecord | None  # where the magnetometer held the yaw
     rig: Rig  # that was in force
 
     @property
@@ -377,6 +407,7 @@ def estimate(
     joint: Literal["ball", "hinge"] | None = None,
     rig: Rig | str | PathLike[str] | None = None,
     smooth: bool = False,
+    mag: bool = False,
 ) -> Estimates:
     """Runs filters over a recording or over measurements, and returns their estimates.
 
@@ -389,14 +420,16 @@ def estimate(
         joint: the joint between the two links of a chain. None: the rig's.
         rig: sensor placement and calibration, or the path of a rig.toml. None: the recording's own.
         smooth: use a smoother, which also uses later measurements, for each filter that has one.
+        mag: let the magnetometer hold the yaw of each filter that estimates one. The rig must hold its calibration.
 
     Raises:
-        UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError.
+        UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
+        NoMagnetometer, UncalibratedMagnetometer, CannotRun (no filter estimates a yaw).
     """
     recording = load_recording(source) if isinstance(source, str | PathLike) else source
-    own, dlpf = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.dlpf)
+    own, delay_s = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.imu_delay_s)
     measurements = recording if isinstance(recording, Measurements) else recording.measurements
-    in_force = as_rig(rig, own).with_delay_of(dlpf)
+    in_force = as_rig(rig, own).with_delay(delay_s)
     first_joint = _joint(j2s_m, j2s_std_m)
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)
@@ -404,6 +437,8 @@ def estimate(
     estimator = Estimator.for_measurements(filters or (), in_force, measurements)
     if smooth:
         estimator.smooth()
+    if mag:
+        estimator.hold_heading()
     values = estimator.process(measurements)
     return Estimates(
         tuple(estimator.columns),
@@ -413,6 +448,7 @@ def estimate(
         estimator.left_out,
         estimator.excluded.samples,
         estimator.found_j2s,
+        estimator.magnetic_field,
         in_force,
     )
 
@@ -442,6 +478,11 @@ def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | N
     if not 0 < j2s_std_m < np.inf:
         raise InvalidValue("j2s_std_m", f"is {j2s_std_m!r}; it must be above 0 (m)")
     return Joint(to_vector(vector), j2s_std_m)
+
+
+def _side_by_side(time_s: Floats, parts: Sequence[Floats]) -> Floats:
+    """Times (N,) and the columns (N, K) of each filter as one table."""
+    return np.concatenate([time_s[:, None], *parts], axis=1)
 
 
 def _decimals(column: str) -> int:

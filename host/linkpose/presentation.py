@@ -97,6 +97,30 @@ def signed_angle(value_deg: float) -> str:
     return f"{value_deg:+.1f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
 
 
+def angle_with_std(value_deg: float, std_deg: float) -> str:
+    """An angle with its standard deviation (°): +13.1° ±0.4°."""
+    bound = f" ±{std_deg:.2g}°" if math.isfinite(value_deg + std_deg) else ""
+    return signed_angle(value_deg) + bound
+
+
+def joint_angle(values: Mapping[Quantity, tuple[float, float]]) -> tuple[float, float] | None:
+    """The angle (°) of a chain's joint and its σ: a hinge's, or the whole angle of a ball joint's rotation.
+
+    None of a filter that estimates no chain.
+    """
+    if quantities.ANGLE in values:
+        return values[quantities.ANGLE]
+    if quantities.QW not in values:
+        return None
+    w, std = values[quantities.QW]
+    return (math.degrees(2 * math.acos(min(abs(w), 1.0))) if math.isfinite(w) else math.nan), std
+
+
+def joint_name(values: Mapping[Quantity, tuple[float, float]]) -> str:
+    """What `joint_angle` is called: of a ball joint it depends on how the sensors are mounted."""
+    return quantities.ANGLE.label if quantities.ANGLE in values else quantities.ROTATION.label
+
+
 def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
     """Place, heading and speed of a robot, each as a text."""
     parts = [

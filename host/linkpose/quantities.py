@@ -125,6 +125,15 @@ HEADING = _radians("heading", "heading")
 VX, VY, VZ = _speed("vx", "speed ahead"), _speed("vy", "speed to the left"), _speed("vz", "speed upwards")
 WX, WY, WZ = _rate("wx", "turn rate about x"), _rate("wy", "turn rate about y"), _rate("wz", "turn rate")
 ROLL_RAD, PITCH_RAD, YAW_RAD = _radians("roll", "roll"), _radians("pitch", "pitch"), _radians("yaw", "yaw")
+DISTURBANCE = Quantity(
+    "mag_disturbance",
+    "uT",
+    "magnetic disturbance",
+    Shown("µT", 1.0, 1),
+    Shown("uT"),
+    "magnetic disturbance",
+    decimals=3,
+)
 EXCLUDED = Quantity("excluded", "", "mice left out", Shown("", 1.0, 0), Shown(""), "mice left out", decimals=0)
 ANGLE = _degrees("angle", "joint angle")
 QW, QX, QY, QZ = (_part_of_rotation(axis) for axis in "wxyz")
@@ -147,7 +156,7 @@ _READINGS = (
 # In the order in which plots and tables present them.
 ALL: tuple[Quantity, ...] = (
     HEIGHT, HEIGHT1, HEIGHT2, ANGLE, ROTATION, X, Y, Z, ROLL, PITCH, YAW, HEADING, VX, VY, VZ, WX, WY, WZ,
-    ROLL_RAD, PITCH_RAD, YAW_RAD, QW, QX, QY, QZ, EXCLUDED, *_READINGS,
+    ROLL_RAD, PITCH_RAD, YAW_RAD, QW, QX, QY, QZ, EXCLUDED, DISTURBANCE, *_READINGS,
 )  # fmt: skip
 POSE = (X, Y, HEADING)  # of a robot in the plane
 CHAIN_ROTATION = (QW, QX, QY, QZ)

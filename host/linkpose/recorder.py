@@ -13,7 +13,7 @@ from linkpose.errors import InvalidValue, LinkposeError
 from linkpose.recording.csvfile import create
 from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
-from linkpose.sensors.devices import MOUSE_VALID
+from linkpose.sensors.devices import MOUSE_VALID, slow_mouse_remarks
 from linkpose.sensors.health import HealthMonitor, expected_sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -38,6 +38,8 @@ class Recorder:
         self._converter = Converter(settings, mouse_ports)
         self.monitor = HealthMonitor(settings.sample_rate_hz, expected_sensors(session.hello, mouse_ports))
         self.marks: list[float] = []  # instants (s) that the user marked; they go into the closing line
+        self._counts_per_m = [mouse.counts_per_m for mouse in rig.mouse]
+        self._limits_reported = False
         self._writer: RecordingWriter | None = None
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
@@ -56,7 +58,18 @@ class Recorder:
         for change in changes:
             self._session.notify(str(change))
         self._count_late_mice(placements)
+        self._report_speed_limits()
         return checked
+
+    def _report_speed_limits(self) -> None:
+        """Once the board has measured its polls, report mice that the rig's calibration shows to overflow early."""
+        status = self._session.status
+        if status is None or self._limits_reported:
+            return
+        self._limits_reported = True
+        poll_s = max((mouse.poll_us * 1e-6 for mouse in status.mice), default=0.0)
+        for remark in slow_mouse_remarks(self._counts_per_m, self._session.hello.sample_rate_hz, poll_s):
+            self._session.notify(remark)
 
     def _count_late_mice(self, placements: list[Placement]) -> None:
         """Count and report the readings of mice for which the recording has no columns."""

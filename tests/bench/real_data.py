@@ -2,17 +2,17 @@
 
     python tests/bench/real_data.py [--data FOLDER] [--json]
 
-FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder, broad and openaxes_robot, each as
-its authors published it; a missing one is named and skipped. Nothing is calibrated beforehand. The error is the root
-mean square angle between the tilts.
+FOLDER (../shared/data beside the checkout) holds repoimu_pendulum, mpu6050_encoder, broad, openaxes_robot and
+diodem_chain, each as its authors published it; a missing one is named and skipped. Nothing is calibrated beforehand.
+The error is the root mean square angle between the tilts.
 
-Sensor and reference do not share a clock: the readings arrive late by what the sensor's filter and the logger take. The
-delay is the lag of the gyro behind the reference's rate, one for all trials of a kind. All filters get the same
-handling: ours through the rig, VQF's estimate is turned on by the last rate less VQF's own bias. Beside the score at
-that fixed delay stands the score at each filter's own best lag. The peer of --smooth is offline VQF.
+Sensor and reference do not share a clock: the sensor's filter and the logger delay the readings. The delay is the lag
+of the gyro behind the reference's rate, one for all trials of a kind. Every filter gets the same correction: ours
+through the rig, VQF's estimate is extrapolated by the last rate less VQF's own bias. The score at each filter's own
+best lag stands beside the score at that fixed delay. The peer of --smooth is offline VQF.
 
-`chosen_on` marks the trials on which constants of the filters were chosen; the others were held out. The last lines
-give for each set and filter the geometric mean of the ratios to VQF, over all and over held-out trials, and the worst.
+`chosen_on` marks the trials on which constants of the filters were chosen; all others are held out. The last lines give
+for each set and filter the geometric mean of the ratios to VQF, over all and over held-out trials, and the worst.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ from linkpose.sensors.rig import Imu, Joint, Rig
 
 PENDULUM_J2S = Joint((-0.15, 0.0, 0.0), 0.03)  # by a ruler
 PENDULUM_DELAY_S, BROAD_DELAY_S, ENCODER_DELAY_S, ROBOT_DELAY_S = 0.0057, 0.0038, 0.011, 0.0
-CHOSEN_ON = {"broad 01", "broad 15", "broad 24", "pendulum 02a_Trial1"}
+OMC_LATE_S = 0.0165  # the camera's stamps of diodem_chain, half a frame
+# Constants of the filters are chosen on these only. Add a trial before you look at its score to choose anything.
+CHOSEN_ON = {"broad 01", "broad 15", "broad 24", "pendulum 02a_Trial1", "robot circle-100_radius", "diodem segment 2"}
 MOST_LAG_S = 0.06
 
 
@@ -49,9 +51,14 @@ class Case(NamedTuple):
     time_s: Floats
     accel_m_s2: Floats
     gyro_rad_s: Floats
-    error_deg: Callable[[Floats], float]  # of tilts (N, 3)
+    errors_deg: Callable[[Floats], Floats]  # of tilts (N, 3): one per sample of the reference, NaN where unknown
     joint: Joint | None
     delay_s: float
+    truth: Floats | None = None  # tilts (N, 3) at the samples, NaN where unknown
+
+    def error_deg(self, tilt: Floats) -> float:
+        """Root mean square error of tilts (N, 3)."""
+        return float(np.sqrt(np.nanmean(np.square(self.errors_deg(tilt)))))
 
     def best_deg(self, tilt: Floats) -> float:
         """The error at the estimate's own best lag."""
@@ -69,12 +76,11 @@ def pendulum(folder: Path) -> Iterator[Case]:
         rows = np.array([[float(c.replace(",", ".")) for c in line.split(";") if c] for line in lines if line.strip()])
         time_s = np.linspace(0, rows[-1, 0] - rows[0, 0], len(rows))
         accel, gyro = np.ascontiguousarray(rows[:, 5:8]), np.ascontiguousarray(rows[:, 8:11])
-        rotation = _matrices(rows[:, 1:5])
+        rotation = matrices(rows[:, 1:5])
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
-        error_deg = _against(tilt, np.ones(len(tilt), bool))
         name = "pendulum " + path.stem[13:23]
-        yield Case("repoimu_pendulum", name, time_s, accel, gyro, error_deg, PENDULUM_J2S, PENDULUM_DELAY_S)
+        yield Case("repoimu_pendulum", name, time_s, accel, gyro, _against(tilt), PENDULUM_J2S, PENDULUM_DELAY_S, tilt)
 
 
 def broad(folder: Path) -> Iterator[Case]:
@@ -82,51 +88,104 @@ def broad(folder: Path) -> Iterator[Case]:
     for path in sorted(folder.glob("*.mat")):
         data = loadmat(path)
         accel, gyro = (np.ascontiguousarray(data[name], dtype=np.float64) for name in ("imu_acc", "imu_gyr"))
-        tilt = _matrices(data["opt_quat"])[:, 2, :]
-        use = data["movement"].ravel().astype(bool) & np.isfinite(tilt).all(axis=1)
+        tilt = matrices(data["opt_quat"])[:, 2, :]
+        tilt[~data["movement"].ravel().astype(bool)] = np.nan
         time_s = np.arange(len(accel)) / float(data["sampling_rate"].item())
-        error_deg = _against(tilt, use)
-        yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, error_deg, None, BROAD_DELAY_S)
+        yield Case("broad", "broad " + path.stem[:2], time_s, accel, gyro, _against(tilt), None, BROAD_DELAY_S, tilt)
+
+
+class Pair(NamedTuple):
+    """Readings of two sensors at the same times: accel (N, 2, 3) m/s², gyro (N, 2, 3) rad/s."""
+
+    time_s: Floats
+    accel_m_s2: Floats
+    gyro_rad_s: Floats
+
+
+def read_encoder(path: Path) -> tuple[Pair, Floats]:
+    """Both MPU-6050, the fixed one first, and the shaft's angle (N,) rad; rows with impossible readings are dropped."""
+    data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
+    gyro, accel = (
+        np.stack([np.column_stack([data[f"all_{kind}_{k}_{axis}"] for axis in "xyz"]) for k in (1, 2)], axis=1)
+        for kind in ("gyro", "accel")
+    )
+    time_s = data["all_time"]
+    in_range = (np.abs(gyro).max(axis=(1, 2)) < 2000) & (np.abs(accel).max(axis=(1, 2)) < 16)
+    use = np.concatenate([[True], np.diff(time_s) > 0]) & in_range
+    pair = Pair(time_s[use] - time_s[use][0], STANDARD_GRAVITY * accel[use], np.radians(gyro[use]))
+    return pair, np.radians(data["all_encoder"][use])
 
 
 def encoder(folder: Path) -> Iterator[Case]:
     """An MPU-6050 on a motor's shaft, with an encoder: the angle about the shaft, less its mean error."""
     for path in sorted(folder.glob("raw_[rp]*.mat")):  # yaw is no tilt
         across = 0 if "pitch" in path.stem else 1  # the shaft lies along y in the trials of pitch, else along x
-        data = {key: np.ravel(value).astype(np.float64) for key, value in loadmat(path).items() if key[:2] != "__"}
-        gyro = np.column_stack([data[f"all_gyro_2_{axis}"] for axis in "xyz"])
-        accel = np.column_stack([data[f"all_accel_2_{axis}"] for axis in "xyz"])
-        time_s = data["all_time"]
-        use = np.concatenate([[True], np.diff(time_s) > 0]) & (np.abs(gyro).max(1) < 2000) & (np.abs(accel).max(1) < 16)
-        angle = np.radians(data["all_encoder"][use])
+        pair, angle = read_encoder(path)
 
-        def error_deg(tilt: Floats, angle: Floats = angle, across: int = across) -> float:
-            measured = np.unwrap(np.arctan2(tilt[:, across], tilt[:, 2]))
-            both = [sign * measured - angle for sign in (1, -1)]
-            return float(np.degrees(min(np.std(difference) for difference in both)))
+        def errors_deg(tilt: Floats, angle: Floats = angle, across: int = across) -> Floats:
+            measured = np.arctan2(tilt[:, across], tilt[:, 2])
+            both = [np.angle(np.exp(1j * (sign * measured - angle))) for sign in (1, -1)]
+            both = [np.angle(np.exp(1j * (e - np.angle(np.nanmean(np.exp(1j * e)))))) for e in both]
+            return np.degrees(min(both, key=lambda e: float(np.nanmean(np.square(e)))))
 
-        force, rate = STANDARD_GRAVITY * accel[use], np.radians(gyro[use])
-        name, start = "encoder " + path.stem[4:], time_s[use][0]
-        yield Case("mpu6050_encoder", name, time_s[use] - start, force, rate, error_deg, None, ENCODER_DELAY_S)
+        force, rate = (np.ascontiguousarray(values[:, 1]) for values in pair[1:])
+        name = "encoder " + path.stem[4:]
+        yield Case("mpu6050_encoder", name, pair.time_s, force, rate, errors_deg, None, ENCODER_DELAY_S)
+
+
+def read_robot(path: Path) -> tuple[Floats, Floats, Floats, Floats]:
+    """Of a `_imu.csv` beside its `_truth.csv`: time (N,) s, accel and gyro (N, 3), the link's rotation (N, 3, 3)."""
+    read = np.loadtxt(path, delimiter=",", skiprows=1)
+    truth = np.loadtxt(path.with_name(path.name.replace("_imu", "_truth")), delimiter=",", skiprows=1)
+    n = min(len(read), len(truth))
+    accel, gyro = np.ascontiguousarray(read[:n, 1:4]), np.ascontiguousarray(read[:n, 4:7])
+    return (truth[:n, 0] - truth[0, 0]) * 1e-6, accel, gyro, matrices(truth[:n, 1:5])
 
 
 def robot(folder: Path) -> Iterator[Case]:
     """A robot arm, encoder truth; the sensor's mounting on its link, and the upward direction, are fitted."""
     for path in sorted(folder.glob("*_imu.csv")):
-        read = np.loadtxt(path, delimiter=",", skiprows=1)
-        truth = np.loadtxt(path.with_name(path.name.replace("_imu", "_truth")), delimiter=",", skiprows=1)
-        n = min(len(read), len(truth))
-        accel, gyro = np.ascontiguousarray(read[:n, 1:4]), np.ascontiguousarray(read[:n, 4:7])
-        time_s = (truth[:n, 0] - truth[0, 0]) * 1e-6
-        rotation = _mounted(_matrices(truth[:n, 1:5]), gyro, time_s)
+        time_s, accel, gyro, link = read_robot(path)
+        rotation = _mounted(link, gyro, time_s)
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
-        error_deg = _against(tilt, np.ones(len(tilt), bool))
-        yield Case("openaxes_robot", "robot " + path.stem[:-4], time_s, accel, gyro, error_deg, None, ROBOT_DELAY_S)
+        yield Case(
+            "openaxes_robot", "robot " + path.stem[:-4], time_s, accel, gyro, _against(tilt), None, ROBOT_DELAY_S, tilt
+        )
+
+
+def diodem(folder: Path) -> Iterator[Case]:
+    """A chain of five links, optical reference at 30 Hz; mounting and upward direction are fitted."""
+    if not folder.joinpath("trial1_imu_rigid.csv").is_file():
+        return
+    read, omc = (
+        np.genfromtxt(folder / f"trial1_{name}.csv", delimiter=",", skip_header=2, names=True)
+        for name in ("imu_rigid", "omc")
+    )
+    time_s, at_s = np.arange(len(read)) / 40.0, np.arange(len(omc)) / 30.0 - OMC_LATE_S
+    for k in range(1, 6):
+        accel, gyro = (np.column_stack([read[f"seg{k}_{kind}_{a}"] for a in "xyz"]) for kind in ("acc", "gyr"))
+        quaternion = np.column_stack([omc[f"seg{k}_quat_{a}"] for a in "wxyz"])
+        use = np.isfinite(quaternion).all(axis=1) & (at_s > 0)
+        rotation = _mounted(matrices(quaternion[use]), _at(at_s[use], time_s, gyro), at_s[use])
+        up = np.median(np.einsum("nij,nj->ni", rotation, _at(at_s[use], time_s, accel)), axis=0)
+        errors = _against(np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up)))
+
+        def errors_deg(tilt: Floats, errors: Callable[[Floats], Floats] = errors, at_s: Floats = at_s[use]) -> Floats:
+            found = _at(at_s, time_s, tilt)
+            return errors(found / np.linalg.norm(found, axis=1, keepdims=True))
+
+        yield Case("diodem_chain", f"diodem segment {k}", time_s, accel, gyro, errors_deg, None, 0.0)
+
+
+def _at(at_s: Floats, time_s: Floats, values: Floats) -> Floats:
+    """Values (N, 3) at other times, linearly between samples."""
+    return np.column_stack([np.interp(at_s, time_s, column) for column in values.T])
 
 
 def _mounted(rotation: Floats, gyro: Floats, time_s: Floats) -> Floats:
     """Rotations (N, 3, 3) from the sensor, for those from the link or to it: the mounting that fits the rates best."""
+    gyro = np.vstack([0.5 * (gyro[1:] + gyro[:-1]), gyro[-1:]])  # between two samples, as the differences are
     fits = []
     for turned in (rotation, rotation.transpose(0, 2, 1)):
         step = np.einsum("nji,njk->nik", turned[:-1], turned[1:])
@@ -140,10 +199,16 @@ def _mounted(rotation: Floats, gyro: Floats, time_s: Floats) -> Floats:
     return min(fits, key=lambda fit: fit[0])[1]
 
 
-SETS = {"repoimu_pendulum": pendulum, "mpu6050_encoder": encoder, "broad": broad, "openaxes_robot": robot}
+SETS = {
+    "repoimu_pendulum": pendulum,
+    "mpu6050_encoder": encoder,
+    "broad": broad,
+    "openaxes_robot": robot,
+    "diodem_chain": diodem,
+}
 
 
-def _matrices(quaternion: Floats) -> Floats:
+def matrices(quaternion: Floats) -> Floats:
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
@@ -152,13 +217,11 @@ def _matrices(quaternion: Floats) -> Floats:
     return np.stack(rows, axis=1).reshape(-1, 3, 3)
 
 
-def _against(truth: Floats, use: Floats) -> Callable[[Floats], float]:
-    def error_deg(tilt: Floats) -> float:
-        use_here = use & np.isfinite(tilt).all(axis=1)
-        cosine = np.clip((tilt * truth).sum(axis=1)[use_here], -1, 1)
-        return float(np.degrees(np.sqrt(np.mean(np.arccos(cosine) ** 2))))
+def _against(truth: Floats) -> Callable[[Floats], Floats]:
+    def errors_deg(tilt: Floats) -> Floats:
+        return np.asarray(np.degrees(np.arccos(np.clip((tilt * truth).sum(axis=1), -1, 1))))
 
-    return error_deg
+    return errors_deg
 
 
 def block_of(case: Case) -> Measurements:
@@ -175,7 +238,12 @@ def tilt_of(name: str, case: Case) -> Floats:
     """A filter's tilts (N, 3)."""
     rig = Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))
     made = JointInertialSmoother(rig) if name == "--smooth" else filters.create(name, rig)
-    roll, pitch = np.radians(made.process(block_of(case))[:, 2:4]).T
+    return tilt_from(made.process(block_of(case)))
+
+
+def tilt_from(estimate: Floats) -> Floats:
+    """Tilts (N, 3) of estimates whose third and fourth columns are roll and pitch (°)."""
+    roll, pitch = np.radians(estimate[:, 2:4]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
 
 
@@ -186,7 +254,7 @@ def vqf_tilt(case: Case, offline: bool) -> Floats:
         found = offlineVQF(case.gyro_rad_s, case.accel_m_s2, None, step)
     else:
         found = VQF(step).updateBatch(case.gyro_rad_s, case.accel_m_s2)
-    tilt = _matrices(found["quat6D"])[:, 2, :]
+    tilt = matrices(found["quat6D"])[:, 2, :]
     turned = tilt - np.cross(case.delay_s * (case.gyro_rad_s - found["bias"]), tilt)
     return np.asarray(turned / np.linalg.norm(turned, axis=1, keepdims=True))
 

@@ -200,6 +200,26 @@ def check_the_gyro_bias_at_rest(rng):
     np.testing.assert_allclose(s.nominal[V:PSI], (nominal + change)[V:PSI], rtol=0, atol=1e-9)
 
 
+def check_the_tilt_at_rest(rng):
+    """f̂ − g Ẑ = g δZ + δb_a + δM_a s_A + e."""
+    _, s = random_state(rng)
+    unconstrained(s)
+    s.nominal[MA:MG] = 0.0
+    force, nominal, p = (
+        GRAVITY * s.tilt + s.accel_bias + 0.01 * rng.standard_normal(3),
+        s.nominal.copy(),
+        s.covariance.copy(),
+    )
+    s.rest_s, s.rest_force_sum[:] = 2.0, 2.0 * force
+    h = np.zeros((3, SIZE))
+    h[:, Z:V], h[:, BA:MA], h[:, MA:MG] = GRAVITY * np.eye(3), np.eye(3), by_matrix(force)
+    noise = (IMU.accel_variance * 0.04 / 2.0 + (0.05 / 2.0) ** 2) * np.eye(3) + 0.25 * np.outer(s.tilt, s.tilt)
+    change, covariance = dense_update(p, h, noise, force - nominal[BA:MA] - GRAVITY * nominal[Z:V])
+    rest.update_tilt_from_rest(s, 0.04, IMU)
+    np.testing.assert_allclose(s.covariance, covariance, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(s.nominal, corrected(nominal, change), rtol=0, atol=1e-9)
+
+
 def check_the_heading(rng):
     """ψ = h Zᵀδω, applied to X, gives the X of a sensor whose rate was known to be off by δω along Z."""
     _, s = random_state(rng)

@@ -134,6 +134,21 @@ def test_parquet_is_the_same_table(estimate, tmp_path):
         read_table(tmp_path / "cut.parquet")
 
 
+def test_a_damaged_parquet_file_is_named(tmp_path):
+    pa, pq = importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
+    path = tmp_path / "run.parquet"
+    pq.write_table(pa.table({"time_s": [0.0, 0.01]}), path, use_dictionary=False, compression="none")
+    data = path.read_bytes()
+    assert data[4:6] == b"\x15\x00"  # the type of the first page: data
+    for damaged, sentence in (
+        (data[:5] + b"\x02" + data[6:], "has no row"),  # an index page, which readers skip
+        (data.replace(b"time_s", b"\xe3ime_s"), "no Parquet table of numbers"),
+    ):
+        path.write_bytes(damaged)
+        with pytest.raises(FileFormatError, match=sentence):
+            read_table(path)
+
+
 def test_what_cannot_be_converted_is_named(estimate, tmp_path, monkeypatch):
     with pytest.raises(UnknownFilter, match="did you mean joint-inertial"):
         convert(estimate, tmp_path / "a.tum", "joint-inertia")

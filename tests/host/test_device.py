@@ -26,7 +26,7 @@ from linkpose.sensors.mpu6050 import self_test_deviation
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.board import DEFAULTS, SimulatedBoard
 from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping, Sample
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Nak, NakReason, Ping, Sample
 
 
 @pytest.fixture
@@ -60,10 +60,11 @@ def framed(payload: bytes) -> bytes:
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
         (random.Random(3).randbytes(60), "only noise was received"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (encode(Nak(Command.GET_INFO, NakReason.UNKNOWN_COMMAND)), "the board refuses every command"),
         (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
         (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
-    ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
+    ids=["silence", "text", "noise", "wrong baud", "refusals", "older board", "newer board"],
 )
 @pytest.mark.parametrize("command", ["record", "info", "estimate --live"])
 def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, sentence, command):
@@ -72,6 +73,14 @@ def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, 
         said = refused(*command.split(), "--port", tmp_path / "port", *out)
     assert sentence in said
     assert not (tmp_path / "r.csv").exists()
+
+
+def test_a_raw_capture_of_another_protocol_is_named(refused, tmp_path):
+    capture = tmp_path / "old.bin"
+    capture.write_bytes(b"\0" + framed(bytes([1, 1, 4]) + OLD_HELLO[3:]) + framed(bytes([2]) + bytes(30)))
+    said = refused("estimate", capture, "-o", tmp_path / "e.csv")
+    assert "protocol 1.4" in said
+    assert not (tmp_path / "e.csv").exists()
 
 
 def test_an_edited_schema_of_the_same_version_is_refused(impatient, refused, tmp_path):
@@ -309,6 +318,25 @@ def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
     assert "is gone" in said and "check the cable" in said
 
 
+def test_a_board_that_returns_silent_is_waited_for_to_the_end(impatient, monkeypatch, tmp_path, linkpose):
+    silent = threading.Event()
+    with PtyBoard(tmp_path / "port", spoil=lambda data: b"" if silent.is_set() else data) as board:
+
+        def come_back_silent() -> None:
+            board.streams.wait()
+            board.pull()
+            silent.set()
+            board.plug()
+
+        back = threading.Thread(target=come_back_silent)
+        back.start()
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 3)
+        back.join()
+    assert result.status == 0
+    assert result.err.count("the board is silent") == 1 and "; still waiting" in result.err
+    assert read_table(tmp_path / "r.csv", "recording").closing["gaps"][0]["cause"] == "cable"
+
+
 def test_an_ack_of_start_that_is_lost_costs_no_sample(tmp_path):
     start_ack = encode(Ack(Command.START))
     port = tmp_path / "port"
@@ -318,24 +346,23 @@ def test_an_ack_of_start_that_is_lost_costs_no_sample(tmp_path):
 
 
 def test_corrupt_bytes_are_counted_and_lost_samples_too(tmp_path, linkpose):
+    """One bit of every tenth sample, anywhere in front of the frame's end: CRC-16 finds each."""
     rng = random.Random(5)
 
-    def flip(data: bytes) -> bytes:
-        if len(data) > 30 and rng.random() < 0.1:
-            at = rng.randrange(len(data))
-            return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
-        return data
+    def flip(message: Sample, count: int) -> bytes:
+        frame = bytearray(encode(message))
+        if count % 10 == 0:
+            frame[rng.randrange(len(frame) - 1)] ^= 1 << rng.randrange(8)
+        return bytes(frame)
 
-    with PtyBoard(tmp_path / "port", spoil=flip):
-        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 3, "--json")
+    with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(0, flip)):
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 1.05, "--json")
     summary = json.loads(result.out.splitlines()[-1])
     table = read_table(tmp_path / "r.csv", "recording")
-    seq = table.columns["seq"]
     assert result.status == 0
-    assert summary["corrupt"] > 0
-    assert summary["lost"] == seq[-1] + 1 - len(table) > 0
-    assert summary["samples"] == len(table)
-    assert np.all(np.diff(seq) > 0)
+    assert (summary["samples"], summary["lost"], len(table)) == (95, 10, 95)
+    assert summary["corrupt"] >= 10  # a bit that makes a zero divides a frame
+    assert set(range(105)) - set(table.columns["seq"]) == set(range(9, 105, 10))
 
 
 def test_a_full_pipe_of_arrivals_loses_nothing_while_the_program_is_busy(tmp_path):

@@ -323,3 +323,37 @@ def test_a_link_of_no_length_has_a_misfit_of_nothing(rest_s):
     f = JointInertialFilter(Rig().with_j2s((0.0, 0.0, 0.0)))
     assert np.isfinite(f.process(block)).all()
     assert f.restarts == 0
+
+
+def test_a_motors_vibration_is_measured_as_noise():
+    """Bursts of 5 m/s² and 0.1 rad/s: the tilt is not lost, and σ counts the noise."""
+    block, truth = recorded(2, 0)
+    rng, on = np.random.default_rng(2), (np.sin(np.pi * block.time_s / 5) > 0)[:, None]
+    shaken = replace(
+        block, accel_m_s2=block.accel_m_s2 + on * rng.normal(0, 5.0, (len(block), 3)),
+        gyro_rad_s=block.gyro_rad_s + on * rng.normal(0, 0.1, (len(block), 3)),
+    )  # fmt: skip
+    f = JointInertialFilter(UNKNOWN)
+    estimate = f.process(shaken)
+    error = np.abs(estimate[:, 0] - truth.height_m)[2000:]
+    assert f.restarts == 0
+    assert 100 * np.sqrt(np.mean(error**2)) < 5
+    assert np.mean(error < 2 * estimate[2000:, 1]) > 0.85
+
+
+def test_a_restart_keeps_what_was_learned_of_j2s():
+    """Half a second is lost, and the stamps hide it: the tilt is lost, J2S is not."""
+    block, truth = recorded(3, 0)
+    kept = np.ones(len(block), bool)
+    for begin in (3000, 3600):
+        kept[begin : begin + 50] = False
+    hidden = replace(rows(block, kept), time_s=block.time_s[: kept.sum()])
+    f = JointInertialFilter(UNKNOWN)
+    estimate = f.process(hidden)
+    assert f.restarts > 0
+    found, covariance = f.j2s_m
+    assert found == pytest.approx(PAPER_J2S_M, abs=0.02)
+    assert np.isfinite(estimate[2990:, 0]).all()  # J2S is never unknown again
+    assert np.all(np.abs(found - PAPER_J2S_M) < 3 * np.sqrt(np.diag(covariance)))
+    late = truth.height_m[kept][-500:]
+    assert 100 * np.sqrt(np.mean((estimate[-500:, 0] - late) ** 2)) < 3

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pty_board import PtyBoard
 
@@ -268,6 +268,31 @@ def test_blocks_of_any_length_give_the_same(cuts: list[int], imu: object) -> Non
     assert monitor.as_dict() == report
     for name in ("accel_m_s2", "gyro_rad_s", "pressure_Pa", "baro_fresh", "flags"):
         np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    cuts=st.lists(st.integers(1, N - 1), max_size=5),
+    held=st.lists(
+        st.tuples(st.integers(0, N - 1), st.integers(6, 70), st.sampled_from([(0,), (1, 2), tuple(range(6))]))
+    ),
+)
+def test_repeats_are_found_wherever_a_block_ends(
+    seed: int, cuts: list[int], held: list[tuple[int, int, tuple[int, ...]]]
+) -> None:
+    """Long blocks are tested as a whole, short ones sample by sample."""
+    rng = np.random.default_rng(seed)
+    values = rng.integers(-2, 3, (N, 6)) * 0.01 + 9.0  # coarse: an axis often repeats by chance
+    for start, length, axes in held:
+        values[start : start + length, axes] = values[start, axes]
+    block = replace(healthy(), accel_m_s2=values[:, :3], gyro_rad_s=values[:, 3:])
+    results = []
+    for edges in ([0, *sorted(set(cuts)), N], [*range(0, N, 20), N]):
+        monitor = HealthMonitor(RATE_HZ, ALL_OK)
+        parts = [monitor.check(block[a:b])[0].accel_m_s2 for a, b in itertools.pairwise(edges)]
+        results.append((np.isnan(np.concatenate(parts)[:, 0]).tolist(), monitor.as_dict()))
+    assert results[0] == results[1]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import http.client
 import json
@@ -15,8 +16,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+import zstandard
 from browser import Browser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -32,12 +35,13 @@ from linkpose.page.page import j2s_text
 from linkpose.page.panel import with_gap_rows
 from linkpose.quantities import by_filter
 from linkpose.sensors.rig import Rig
+from linkpose.simulation.chain import ChainRun
 
 J2S_M = (-0.09, -0.04, 1.65)
 LINK = ["time_s", *(f"tilt_{q}{std}_{unit}" for q, unit in (("height", "m"), ("roll", "deg"), ("pitch", "deg"))
                     for std in ("", "_std"))]  # fmt: skip
-CHAIN = ["time_s", "chain_qw", "chain_qx", "chain_qy", "chain_qz", "chain_rotation_std_deg", "chain_angle_deg",
-         "chain_angle_std_deg"]  # fmt: skip
+CHAIN = ["time_s", "tilt_roll_deg", "tilt_pitch_deg", "chain_qw", "chain_qx", "chain_qy", "chain_qz",
+         "chain_rotation_std_deg", "chain_angle_deg", "chain_angle_std_deg"]  # fmt: skip
 HOST = Path(__file__).parents[2] / "host"
 ROBOT = ["time_s", "mice_x_m", "mice_x_std_m", "mice_y_m", "mice_y_std_m", "mice_heading_rad", "mice_excluded"]
 
@@ -185,12 +189,31 @@ def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
         browser.wait_for_text("mouse 2 LEFT OUT since 3.1 s")
         leave_without_error(browser)
     angle = np.radians(30.0)
-    chain = np.array([[0.0, np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 1.5, 30.0, 1.2]])
-    with Page(CHAIN, Rig(), "sim://chain") as page:
+    chain = np.array([[0.0, 20.0, 10.0, np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 1.5, 30.0, 1.2]])
+    with Page(CHAIN, ChainRun("hinge").calibrated_rig, "sim://chain") as page:
         page.show(chain, status())
         browser.open(page.url)
         browser.wait_for_text("+30.0° ±1.2°")
         leave_without_error(browser)
+
+
+def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Path, linkpose: Any) -> None:
+    """A robot's tilt filter has columns of the height without a value: the robot is drawn, not a link."""
+    estimate = tmp_path / "e.csv"
+    rows = [f"{0.1 * at:.1f},,{0.1 * at:.2f},0.5,0.1\n" for at in range(20)]
+    estimate.write_text("time_s,tilt_height_m,mice_x_m,mice_y_m,mice_heading_rad\n" + "".join(rows))
+    assert linkpose("plot", estimate, "-o", tmp_path / "e.html").status == 0
+    text = (tmp_path / "e.html").read_text()
+    payload = base64.b64decode(text.split('__VISER_EMBED_DATA__="')[1].split('"')[0])
+    inner = zstandard.ZstdDecompressor().decompress(payload[8:], int.from_bytes(payload[:8], "little"))
+    recorded = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
+    assert recorded["durationSeconds"] == pytest.approx(1.9)
+    places = [m["position"] for _, m in recorded["messages"] if m.get("name") == "/robot" and "position" in m]
+    assert places[-1][:2] == pytest.approx([1.9, 0.5])
+    browser.open((tmp_path / "e.html").as_uri())
+    browser.wait_for("!!document.querySelector('canvas') && !!document.querySelector('input')")
+    leave_without_error(browser)
+    assert linkpose("plot", estimate, "-o", tmp_path / "e.gif").status == 2
 
 
 def test_what_is_not_excited_yet_is_shown() -> None:
@@ -318,3 +341,11 @@ def test_history_keeps_the_newest_row_and_stays_small() -> None:
     assert window[-1, 1] == path[-1, 1] == 49_999
     assert window[0, 0] >= window[-1, 0] - SPAN_S and len(window) > 300
     assert path[0, 1] == 0 and len(path) <= PATH_POINTS + 2
+
+
+def test_turns_follow_each_other_as_their_product() -> None:
+    first, second = geometry.attitude(10.0, 0.0, 30.0), geometry.attitude(-20.0, 40.0, 5.0)
+    vector = np.array([0.3, -1.0, 2.0])
+    one_by_one = geometry.turned(first, geometry.turned(second, vector))
+    assert geometry.turned(geometry.product(first, second), vector) == pytest.approx(one_by_one)
+    assert geometry.turned(geometry.attitude(0.0, 0.0, 90.0), np.eye(3)[0]) == pytest.approx(np.eye(3)[1])

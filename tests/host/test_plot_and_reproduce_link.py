@@ -56,8 +56,14 @@ def link_files(tmp_path, n=600, **more):
 def test_a_link_with_its_truth_shows_height_error_and_tilt(tmp_path):
     figure, remarks = plotting.plot_tables(link_files(tmp_path))
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["height over the joint (m)", "height error (cm)", "roll (°)"]  # no filter estimates the yaw
-    height, error, _ = figure.axes
+    assert labels == [
+        "height over the joint (m)",
+        *["height error (cm)"] * 2,
+        "roll (°)",
+    ]  # no filter estimates the yaw
+    height, best, error, _ = figure.axes
+    assert [label.split()[0] for label in drawn(best)] == ["joint-inertial", "±2σ"]  # 0.1 cm beside 1 cm were a line
+    assert best.get_ylim()[1] == pytest.approx(0.24) and error.get_ylim()[1] > 1.0
     assert drawn(height) == ["truth", "joint-inertial", "joint", "±2σ joint-inertial"]
     words = [label.split() for label in drawn(error)]
     assert [word[0] for word in words] == ["joint-inertial", "joint", "±2σ"] and words[0][2:] == ["cm", "rms"]
@@ -135,6 +141,16 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
 
 
+def test_a_long_straight_path_takes_the_whole_width(tmp_path):
+    t = np.arange(400) / 100
+    columns = {"time_s": t, "mice_x_m": 2 * t, "mice_y_m": np.sin(t), "mice_vx_m_s": 2 + 0 * t, "mice_vy_m_s": 0 * t}
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "e.csv", columns)))])
+    path, speed = figure.axes
+    figure.draw_without_rendering()
+    assert path.get_position().width == pytest.approx(speed.get_position().width, rel=0.01)
+    assert path.get_position().y0 > speed.get_position().y1
+
+
 def test_a_map_and_beacons_lie_under_the_path(tmp_path):
     """A map whose own axes are turned by 90°: its corners are where map_server puts them."""
     t = np.arange(50) / 100
@@ -198,6 +214,7 @@ def test_an_evaluation_shows_errors_their_distribution_and_the_table(tmp_path):
     found = evaluate(*link_files(tmp_path))
     figure = plotting.evaluation(found, "e.csv", "t.csv")
     errors, density, roll, table = figure.axes
+    assert errors.get_ylim()[0] < 0.0
     assert errors.get_ylabel() == "height error (cm)" and roll.get_ylabel() == "roll error (°)"
     share = found.scores[0].statistics()["height"].within_2sigma
     assert drawn(density)[0] == f"joint-inertial {100 * share:.0f} %"

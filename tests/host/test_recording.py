@@ -143,7 +143,7 @@ def test_wraps_and_losses_in_a_capture(tmp_path):
 
 @given(st.lists(st.floats(-1e9, 1e9) | st.just(float("nan")), min_size=1, max_size=8), st.integers(0, 7))
 def test_numbers_as_text(values, decimals):
-    text = format_rows(np.array([values]), np.full(len(values), decimals))
+    text = format_rows(np.array([values]), np.full(len(values), decimals)).decode()
     for word, value in zip(text.rstrip("\n").split(","), values, strict=True):
         if value != value:
             assert word == ""

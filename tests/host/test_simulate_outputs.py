@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+import linkpose as lp
+from linkpose.sensors.rig import Chain
+
 KINDS = {
     "link": ("--duration", 3),
+    "chain": ("--duration", 3),
     "mice": ("--duration", 3),
     "indoor": ("--duration", 5),
     "underwater": ("--duration", 5),
@@ -53,3 +57,18 @@ def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):
     linkpose("simulate", "link", "-o", tmp_path / "r.csv", "--truth", tmp_path / "t.csv", "--duration", 3, "-q")
     header = next(line for line in (tmp_path / "t.csv").read_text().splitlines() if not line.startswith("#"))
     assert header == "time_s,height_m,roll_deg,pitch_deg,x_m,y_m,yaw_deg"
+
+
+def test_a_chain_has_two_sensors_its_truth_and_the_mounting_only_on_request(linkpose, tmp_path):
+    names = ("-o", tmp_path / "r.csv", "--truth", tmp_path / "t.csv")
+    typed = ("simulate", "chain", *names, "--duration", 3)
+    assert linkpose(*typed).err == f"next: linkpose estimate {tmp_path / 'r.csv'} --filter chain -o estimate.csv\n"
+    header = next(line for line in (tmp_path / "t.csv").read_text().splitlines() if not line.startswith("#"))
+    assert header.endswith(",x_m,y_m,yaw_deg,qw,qx,qy,qz,angle_deg,height1_m,height2_m")
+    recording = lp.load(tmp_path / "r.csv")
+    assert recording.measurements.has_imu2 and recording.rig is not None
+    assert (recording.rig.chain, (tmp_path / "rig.toml").exists()) == (Chain("hinge"), False)
+    assert linkpose(*typed, "--joint", "ball", "--rig", tmp_path / "rig.toml", "--force", "-q") == (0, "", "")
+    chain = lp.Rig.load(tmp_path / "rig.toml").chain
+    assert (chain.joint, chain.axis1) == ("ball", None) and chain.r1_m and chain.r2_m
+    assert "angle_deg" not in (tmp_path / "t.csv").read_text()

@@ -212,7 +212,21 @@ def test_the_next_filter_is_shown_with_its_own_curve() -> None:
     assert screen.render(health(), 80, 24).plain == before
 
 
-def test_a_chain_shows_its_joint_angle() -> None:
+def test_a_chain_shows_its_joint_angle_with_its_deviation_and_curve() -> None:
+    screen = Screen("sim://chain", ["joint-inertial", "chain"])
+    for at in range(200):
+        values = {quantities.ANGLE: (30 * math.sin(0.1 * at), 0.4), quantities.HEIGHT1: (0.25, 0.01)}
+        screen.add(0.1 * at, {"joint-inertial": {quantities.HEIGHT: (0.2, 0.001)}, "chain": values})
+    shown = screen.render(health(), 80, 24).plain
+    assert "joint angle   +26.0° ±0.4°   height 1 0.250 m ±1.0 cm" in shown and "HEIGHT over joint" in shown
+    assert shown.splitlines()[2].strip().startswith("30.0")
+    assert "height 1" not in screen.render(health(), 40, 24).plain
+
+
+def test_a_ball_joint_shows_its_rotation() -> None:
     screen = Screen("sim://chain", ["chain"])
-    screen.add(0.0, {"chain": {quantities.ANGLE: (31.5, 0.4), quantities.HEIGHT1: (0.25, 0.01)}})
-    assert "joint angle +31.5°   height 1 0.250 m ±1.0 cm" in screen.render(health(), 80, 24).plain
+    half = math.radians(42.0) / 2
+    screen.add(0.0, {"chain": dict.fromkeys(quantities.CHAIN_ROTATION, (math.cos(half), 0.9))})
+    assert "joint rotation   +42.0° ±0.9°" in screen.render(health(), 80, 24).plain
+    screen.add(0.1, {"chain": dict.fromkeys(quantities.CHAIN_ROTATION, (math.nan, 180.0))})
+    assert "joint rotation   not known yet" in screen.render(health(), 80, 24).plain

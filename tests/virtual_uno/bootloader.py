@@ -55,3 +55,11 @@ def build_optiboot(folder: Path, processor: str = "atmega328p", resets: str = "4
     subprocess.run(["avr-gcc", *options, "-iquote", _FOLDER / "optiboot", "-o", elf, source], check=True)
     subprocess.run(["avr-objcopy", "-O", "ihex", "-j", ".text", "-j", ".version", elf, image], check=True)
     return BootloaderImage(image, _COMPILED_ADDRESS)
+
+
+def programmed(folder: Path, firmware: Path, bootloader: BootloaderImage) -> BootloaderImage:
+    """One .hex in `folder` with the firmware and a bootloader."""
+    records = firmware.read_text().splitlines()[:-1] + bootloader.path.read_text().splitlines()
+    path = folder / "programmed.hex"
+    path.write_text("\n".join(record for record in records if record[7:9] in ("00", "01")) + "\n")
+    return bootloader._replace(path=path)

@@ -80,10 +80,11 @@ class PtyServer:
             os.close(self._master)
             self._master = None
 
-    def put_cable_back(self) -> None:
-        """The port is there again, at the same link."""
+    def put_cable_back(self, link: Path | None = None) -> None:
+        """The port is there again, at the same link or at another one from now on."""
         if self._master is not None:
             return
+        self.link = link or self.link
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)

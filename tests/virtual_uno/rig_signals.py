@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -64,6 +62,13 @@ def air_rows(run: LinkRun, first: int, count: int) -> tuple[Floats, Floats]:
     return time_s, np.column_stack([pressure, truth.temp_degC])
 
 
+def room_rows(seed: int, first: int, count: int) -> tuple[Floats, Floats]:
+    """As `air_rows`, in a room in which a robot drives: 1013.25 hPa and 25 °C."""
+    noise = imu.white((seed, _AIR_NOISE_STREAM), first, count, 1)[:, 0]
+    time_s = np.arange(first, first + count) / RATE_HZ
+    return time_s, np.column_stack([101_325 + PRESSURE_NOISE_PA * noise, np.full(count, 25.0)])
+
+
 def mouse_rows(run: MiceRun, first: int, count: int) -> tuple[Floats, list[Floats]]:
     """Times (N,) s and for each mouse its path (N, 2) in mm for `Mouse.feed`.
 
@@ -77,9 +82,10 @@ def mouse_rows(run: MiceRun, first: int, count: int) -> tuple[Floats, list[Float
 class RigFeed:
     """Keeps the emulated sensors supplied with a run of any length, a stretch at a time."""
 
-    def __init__(self, uno: VirtualUno, run: LinkRun | MiceRun) -> None:
+    def __init__(self, uno: VirtualUno, run: LinkRun | MiceRun, drive: MiceRun | None = None) -> None:
+        """`drive`: how the mice move beside a link, which has none."""
         self._uno, self._run = uno, run
-        self._feed: Callable[[int, int], None] = self._feed_mice if isinstance(run, MiceRun) else self._feed_air
+        self._drive = run if isinstance(run, MiceRun) else drive
         self.restart()
 
     def restart(self) -> None:
@@ -94,19 +100,22 @@ class RigFeed:
         first = max(0, round((self._uno.time_s - self.start_s - _OVERLAP_S) * RATE_HZ))
         count = (STRETCH_S + 2 * _OVERLAP_S) * RATE_HZ
         self._uno.imu.feed(*imu_rows(self._run, first, count), start_s=self.start_s)
-        self._feed(first, count)
+        if isinstance(self._run, LinkRun):
+            self._feed_air(self._run, first, count)
+        else:
+            self._uno.baro.feed(*room_rows(self._run.seed, first, count), start_s=self.start_s)
+        if self._drive is not None:
+            self._feed_mice(self._drive, first, count)
         self._fed_until = self.start_s + (first + count) / RATE_HZ
 
-    def _feed_air(self, first: int, count: int) -> None:
-        assert isinstance(self._run, LinkRun)
-        self._uno.baro.feed(*air_rows(self._run, first, count), start_s=self.start_s)
-        if self._run.hello_sensors & Sensors.IMU2:
-            self._uno.imu2.feed(*imu2_rows(self._run, first, count), start_s=self.start_s)
-        if self._run.hello_sensors & Sensors.MAG:
-            self._uno.mag.feed(*mag_rows(self._run, first, count), start_s=self.start_s)
+    def _feed_air(self, run: LinkRun, first: int, count: int) -> None:
+        self._uno.baro.feed(*air_rows(run, first, count), start_s=self.start_s)
+        if run.hello_sensors & Sensors.IMU2:
+            self._uno.imu2.feed(*imu2_rows(run, first, count), start_s=self.start_s)
+        if run.hello_sensors & Sensors.MAG:
+            self._uno.mag.feed(*mag_rows(run, first, count), start_s=self.start_s)
 
-    def _feed_mice(self, first: int, count: int) -> None:
-        assert isinstance(self._run, MiceRun)
-        time_s, paths = mouse_rows(self._run, first, count)
+    def _feed_mice(self, drive: MiceRun, first: int, count: int) -> None:
+        time_s, paths = mouse_rows(drive, first, count)
         for mouse, path in zip(self._uno.mice, paths, strict=True):
             mouse.feed(time_s, path, start_s=self.start_s)

@@ -374,7 +374,7 @@ def test_resources(board: MakeBoard) -> None:
     link.run_ms(5000)
     after = link.uno.state()
     assert link.status.cpu_load / 1000 == pytest.approx(busy(before, after), abs=0.05)
-    assert link.status.stack_free >= 250
+    assert link.status.stack_free >= 400
     assert longest_run(link.uno.peek(0x100, 2048)) == pytest.approx(link.status.stack_free, abs=2)
 
 
@@ -540,6 +540,24 @@ def test_a_program_that_hangs_restarts_and_reports_where(board: MakeBoard) -> No
     link.uno.reset()
     hello = link.boot()
     assert (hello.reset_cause, hello.hung_at) == (ResetCause.EXTERNAL, NOT_HUNG)
+
+
+def test_a_reset_within_a_frame_does_not_cost_hello(board: MakeBoard) -> None:
+    """A frame is 1.5 ms long: the resets cut it near its beginning, in its middle and near its end."""
+    link = board()
+    link.start()
+    for cut_ms in (0.2, 0.5, 0.8):
+        link.run_ms(5)
+        while not (begun := link.uno.take_received()):
+            link.uno.run_ms(0.05)
+        link.decoder.feed(begun)
+        link.run_ms(cut_ms)
+        corrupt = link.decoder.corrupt.total
+        link.uno.reset()
+        link.forget()
+        assert link.expect(Hello, 500).streaming == 0
+        assert link.decoder.corrupt.total == corrupt + 1
+        link.carry_out(Start())
 
 
 @pytest.mark.parametrize(("supply_v", "band_gap_v"), [(5.0, 1.1), (4.2, 1.1), (5.0, 1.0)])

@@ -119,6 +119,17 @@ def test_a_sensor_that_fails_is_invalid_with_its_cause(
     assert last(link, 300).flags & SampleFlags.IMU_VALID
 
 
+def test_a_sensor_without_data_from_power_on_has_failed(board: MakeBoard) -> None:
+    """It answers with its id and keeps its settings; its data registers stay zero."""
+    link = board(mpu6050={"fault": "zeros"}, magnetometer="qmc5883l")
+    assert streaming(link).devices[0].state == DeviceState.FAILED
+    sample = last(link)
+    assert sample.sections & Sections.IMU and sample.flags & SampleFlags.IMU_BLANK
+    link.uno.imu.set(fault=None)
+    wanted = SampleFlags.IMU_VALID | SampleFlags.MAG_VALID
+    assert last(link, 500).flags & wanted == wanted
+
+
 def test_a_board_with_everything(board: MakeBoard) -> None:
     """Two inertial sensors, a barometer, a magnetometer and three mice at 100 Hz: nothing lost, within the budget."""
     link = board(imu2={"whoAmI": 0x70}, magnetometer="qmc5883l", mice=MICE[:3])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from bootloader import ATMEGABOOT, BootloaderImage, build_optiboot
+from bootloader import ATMEGABOOT, build_optiboot, programmed
 from wire_link import WireLink
 
 from linkpose.wire.messages import Hello, ResetCause
@@ -14,14 +14,6 @@ from virtual_uno import VirtualUno
 NOT_HUNG = 0xFFFF
 HUNG = ResetCause.HUNG | ResetCause.WATCHDOG
 EXTERNAL = ResetCause.EXTERNAL
-
-
-def programmed(folder: Path, firmware: Path, bootloader: BootloaderImage) -> Path:
-    """One .hex with the firmware and a bootloader."""
-    records = firmware.read_text().splitlines()[:-1] + bootloader.path.read_text().splitlines()
-    path = folder / "programmed.hex"
-    path.write_text("\n".join(record for record in records if record[7:9] in ("00", "01")) + "\n")
-    return path
 
 
 @pytest.mark.parametrize(
@@ -46,7 +38,7 @@ def test_reset_causes(
 ) -> None:
     old = version == "ATmegaBOOT"
     bootloader = ATMEGABOOT if old else build_optiboot(tmp_path, resets=version)
-    program = programmed(tmp_path, firmware_hex, bootloader)
+    program = programmed(tmp_path, firmware_hex, bootloader).path
     with VirtualUno(program, boot_address=bootloader.address, seed=5) as uno:
         link = WireLink(uno)
         assert link.expect(Hello, 4000).reset_cause & ~(ResetCause.POWER_ON | after_external_reset) == 0

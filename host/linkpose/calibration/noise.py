@@ -19,7 +19,7 @@ from linkpose.calibration.rests import find_rests
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.mpu6050 import DLPF_DELAY_S, STANDARD_GRAVITY
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Noise, Rig, Vector
 
 # Data sheet of the MPU-6050, 3.1 and 3.2: densities at 10 Hz (rad/s/√Hz, m/s²/√Hz).
@@ -138,7 +138,7 @@ def calibrate_noise(recordings: Sequence[Recording]) -> NoiseCalibration:
             "the random walk); record the sensor lying untouched for longer"
         )
     rate_hz = (len(rest) - 1) / span
-    delay_s = DLPF_DELAY_S[recording.dlpf] if recording.dlpf is not None else _USUAL_DELAY_S
+    delay_s = recording.imu_delay_s or _USUAL_DELAY_S
     gyro, accel = (_three(rest, values, rate_hz, _DELAYS * delay_s) for values in (rest.gyro_rad_s, rest.accel_m_s2))
     temperature = rest.imu_temp_degC[np.isfinite(rest.imu_temp_degC)]
     return NoiseCalibration(

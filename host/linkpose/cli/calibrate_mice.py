@@ -33,12 +33,16 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     recordings, are better), each with a second of rest before it. The gyro shows which recording is which.
     """
     from linkpose.calibration.mice import calibrate_mice, with_calibration
+    from linkpose.sensors.devices import slow_mouse_remarks
 
     loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_mice(loaded, rig, length)
     with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
+    if not quiet:
+        for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
+            click.echo(remark, err=True)
     options.show_rig_written(rig_file, quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")
 
 

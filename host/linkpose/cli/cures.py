@@ -30,6 +30,10 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.MissingJ2S: lambda e: (
         "type `linkpose calibrate joint`, give it with --j2s X,Y,Z, or estimate it with --j2s auto"
     ),
+    errors.UncalibratedMagnetometer: lambda e: (
+        "record it turned through all attitudes, type `linkpose calibrate mag RECORDING --rig rig.toml`, and add "
+        "--rig rig.toml"
+    ),
     errors.FilterCannotRun: lambda e: cure(e.reason),
     errors.NoFilterRuns: lambda e: "; ".join(dict.fromkeys(filter(None, map(cure, e.reasons.values())))),
     errors.MissingMap: lambda e: "add --map MAP.yaml",

@@ -46,6 +46,7 @@ class Request:
     targets: tuple[str, ...]
     page: PageOptions
     chain_joint: str | None = None
+    mag: bool = False
 
 
 @click.command(name="estimate")
@@ -76,6 +77,9 @@ class Request:
     type=click.Choice(["ball", "hinge"]),
     help="Joint between the two links of a chain. Default: the rig file's, or ball.",
 )
+@click.option(
+    "--mag", is_flag=True, help="Hold the heading with the magnetometer; `calibrate mag` must have calibrated it."
+)
 @options.page
 @board_settings
 @options.force
@@ -104,6 +108,7 @@ def command(
     joint: Joint | None,
     j2s_std: float | None,
     chain_joint: str | None,
+    mag: bool,
     has_page: bool,
     view_host: str,
     view_port: int | None,
@@ -144,7 +149,7 @@ def command(
     options.refuse_mixed_output(output, json_lines)
     joint = options.joint_from(joint, j2s_std)
     request = Request(
-        output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page, chain_joint
+        output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page, chain_joint, mag
     )
     console = Console(quiet, verbose)
     if recording is not None:
@@ -160,7 +165,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     from linkpose.recording.reader import RecordingFile
 
     recording = RecordingFile(path, lambda share: console.progress(lambda: f"reading {path} {share:.0%}"))
-    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay_of(recording.dlpf)
+    rig = options.resolve_rig(request.rig_file, request.joint, recording.rig).with_delay(recording.imu_delay_s)
     for remark in [*recording.remarks, *recording.contradictions(rig)]:
         console.report(remark)
     if recording.unusable and not request.filter_names:
@@ -170,9 +175,11 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _check(estimator, request, console)
     if request.smooth:
         _smooth(estimator)
+    if request.mag:
+        estimator.hold_heading()
     console.compile([f.name for f in estimator.filters])
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
-    head |= {"smooth": request.smooth, "rig": rig.as_dict()}
+    head |= {"smooth": request.smooth, "mag": request.mag, "rig": rig.as_dict()}
     rows = 0
     with _Sink(estimator, request, head) as sink:
         blocks = iter([recording.load()]) if request.smooth else recording.blocks()
@@ -184,6 +191,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         sink.close({"rows": rows, **_outcome(estimator)})
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
+    _report_field(estimator, console)
     if request.output:
         console.report(f"{rows} rows of {', '.join(head['filters'])}{options.written(request.output)}")
         options.show_next(console.is_quiet, f"plot {request.output}")
@@ -221,12 +229,14 @@ def _live(
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board(request.filter_names, connected, request.chain_joint)
+        if request.mag:
+            estimator.hold_heading()
         _check(estimator, request, console)
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))
         if record:
             connected.record(record, force=request.force, plain=request.plain)
-        head = {"device": connected.port, "filters": names, "rig": estimator.rig.as_dict()}
+        head = {"device": connected.port, "filters": names, "mag": request.mag, "rig": estimator.rig.as_dict()}
         sink = stack.enter_context(_Sink(estimator, request, head))
         keys = stack.enter_context(Keys(console.shows_progress))
         run = stack.enter_context(_LiveRun(connected, estimator, compiling, sink, request, console, keys))
@@ -320,6 +330,7 @@ class _LiveRun:
                 self._console.report(line)
         _report_j2s(self._estimator, self._console)
         _report_mice(self._estimator, self._console)
+        _report_field(self._estimator, self._console)
 
     def _mark(self, time_s: float) -> None:
         self._marks.append(time_s)
@@ -373,7 +384,27 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
         outcome["excluded_mice"] = estimator.excluded.samples
     if estimator.mice_scale:
         outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
+    if estimator.magnetic_field:
+        outcome["mag"] = estimator.magnetic_field.as_dict()
     return outcome
+
+
+def _report_field(estimator: Estimator, console: Console) -> None:
+    """How long the magnetometer held the heading, and the largest disturbance."""
+    found = estimator.magnetic_field
+    if found is None:
+        return
+    if not found.references:
+        console.report(
+            "The magnetometer did not hold the heading: the field is not as strong as at its calibration. Move away "
+            "from iron, or calibrate it here: linkpose calibrate mag RECORDING --rig rig.toml"
+        )
+        return
+    console.report(
+        f"The magnetometer held the heading for {found.used_s:.0f} s; for {found.rejected_s:.0f} s the field was "
+        f"disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+        + ("" if found.north_deg is None else f" Magnetic north is at yaw {found.north_deg:.0f}°.")
+    )
 
 
 def _report_mice(estimator: Estimator, console: Console) -> None:
@@ -425,7 +456,7 @@ class _Sink:
         if self._file is not None:
             self._file.write(self._estimator.text(estimates))
         if self._prints:
-            _print(self._estimator.text(estimates))
+            _print(self._estimator.text(estimates).decode())
         if self._json or self._outputs:
             rows = self._estimator.objects(estimates)
             for output in self._outputs:

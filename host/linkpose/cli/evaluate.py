@@ -12,7 +12,8 @@ from linkpose.cli import options
 from linkpose.errors import printable
 
 if TYPE_CHECKING:
-    from linkpose.evaluation.scores import Evaluation, Score
+    from linkpose.evaluation.scores import Evaluation
+    from linkpose.evaluation.scoring import Score
 
 
 @click.command("evaluate")
@@ -48,17 +49,19 @@ def command(
     its y axis.
     """
     from linkpose import plotting
-    from linkpose.evaluation.references import read_any
-    from linkpose.evaluation.scores import evaluate
-    from linkpose.recording.table import read_table
+    from linkpose.cli.live import Console
+    from linkpose.evaluation.longfiles import evaluate_files
 
     if from_s is not None and to_s is not None and from_s >= to_s:
         raise click.UsageError(f"--from {from_s:g} is not before --to {to_s:g}")
     plotting.check_output(plot_path, force)
-    truth = read_any(reference, up)
-    found = evaluate(read_table(estimate), truth, from_s, to_s)
+    console = Console(quiet, verbose=False)
+    found = evaluate_files(
+        estimate, reference, up, from_s, to_s, lambda share: console.progress(lambda: f"comparing {share:.0%}")
+    )
+    console.clear()
     if not quiet:
-        for remark in (*truth.remarks, *found.remarks):
+        for remark in found.remarks:
             click.echo(printable(remark), err=True)
     if json_lines:
         for score in found.scores:

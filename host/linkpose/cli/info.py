@@ -22,7 +22,7 @@ OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of th
 @click.command(name="info")
 @click.argument("recording", type=options.FILE, required=False)
 @options.port
-@click.option("--self-test", is_flag=True, help="Also run the MPU-6050's self-test; keep the board still.")
+@click.option("--self-test", is_flag=True, help="Also run the self-test of each inertial sensor; keep the board still.")
 @options.as_json
 @options.verbosity
 def command(
@@ -65,7 +65,7 @@ def _ask_board(port: str | None, self_test: bool, console: Console) -> dict[str,
 
     with open_session(port, console.report) as session:
         session.wait_for_mice(0)
-        tested = _self_test(session) if self_test else {}
+        tested = _self_tests(session) if self_test else {}
         sensors = _observe(session, console)
         return _report(session, session.health()) | {"health": sensors} | tested
 
@@ -133,16 +133,32 @@ def _device(device: HelloDevice) -> dict[str, Any]:
     }
 
 
-def _self_test(session: Session) -> dict[str, Any]:
-    """How far each axis is from the factory's answer, and whether that is within the data sheet's limit."""
+def _self_tests(session: Session) -> dict[str, Any]:
+    """The self-tests of the inertial sensors found. Raises LinkposeError if there is none."""
+    from linkpose.sensors.devices import DEVICES, Sensors, found
+
+    prefixes = {Sensors.MPU6050: "", Sensors.IMU2: "imu2_"}
+    present = [sensor for sensor in prefixes if sensor & found(session.hello)] or [Sensors.MPU6050]
+    report: dict[str, Any] = {}
+    for sensor in present:
+        tested = _self_test(session, DEVICES.index(sensor))
+        report |= {f"{prefixes[sensor]}{name}": value for name, value in tested.items()}
+    return report
+
+
+def _self_test(session: Session, device: int) -> dict[str, Any]:
+    """How far each axis is from the factory's response, and whether that is within the data sheet's limit."""
     from linkpose.sensors.mpu6050 import self_test_deviation, self_test_limit
 
-    result = session.self_test()
+    result = session.self_test(device)
     deviations = self_test_deviation(result)
     known = [deviation for deviation in deviations.values() if deviation is not None]
-    passed = bool(known) and all(abs(deviation) <= self_test_limit(result) for deviation in known)
+    verdict = "passed" if all(abs(deviation) <= self_test_limit(result) for deviation in known) else "failed"
     percent = {axis: None if value is None else round(100 * value, 1) for axis, value in deviations.items()}
-    return {"self_test": "passed" if passed else "failed", "self_test_deviation_percent": percent}
+    return {
+        "self_test": verdict if known else "not known: the chip has no factory response",
+        "self_test_deviation_percent": percent,
+    }
 
 
 def _rounded(value: float | None) -> float | None:

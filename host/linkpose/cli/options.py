@@ -107,7 +107,7 @@ def port_names() -> list[str]:
     """The serial ports that are connected, and the simulated boards."""
     from linkpose.device.ports import find_ports
 
-    return [*(port.port for port in find_ports()), "sim://link", "sim://mice"]
+    return [*(port.port for port in find_ports()), "sim://link", "sim://chain", "sim://mice"]
 
 
 def duration(function: Function) -> Function:

@@ -15,14 +15,21 @@ from linkpose.errors import printable
 
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
+    from linkpose.page.scene import Surroundings
     from linkpose.plotting import Scene
     from linkpose.recording.table import Table
+
+_ANIMATION = ".html"
 
 
 @click.command("plot")
 @click.argument("files", type=options.FILE, nargs=-1, required=True)
 @click.option(
-    "-o", "--output", type=options.FILE, metavar="FILE.png", help="PNG, SVG or PDF; default: the first file's name."
+    "-o",
+    "--output",
+    type=options.FILE,
+    metavar="FILE.png",
+    help="PNG, SVG, PDF, or HTML that plays an estimate in 3-D; default: the first file's name, as PNG.",
 )
 @click.option(
     "--filter",
@@ -71,20 +78,40 @@ def command(
         _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, scene, quiet)
         return
     output = output or files[0].with_suffix(".png")
-    plotting.check_output(output, force)
+    plotting.check_output(output, force, (*plotting.FORMATS, _ANIMATION))
     console = Console(quiet, verbose=False)
     tables = []
     for path in files:
         tables.append(read_for_picture(path, up, _show_progress(console, path)))
         console.clear()
+    names = [name.replace("_", "-") for name in wanted]
     scene = _scene(map_file, beacons)
-    figure, remarks = plotting.plot_tables(tables, [name.replace("_", "-") for name in wanted], scene)
-    plotting.save(figure, output, force)
+    remarks: list[str] = []
+    if output.suffix.lower() == _ANIMATION:
+        _save_animation(tables, names, output, scene)
+    else:
+        figure, remarks = plotting.plot_tables(tables, names, scene)
+        plotting.save(figure, output, force)
     for remark in [remark for table in tables for remark in table.remarks] + remarks:
         if not quiet:
             click.echo(printable(remark), err=True)
     if output != STDOUT:
         click.echo(output)
+
+
+def _save_animation(tables: list[Table], wanted: list[str], output: Path, scene: Scene | None) -> None:
+    """Writes the first estimate, with the reference if there is one, as an animation in 3-D."""
+    from linkpose.page.animation import save_animation
+    from linkpose.page.tables import rig_of, rows_of
+
+    columns, values = rows_of(tables, wanted)
+    save_animation(output, columns, values, rig_of(tables), _surroundings(scene))
+
+
+def _surroundings(scene: Scene | None) -> Surroundings | None:
+    from linkpose.page.scene import Surroundings
+
+    return Surroundings(scene.grid, scene.beacons) if scene is not None else None
 
 
 def _show_progress(console: Console, path: Path) -> Callable[[float], None]:
@@ -108,7 +135,6 @@ def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, sc
     """Plays the first estimate, with the reference if there is one, until Ctrl-C or "stop"."""
     from linkpose.cli.live import Console, ending_well
     from linkpose.page.history import Replay
-    from linkpose.page.scene import Surroundings
     from linkpose.page.tables import rig_of, rows_of
 
     console = Console(quiet, verbose=False)
@@ -123,7 +149,7 @@ def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, sc
             title,
             lambda text: click.echo(text, err=True),
             replay=Replay(values),
-            surroundings=Surroundings(scene.grid, scene.beacons) if scene is not None else None,
+            surroundings=_surroundings(scene),
         ) as page,
     ):
         console.report("Ctrl-C ends")

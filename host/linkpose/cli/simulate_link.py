@@ -27,6 +27,11 @@ from linkpose.sensors.rig import Rig, Vector
 @click.option("--rests", is_flag=True, help="Lay the sensor on its six sides in turn, as `calibrate imu` needs it.")
 @click.option("--imu2", is_flag=True, help="Add a second inertial sensor, half-way between the joint and the first.")
 @click.option("--mag", is_flag=True, help="Add a magnetometer.")
+@click.option(
+    "--mag-disturbance",
+    type=click.Choice(["desk", "motor", "iron"]),
+    help="Disturb the magnetometer, which is added: a steel desk, a motor on the link, or iron that is carried past.",
+)
 @options.force
 @options.quiet
 def command(
@@ -41,6 +46,7 @@ def command(
     rests: bool,
     imu2: bool,
     mag: bool,
+    mag_disturbance: str | None,
     force: bool,
     quiet: bool,
 ) -> None:
@@ -51,7 +57,11 @@ def command(
     check_outputs((output, truth), force)
     check_length(duration, rate)
     level, noise_of = ("calibrated", errors) if isinstance(errors, Rig) else (errors, None)
-    run = LinkRun(test, seed, duration, rate, level, j2s, rests=rests, imu2=imu2, mag=mag, noise_of=noise_of)
+    has_mag = mag or mag_disturbance is not None
+    run = LinkRun(
+        test, seed, duration, rate, level, j2s, rests=rests, imu2=imu2, mag=has_mag, mag_disturbance=mag_disturbance,
+        noise_of=noise_of,
+    )  # fmt: skip
     write_link(run, output, truth, force)
     following = f"calibrate imu {output} --rig rig.toml" if rests else f"estimate {output} -o estimate.csv"
     options.show_next(quiet, following)

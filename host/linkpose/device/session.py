@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import random
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -61,6 +62,7 @@ MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 STILL_SAMPLES = 10  # with the same time stamp
 JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
+OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
@@ -112,13 +114,15 @@ class Session:
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
-        self._token = 0
-        self._status: Status | None = None
+        self._token = random.getrandbits(32)  # another program's differ
+        self._intruder_reported = False
+        self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
-        self._started: Arrival | None = None  # what came together with the ACK of START
+        self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
         self._last_stamp: tuple[int, int] | None = None  # seq and t_us of the last sample
+        self._arrived_s = 0.0  # s, the connection's clock: of the last sample
         self._still = 0  # samples in a row with the same t_us
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
@@ -155,7 +159,7 @@ class Session:
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
-        heard = bytearray()
+        heard, refused = bytearray(), 0
         deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
         while time.perf_counter() < deadline:
             if time.perf_counter() >= ask_at:
@@ -169,12 +173,16 @@ class Session:
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
                     raise _other_protocol(message)
+                refused += isinstance(message, Nak)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+        reason = _why_no_hello(bytes(heard), connection.decoder.corrupt)
+        if refused:
+            reason = "the board refuses every command, also the request for its version; its firmware is damaged"
+        raise NoFirmware(self.port, bytes(heard), reason)
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
         """Waits for sensors that are being set up and returns the latest HELLO."""
@@ -292,6 +300,16 @@ class Session:
         sent = self._pings.pop(pong.token, None)
         if sent is not None:
             self._clock.pong(pong.t_us, sent, time_s)
+        elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
+            self._report_intruder()
+
+    def _report_intruder(self) -> None:
+        """An answer came that this program has not asked for: a port such as socket:// serves several programs."""
+        if not self._intruder_reported:
+            self._intruder_reported = True
+            self.notify(
+                f"another program also sends commands to the board at {self.port}; close it, or the data will have gaps"
+            )
 
     def _tie_clocks(self) -> None:
         """A few round trips before the first sample."""
@@ -317,7 +335,7 @@ class Session:
         """
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
-        self._began_s = self._connection.now()
+        self._arrived_s = self._connection.now()
         while not timeline.is_over:
             try:
                 placements = self._next(timeline)
@@ -339,9 +357,11 @@ class Session:
             )
 
     def _end_when_due(self, timeline: Timeline) -> None:
-        """End the timeline when the duration has passed without a sample that would have ended it."""
-        first_s = timeline.start_s if timeline.samples else self._began_s
-        timeline.end_if_past(self._connection.now() - first_s - LATE_S)
+        """End the timeline when the duration has passed without a sample that would have ended it.
+
+        What has passed is counted from the last sample's arrival: a board whose samples come late goes on to the end.
+        """
+        timeline.end_if_past(timeline.duration_s + self._connection.now() - self._arrived_s - LATE_S)
 
     def _begin(self) -> None:
         """Ties the clocks anew and starts the stream."""
@@ -349,8 +369,8 @@ class Session:
         for _ in range(ATTEMPTS):
             self._clock = DeviceClock()
             self._tie_clocks()
-            self._started = self._start(wanted)
-            if self._started is not None:
+            self._unhandled = self._start(wanted)
+            if self._unhandled is not None:
                 break
             self._connection.send(Stop())
             self.configure(wanted)
@@ -383,7 +403,7 @@ class Session:
         return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
-        arrival, self._started = self._started or self._connection.receive(RECEIVE_TIMEOUT_S), None
+        arrival, self._unhandled = self._unhandled or self._connection.receive(RECEIVE_TIMEOUT_S), None
         now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
@@ -394,17 +414,22 @@ class Session:
             self._silent_s += min(waited_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
             self._ask_when_silent()
             return []
-        placements = []
-        for message in arrival.messages:
+        placements: list[Placement] = []
+        for at, message in enumerate(arrival.messages):
             if isinstance(message, Sample):
                 self._silent_s = self._asked_s = 0.0
                 self._unread_bytes = 0
+                self._arrived_s = arrival.time_s
                 self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
                 if place is not None:
                     placements.append(Placement(message, place))
-            else:
-                self._hear(message, arrival, timeline)
+            elif placements and isinstance(message, Hello | OtherProtocol):
+                # It may end the connection, and the samples before it must not be lost then.
+                self._unhandled = Arrival(arrival.time_s, arrival.messages[at:], b"")
+                break
+            elif self._hear(message, arrival, timeline):
+                break
         return placements
 
     def _check_supply(self, status: Status) -> None:
@@ -444,11 +469,15 @@ class Session:
             self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
-    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> None:
+    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> bool:
+        """Act on a message other than a sample. True if the board was reset and has been started again: what arrived
+        together with its HELLO is older than that."""
         if isinstance(message, Pong):
             self._hear_pong(message, arrival.time_s)
+        elif isinstance(message, Ack | Nak) and message.command in (Command.STOP, Command.CONFIGURE):
+            self._report_intruder()  # the board answers in order: START was the last command of this program
         elif isinstance(message, Status):
-            self._status = message
+            self.status = message
             self._check_supply(message)
         elif isinstance(message, OtherProtocol):
             raise _other_protocol(message)
@@ -462,6 +491,8 @@ class Session:
                 raise
             except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
                 raise NotResumed(self.port, error) from error
+            return True
+        return False
 
     def _resume(self, hello: Hello) -> None:
         """Puts the settings of before in force again and goes on streaming."""
@@ -545,7 +576,7 @@ class Session:
             rate_hz=timeline.samples / duration if duration else 0.0,
             drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
-            status=self._status,
+            status=self.status,
         )
 
 

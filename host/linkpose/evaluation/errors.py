@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ from linkpose.quantities import CHAIN_ROTATION, HEADING, POSE, ROTATION, VX, VY,
 from linkpose.sensors.measurements import Floats
 
 Values = Mapping[Quantity, Floats]  # (N,) each; angles in radians
+_Place = Mapping[Quantity, float]  # at one instant
 
 COMPONENTS = (X, Y, Z, VX, VY)  # of vectors, whose RMSE is that of the vector
 
@@ -28,25 +29,63 @@ class Errors:
     unit: str  # as JSON keys write it: cm, deg, m_s
     label: str
     least_std: float = 0.0  # resolution of σ in the file
+    whole: Statistics | None = None  # of all instants, where these are some of them
 
     def statistics(self) -> Statistics:
         """Of all instants."""
-        return Statistics.of(self.error, self.std, self.least_std)
+        return self.whole or Statistics.of(self.error, self.std, self.least_std)
 
 
-def errors_of(name: str, ours: Values, theirs: Values) -> dict[Quantity, Floats]:
-    """Estimate − reference of each quantity, angles within ±π.
+class CommonStart:
+    """The first instant at which estimate and reference are known, for what a filter counts from an arbitrary origin.
 
-    A pose without an absolute origin is compared after moving it as a whole to agree with the reference at the first
-    common instant: odometry in position and heading, a link without compass about the vertical only.
+    A pose without an absolute origin is compared after moving it as a whole to agree with the reference at that
+    instant: odometry in position and heading, a link without compass about the vertical only.
+    """
+
+    def __init__(self, name: str, quantities: Collection[Quantity]) -> None:
+        """For a filter of this name that estimates these quantities."""
+        needs = filters.capabilities(name)
+        is_odometric = needs is not None and needs.is_odometric
+        self._needed = {
+            POSE: is_odometric and all(q in quantities for q in POSE),
+            (YAW,): YAW in quantities,
+        }
+        self.pose: tuple[_Place, _Place] | None = None  # the estimate there, and its error
+        self.yaw_error: float | None = None
+
+    @property
+    def is_found(self) -> bool:
+        """Whether nothing is left to be found."""
+        return not any(self._needed.values())
+
+    def find(self, ours: Values, errors: Values) -> None:
+        """Looks for what was not found yet in the next instants, (N,) each."""
+        for wanted in [wanted for wanted, is_needed in self._needed.items() if is_needed]:
+            first = _first_common(errors, wanted)
+            if first is None:
+                continue
+            self._needed[wanted] = False
+            if wanted == POSE:
+                at, error = ({q: float(values[q][first]) for q in POSE} for values in (ours, errors))
+                self.pose = at, error
+            else:
+                self.yaw_error = float(errors[YAW][first])
+
+
+def errors_of(name: str, ours: Values, theirs: Values, start: CommonStart | None = None) -> dict[Quantity, Floats]:
+    """Estimate − reference of each quantity, angles within ±π, of the filter `name`.
+
+    `start` is the common start of all instants where these are some of them; None: it is looked for in these.
     The four numbers of a quaternion give one error: the angle of the rotation between the two.
     """
     errors = {q: _difference(q, ours[q], theirs[q]) for q in ours if q not in CHAIN_ROTATION}
-    needs = filters.capabilities(name)
-    if needs is not None and needs.is_odometric and all(q in errors for q in POSE):
-        errors |= _from_common_start(ours, errors)
-    if YAW in errors:
-        errors |= _from_common_yaw(ours, theirs, errors)
+    start = start or CommonStart(name, ours)
+    start.find(ours, errors)
+    if start.pose is not None:
+        errors |= _from_common_start(ours, errors, *start.pose)
+    if start.yaw_error is not None:
+        errors |= _from_common_yaw(ours, theirs, errors, start.yaw_error)
     if all(q in ours for q in CHAIN_ROTATION):
         errors[ROTATION] = _rotation_between(ours, theirs)
     return errors
@@ -71,15 +110,34 @@ def scored(time_s: Floats, errors: Values, std: Values, is_planar: bool) -> dict
     return found
 
 
-def yaw_drift_deg_per_min(time_s: Floats, error_rad: Floats) -> float | None:
-    """Magnitude of the slope of the yaw's error, by least squares; None of fewer than two instants."""
-    known = np.isfinite(error_rad)
-    t = time_s[known]
-    if len(t) < 2 or not t[-1] > t[0]:
-        return None
-    t = t - t.mean()
-    unwrapped = np.unwrap(error_rad[known])
-    return float(abs(np.degrees(60.0 * (t @ unwrapped) / (t @ t))))
+class Drift:
+    """The slope of an angle's error over time, by least squares, collected block by block."""
+
+    def __init__(self) -> None:
+        self._sums: Floats = np.zeros(5)  # of 1, t, t², e, t e over the known instants
+        self._first: tuple[float, float] | None = None  # time and error from which t and e count
+        self._last = 0.0  # error, unwrapped (rad)
+
+    def add(self, time_s: Floats, error_rad: Floats) -> None:
+        """The next instants (N,) and errors (N,), NaN where unknown."""
+        known = np.isfinite(error_rad)
+        if not known.any():
+            return
+        t, error = time_s[known], error_rad[known]
+        if self._first is None:
+            self._first = float(t[0]), float(error[0])
+            self._last = self._first[1]
+        error = np.unwrap(np.concatenate([[self._last], error]))[1:]
+        self._last = float(error[-1])
+        t, error = t - self._first[0], error - self._first[1]
+        self._sums += [len(t), t.sum(), t @ t, error.sum(), t @ error]
+
+    @property
+    def deg_per_min(self) -> float | None:
+        """Magnitude; None of fewer than two instants."""
+        n, t, tt, e, te = self._sums.tolist()
+        spread = n * tt - t * t
+        return float(abs(np.degrees(60.0 * (n * te - t * e) / spread))) if spread > 0 else None
 
 
 def _in_score_unit(unit: str) -> float:
@@ -107,27 +165,21 @@ def _first_common(errors: Values, needed: tuple[Quantity, ...]) -> int | None:
     return int(both[0]) if len(both) else None
 
 
-def _from_common_start(ours: Values, errors: Values) -> dict[Quantity, Floats]:
-    """Errors of a pose moved as a whole to agree with the reference at the first common instant."""
-    first = _first_common(errors, POSE)
-    if first is None:
-        return {}
-    turn = -errors[HEADING][first]
-    x, y = (ours[q] - ours[q][first] for q in (X, Y))
+def _from_common_start(ours: Values, errors: Values, start: _Place, start_error: _Place) -> dict[Quantity, Floats]:
+    """Errors of a pose moved as a whole to agree with the reference at the common start."""
+    turn = -start_error[HEADING]
+    x, y = (ours[q] - start[q] for q in (X, Y))
     moved_x, moved_y = np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y
     return {
-        X: moved_x - x + errors[X] - errors[X][first],
-        Y: moved_y - y + errors[Y] - errors[Y][first],
+        X: moved_x - x + errors[X] - start_error[X],
+        Y: moved_y - y + errors[Y] - start_error[Y],
         HEADING: _wrapped(errors[HEADING] + turn),
     }
 
 
-def _from_common_yaw(ours: Values, theirs: Values, errors: Values) -> dict[Quantity, Floats]:
-    """Errors of a link's yaw and horizontal position, turned to agree in yaw at the first common instant."""
-    first = _first_common(errors, (YAW,))
-    if first is None:
-        return {}
-    turn = -errors[YAW][first]
+def _from_common_yaw(ours: Values, theirs: Values, errors: Values, start_error: float) -> dict[Quantity, Floats]:
+    """Errors of a link's yaw and horizontal position, turned to agree in yaw at the common start."""
+    turn = -start_error
     turned: dict[Quantity, Floats] = {YAW: _wrapped(errors[YAW] + turn)}
     if X in ours and Y in ours:
         x, y = ours[X], ours[Y]

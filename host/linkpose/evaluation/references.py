@@ -17,15 +17,16 @@ def read_any(path: Path, up: str | None = None) -> Table:
 
     `up` is the axis of the room that points upwards, "y" or "z"; None: as the format has it.
     """
-    return _read_take(path, up) or read_table(path)
+    return read_take(path, up) or read_table(path)
 
 
 def read_for_picture(path: Path, up: str | None = None, progress: Progress | None = None) -> Table:
     """As `read_any`; of a long table, the rows that a picture shows."""
-    return _read_take(path, up) or read_thinned(path, progress)
+    return read_take(path, up) or read_thinned(path, progress)
 
 
-def _read_take(path: Path, up: str | None) -> Table | None:
+def read_take(path: Path, up: str | None) -> Table | None:
+    """The take (C3D, TRC, Motive's CSV) in a file; None for any other file."""
     with contextlib.closing(open_binary(path)) as file:
         start = file.read(64)
     if is_c3d(start):

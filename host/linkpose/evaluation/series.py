@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,13 @@ from linkpose.sensors.measurements import Floats
 
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
 _CLEARLY_BETTER = 0.7
-_SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter
+SPARSER = 1.05  # a longer interval than this one's times that is another rate, not its jitter
 _FEWEST = 10  # instants that a fit is judged by
-# Points of the grid on which the lag is searched: 3 h at 100 Hz; longer files on a coarser one. 300 MB at most.
-_LARGEST_GRID = 1 << 20
+# Points of the grid on which the lag is searched: 3 h at 100 Hz; longer files on a coarser one. 100 MB at most. More
+# than 2²⁰ double memory and time.
+_LARGEST_GRID = 1_000_000
 _MOST_COMPARED = 100_000  # instants by which an offset is judged: 17 min at 100 Hz
+_MOST_STEPS = 1_000_000  # between stamps, by which the usual one is judged
 _STRAY = 0.01  # share of the stamps at either end that may be far from the others
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -30,6 +33,7 @@ class Series:
     time_s: Floats  # (N,) not decreasing
     value: Floats  # (N,) angles in radians
     is_angle: bool = False
+    step_s: float | None = None  # the usual step between two stamps of the whole signal, where this is a part of it
 
     def at(self, time_s: Floats) -> Floats:
         """Linear interpolation, NaN outside, next to a NaN, and within a gap."""
@@ -44,14 +48,16 @@ class Series:
     @functools.cached_property
     def _known(self) -> tuple[Floats, Floats, float]:
         """Times and values (an angle's unwrapped) where there is a value, and the longest step that is no gap (s)."""
-        good = np.isfinite(self.value)
-        value = self.value[good]
-        return self.time_s[good], np.unwrap(value) if self.is_angle else value, LONGEST_HOLE * self.interval_s
+        time_s, value = self.time_s, self.value
+        good = np.isfinite(value)
+        if not good.all():
+            time_s, value = time_s[good], value[good]
+        return time_s, np.unwrap(value) if self.is_angle else value, LONGEST_HOLE * self.interval_s
 
     @functools.cached_property
     def interval_s(self) -> float:
         """The usual step between two stamps."""
-        return interval(self.time_s)
+        return interval(self.time_s) if self.step_s is None else self.step_s
 
     @functools.cached_property
     def spread(self) -> float:
@@ -59,16 +65,31 @@ class Series:
         return float(np.nanstd(self.value)) if np.isfinite(self.value).any() else 0.0
 
 
+Pair = tuple[Series, Series]  # estimate, reference
+
+
+class Lag(NamedTuple):
+    """An offset between two clocks, found on a grid."""
+
+    lag_s: float  # added to the estimate's clock to get the reference's
+    step_s: float  # of the grid
+
+
 def interval(time_s: Floats) -> float:
-    """The usual step between two stamps (s)."""
-    steps = np.diff(time_s)
+    """The usual step between two stamps (s); of very many stamps, by some of the steps."""
+    every = max(1, len(time_s) // _MOST_STEPS)
+    return usual(time_s[1::every] - time_s[: len(time_s) - 1 : every])
+
+
+def usual(steps: Floats) -> float:
+    """The usual one of the steps between two stamps (s); 0 where none is positive."""
     steps = steps[steps > 0]
     return float(np.median(steps)) if len(steps) else 0.0
 
 
 def is_sparser(one: Series, other: Series) -> bool:
     """Whether `one` has clearly fewer instants than `other`."""
-    return one.interval_s > _SPARSER * other.interval_s
+    return one.interval_s > SPARSER * other.interval_s
 
 
 def paired(estimate: Series, reference: Series, offset_s: float) -> tuple[Floats, Floats]:
@@ -91,30 +112,31 @@ def difference(estimate: Series, reference: Series, offset_s: float) -> Floats:
     return error
 
 
-def find_offset(pairs: Sequence[tuple[Series, Series]]) -> tuple[float, float]:
+def find_offset(pairs: Sequence[Pair], near: Lag | None = None) -> tuple[float, float]:
     """Offset (s) to add to the estimate's clock to get the reference's, and the residual with it.
 
-    `pairs` are (estimate, reference) of one filter. 0 unless another offset fits clearly better. The residual is the
-    RMS of the differences without their means, each over the reference's standard deviation; inf without an overlap.
+    `pairs` are of one filter, `near` is where the offset is if it is not 0; None: it is searched for in the pairs.
+    0 unless another offset fits clearly better. The residual is the RMS of the differences without their means, each
+    over the reference's standard deviation; inf without an overlap.
     """
     step = max(pairs[0][0].interval_s, pairs[0][1].interval_s)
-    whole, pairs = pairs, [(_thinned(estimate), reference) for estimate, reference in pairs]
+    thin = [(_thinned(estimate), reference) for estimate, reference in pairs]
     if step == 0.0:
-        return 0.0, _residual(pairs, 0.0)
-    coarse, grid_step = _strongest_lag(whole, step)
-    offset = _refine(pairs, coarse - 2 * grid_step, coarse + 2 * grid_step)
-    if abs(offset) > 0.5 * step and _fits_clearly_better(pairs, offset):
-        return offset, _residual(pairs, offset)
-    return 0.0, _residual(pairs, 0.0)
+        return 0.0, _residual(thin, 0.0)
+    near = near or strongest_lag(pairs)
+    offset = _refine(thin, near.lag_s - 2 * near.step_s, near.lag_s + 2 * near.step_s)
+    if abs(offset) > 0.5 * step and _fits_clearly_better(thin, offset):
+        return offset, _residual(thin, offset)
+    return 0.0, _residual(thin, 0.0)
 
 
 def _thinned(series: Series) -> Series:
     """At most some _MOST_COMPARED of the samples: an offset needs no more, and a day at 100 Hz has 8.6 million."""
     every = max(1, len(series.time_s) // _MOST_COMPARED)
-    return Series(series.time_s[::every], series.value[::every], series.is_angle)
+    return Series(series.time_s[::every], series.value[::every], series.is_angle, series.step_s)
 
 
-def _fits_clearly_better(pairs: Sequence[tuple[Series, Series]], offset_s: float) -> bool:
+def _fits_clearly_better(pairs: Sequence[Pair], offset_s: float) -> bool:
     """Whether the offset fits better than none on the instants that have a reference either way.
 
     On all instants an offset would look better for merely pushing a bad one, often the first, out of the reference.
@@ -126,16 +148,14 @@ def _fits_clearly_better(pairs: Sequence[tuple[Series, Series]], offset_s: float
     return _residual(pairs, 0.0) == float("inf")
 
 
-def _instants(pairs: Sequence[tuple[Series, Series]], offsets_s: Sequence[float]) -> list[NDArray[np.bool_]]:
+def _instants(pairs: Sequence[Pair], offsets_s: Sequence[float]) -> list[NDArray[np.bool_]]:
     """Of each pair, which of its instants (N,) can be compared with each of these offsets."""
     return [
         np.logical_and.reduce([np.isfinite(difference(*pair, offset_s)) for offset_s in offsets_s]) for pair in pairs
     ]
 
 
-def _residual(
-    pairs: Sequence[tuple[Series, Series]], offset_s: float, instants: Sequence[NDArray[np.bool_]] | None = None
-) -> float:
+def _residual(pairs: Sequence[Pair], offset_s: float, instants: Sequence[NDArray[np.bool_]] | None = None) -> float:
     squares: list[float] = []
     for i, (estimate, reference) in enumerate(pairs):
         error = difference(estimate, reference, offset_s)
@@ -149,8 +169,9 @@ def _residual(
     return float(np.sqrt(np.mean(squares))) if squares else float("inf")
 
 
-def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> tuple[float, float]:
-    """The lag (s) with the largest sum of cross-correlations on a common grid, and the grid's step (s)."""
+def strongest_lag(pairs: Sequence[Pair]) -> Lag:
+    """The lag with the largest sum of cross-correlations on a common grid."""
+    step = max(pairs[0][0].interval_s, pairs[0][1].interval_s)
     (estimate_from, estimate_to), (reference_from, reference_to) = (_span(series.time_s) for series in pairs[0])
     length = max(estimate_to - estimate_from, reference_to - reference_from)
     step = max(step, length / _LARGEST_GRID)
@@ -163,7 +184,7 @@ def _strongest_lag(pairs: Sequence[tuple[Series, Series]], step: float) -> tuple
         spectrum += np.fft.rfft(theirs, size) * np.conj(np.fft.rfft(ours, size))
     lag = int(np.argmax(np.fft.irfft(spectrum, size)))
     lag = lag - size if lag > size // 2 else lag
-    return float(reference_from - estimate_from + lag * step), step
+    return Lag(float(reference_from - estimate_from + lag * step), step)
 
 
 def _span(time_s: Floats) -> tuple[float, float]:
@@ -183,7 +204,7 @@ def _standard(value: Floats) -> Floats:
     return np.where(good, (value - np.mean(value[good])) / np.std(value[good]), 0.0)
 
 
-def _refine(pairs: Sequence[tuple[Series, Series]], low: float, high: float) -> float:
+def _refine(pairs: Sequence[Pair], low: float, high: float) -> float:
     """The offset with the least residual within the bracket, by golden section to 10 µs."""
     instants = _instants(pairs, (low, high))
     a, b = low, high

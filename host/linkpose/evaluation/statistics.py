@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from linkpose.sensors.measurements import Floats
 
+_HIGH = 0.95  # the quantile of the magnitudes
+# The largest magnitudes are sorted out when there are so many times as many as needed. Twice of it doubles that memory,
+# and halves the number of times.
+_SURPLUS = 1.25
 # A verdict on σ: shares of errors within 2σ between which σ is right. A normal error has 95.4 %.
 HONEST_SHARE = (0.90, 0.99)
 _NORMAL_95 = 1.96  # 95 % of normal errors are within so many σ
@@ -28,30 +32,13 @@ class Statistics:
 
     @staticmethod
     def of(error: Floats, std: Floats | None = None, least_std: float = 0.0) -> Statistics:
-        """Of the finite errors (N,) and their σ (N,), NaN where unknown.
+        """Of the finite errors (N,), at least one, and their σ (N,), NaN where unknown.
 
         `least_std` is the resolution of σ in its file: a smaller one was rounded.
         """
-        known = np.isfinite(error)
-        errors = error[known]
-        size = np.abs(errors)
-        moments = (float(np.sqrt(np.mean(errors**2))), float(errors.mean()), float(size.max()))
-        base = Statistics(len(errors), *moments, float(np.quantile(size, 0.95)))
-        if std is None:
-            return base
-        paired = known & np.isfinite(std)
-        sigma = np.maximum(std[paired], least_std)
-        if not paired.any() or not (sigma > 0).all():
-            return base
-        normalised = np.abs(error[paired]) / sigma
-        return Statistics(
-            base.rows,
-            *moments,
-            base.p95,
-            nees=float(np.mean(normalised**2)),
-            within_2sigma=float(np.mean(normalised <= 2.0)),
-            sigma_ratio=float(np.quantile(normalised, 0.95)) / _NORMAL_95,
-        )
+        collected = Collector(len(error), least_std)
+        collected.add(error, std)
+        return collected.statistics()
 
     def verdict(self) -> str | None:
         """One sentence on σ; None where there is no σ."""
@@ -64,3 +51,97 @@ class Statistics:
         if self.within_2sigma > high:
             return f"σ is {1 / max(self.sigma_ratio, 0.01):.1f} times too large: {share}."
         return f"σ is right: {share}."
+
+
+class Collector:
+    """Collects errors block by block; its memory does not depend on the length of a block."""
+
+    def __init__(self, most: int, least_std: float = 0.0) -> None:
+        """Of at most `most` errors in all; `least_std` as for `Statistics.of`."""
+        self.rows = 0  # finite errors so far
+        self._least_std = least_std
+        self._sum = self._squares = 0.0
+        self._size = _Largest(most)
+        self._paired = self._within = 0
+        self._normalised_squares = 0.0
+        self._normalised = _Largest(most)
+        self._is_positive = True  # each σ
+
+    def add(self, error: Floats, std: Floats | None = None) -> None:
+        """The next errors (N,), and their σ (N,)."""
+        known = np.isfinite(error)
+        errors = error[known]
+        self.rows += len(errors)
+        self._sum += float(errors.sum())
+        self._squares += float((errors**2).sum())
+        self._size.add(np.abs(errors))
+        if std is None or not self._is_positive:
+            return
+        paired = known & np.isfinite(std)
+        sigma = np.maximum(std[paired], self._least_std)
+        self._is_positive = bool((sigma > 0).all())
+        if self._is_positive:
+            normalised = np.abs(error[paired]) / sigma
+            self._paired += len(normalised)
+            self._within += int(np.count_nonzero(normalised <= 2.0))
+            self._normalised_squares += float((normalised**2).sum())
+            self._normalised.add(normalised)
+
+    def statistics(self) -> Statistics:
+        """Of all errors so far, at least one."""
+        n, paired = self.rows, self._paired
+        base = Statistics(
+            n, float(np.sqrt(self._squares / n)), self._sum / n, self._size.largest, self._size.quantile()
+        )
+        if not paired or not self._is_positive:
+            return base
+        return replace(
+            base,
+            nees=self._normalised_squares / paired,
+            within_2sigma=self._within / paired,
+            sigma_ratio=self._normalised.quantile() / _NORMAL_95,
+        )
+
+
+class _Largest:
+    """The largest of many values: enough of them for the quantile _HIGH."""
+
+    def __init__(self, most: int) -> None:
+        """Of at most `most` values in all."""
+        self._needed = max(1, most - int(_HIGH * max(0, most - 1)))
+        self._held: Floats = np.empty(int(_SURPLUS * self._needed) + 1)  # one piece of memory for a whole run
+        self._size = self._count = 0
+        self._least = -np.inf  # smaller values are not among the largest
+
+    def add(self, values: Floats) -> None:
+        """The next values."""
+        self._count += len(values)
+        values = values[values > self._least]
+        while len(values):
+            taken = values[: len(self._held) - self._size]
+            self._held[self._size : self._size + len(taken)] = taken
+            self._size += len(taken)
+            values = values[len(taken) :]
+            if self._size == len(self._held):
+                self._sort_out()
+                values = values[values > self._least]
+
+    @property
+    def largest(self) -> float:
+        """Of all values."""
+        return float(self._held[: self._size].max())
+
+    def quantile(self) -> float:
+        """The quantile _HIGH of all values, linear between two of them."""
+        values = np.sort(self._held[: self._size])
+        place = _HIGH * (self._count - 1) - (self._count - len(values))
+        low = int(place)
+        high = min(low + 1, len(values) - 1)
+        return float(values[low] + (place - low) * (values[high] - values[low]))
+
+    def _sort_out(self) -> None:
+        """Keeps the largest values only."""
+        surplus = self._size - self._needed
+        self._held.partition(surplus)
+        self._held[: self._needed] = self._held[surplus:].copy()
+        self._size, self._least = self._needed, float(self._held[: self._needed].min())

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from linkpose import filters
-from linkpose.evaluation.errors import errors_of, scored, yaw_drift_deg_per_min
+from linkpose.evaluation.errors import Drift, errors_of, scored
 from linkpose.quantities import HEIGHT, PITCH, ROLL, YAW, Quantity, X, Y, Z, by_filter
 from linkpose.sensors.measurements import Floats
 from linkpose.simulation.link import LinkRun, LinkTruth
@@ -96,8 +96,10 @@ def _figures(estimate: Floats, columns: Sequence[str], truth: LinkTruth) -> dict
     theirs = {q: reference[q] * q.radians for q in ours}
     errors = errors_of(name, ours, theirs)
     figures = {key: of.statistics().rmse for key, of in scored(truth.time_s, errors, {}, is_planar=False).items()}
-    drift = yaw_drift_deg_per_min(truth.time_s, errors[YAW]) if YAW in errors else None
-    return figures if drift is None else figures | {"drift": drift}
+    drift = Drift()
+    if YAW in errors:
+        drift.add(truth.time_s, errors[YAW])
+    return figures if drift.deg_per_min is None else figures | {"drift": drift.deg_per_min}
 
 
 def _reference(truth: LinkTruth) -> dict[Quantity, Floats]:

@@ -22,16 +22,16 @@ ALL_SENSORS = Sensors.MPU6050 | Sensors.BMP180 | Sensors.IMU2 | Sensors.MAG
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a filter needs and offers. The estimator, the smoother's choice, scores and plots decide by these."""
+    """Requirements and features of a filter, used by the estimator, the choice of a smoother, scores and plots."""
 
     module: str  # below linkpose.filters
     cls: str
     sensors: Sensors  # without which it cannot run
-    # Of J2S (the vector from the joint centre to the sensor): "guess" runs with a rough one and estimates it.
+    # J2S, the vector from the joint centre to the sensor. "guess": a rough value suffices, the filter estimates it.
     j2s: Literal["none", "guess", "known"] = "none"
     needs_mice: bool = False
-    is_odometric: bool = False  # its pose counts from where the robot stood at the first sample
-    smoother: str | None = None  # class in linkpose.filters.smoother that takes its place over a whole recording
+    is_odometric: bool = False  # its pose is relative to the robot's pose at the first sample
+    smoother: str | None = None  # class in linkpose.filters.smoother that replaces it for a whole recording
 
     @property
     def is_barometric(self) -> bool:
@@ -60,12 +60,12 @@ NAMES = tuple(REGISTRY)
 
 
 def capabilities(name: str) -> Capabilities | None:
-    """The filter's capabilities; None of a name that is no filter here, such as `ekf` of `localize`."""
+    """The filter's capabilities; None for a name outside this registry, such as `ekf` of `localize`."""
     return REGISTRY.get(name)
 
 
 class Filter(Protocol):
-    """What every filter offers. State goes on from block to block, whatever their lengths."""
+    """Interface of every filter. The state continues from block to block; blocks may have any length."""
 
     @property
     def name(self) -> str: ...
@@ -76,15 +76,15 @@ class Filter(Protocol):
 
     @property
     def rejected(self) -> int:
-        """How many samples so far could not be used and were passed by prediction alone."""
+        """Number of samples so far that were unusable and bridged by prediction alone."""
 
     def process(self, block: Measurements) -> Floats:
-        """The estimate at each of the block's N samples: (N, len(columns)); NaN where there is none yet."""
+        """The estimate at each of the block's N samples: (N, len(columns)); NaN where unknown so far."""
 
 
 @runtime_checkable
 class FindsMiceScale(Protocol):
-    """What a filter offers beyond that when it compares the mice with the gyro."""
+    """Further interface of a filter that compares the mice with the gyro."""
 
     @property
     def scale_change(self) -> tuple[float, float]:
@@ -93,7 +93,7 @@ class FindsMiceScale(Protocol):
 
 @runtime_checkable
 class FindsJ2s(Protocol):
-    """What a filter offers beyond that when it estimates J2S."""
+    """Further interface of a filter that estimates J2S."""
 
     @property
     def j2s_m(self) -> tuple[Floats, Floats]:
@@ -103,7 +103,7 @@ class FindsJ2s(Protocol):
 def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_MICE) -> Filter:
     """A fresh filter for measurements of these sensors and of mice at ports 1 to `mice`.
 
-    Raises CannotRun where the rig or the sensors do not allow it, UnknownFilter for no such name.
+    Raises CannotRun where the rig or the sensors do not support it, UnknownFilter for an unknown name.
     """
     name = name.replace("_", "-")
     if name not in REGISTRY:
@@ -119,7 +119,7 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_
 
 
 def create_smoother(name: str, rig: Rig) -> Filter:
-    """The smoother that takes the place of a filter whose capabilities name one: it processes one whole recording."""
+    """The smoother named in a filter's capabilities; it replaces the filter and processes one whole recording."""
     cls = REGISTRY[name].smoother
     if cls is None:
         raise CannotRun(f"{name} has no smoother")
@@ -136,7 +136,7 @@ def _check_j2s(name: str, needs: Capabilities, rig: Rig) -> None:
 
 
 def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
-    """Raises CannotRun where there are no mice, or nobody knows where they sit, or a lone one lacks the gyro."""
+    """Raises CannotRun without mice, without their positions, or with a single mouse and no gyro."""
     if not mice:
         raise CannotRun("no mouse gives counts; if there is one, check its wiring")
     if not rig.mouse:
@@ -148,7 +148,7 @@ def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
 
 
 def warm_up(names: Iterable[str] = NAMES) -> None:
-    """Compiles the filters, or loads them compiled, so that no sample waits for a compiler."""
+    """Compile the filters, or load them from the cache, so that no sample waits for the compiler."""
     rig = Rig(mouse=(Mouse(0.1, 0.0), Mouse(-0.1, 0.0))).with_j2s((0.0, 0.0, 1.0))
     for name in names:
         create(name, rig).process(_two_samples_at_rest())

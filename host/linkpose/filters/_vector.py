@@ -129,6 +129,12 @@ def load(a: Floats) -> Vec:
 
 
 @inner
+def row(a: Floats, i: int) -> Vec:
+    """Row i of an (N, 3) array."""
+    return (a[i, 0], a[i, 1], a[i, 2])
+
+
+@inner
 def store(a: Floats, value: Vec) -> None:
     """Store a vector in the first three elements of an array."""
     a[0], a[1], a[2] = value
@@ -212,6 +218,12 @@ def turn_back_sym(r: Vec, s: Sym) -> Sym:
         m12 + r[1] * m10 - r[0] * m11,
         m22 + r[1] * m20 - r[0] * m21,
     )
+
+
+@inner
+def wrapped(angle: float) -> float:
+    """The angle (rad) in [−π, π)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @inner

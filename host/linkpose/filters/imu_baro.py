@@ -1,16 +1,16 @@
-"""`imu-baro`: inertial sensor and barometer fused in two steps, the paper's Method C.
+"""`imu-baro`: inertial sensor and barometer fused in two steps, Method C of [Link].
 
-First the tilt filter (Method B) gives the vertical acceleration Zᵀs_A − g. Then a Kalman filter over (h, v, b), the
-height, the vertical velocity and the bias of the vertical acceleration,
+The tilt filter (Method B) first gives the vertical acceleration Zᵀs_A − g. A Kalman filter then estimates the height h,
+the vertical velocity v and the bias b of the vertical acceleration,
 
     h_k = h_k−1 + Ts v_k−1 + ½ Ts² a_k,   v_k = v_k−1 + Ts a_k,   a_k = Zᵀs_A − g − b,   b a random walk,
 
-propagates it at the sampling rate and corrects it with each fresh pressure only, by the barometric formula of `baro`.
-Height over the joint's centre with J2S, relative to the start without.
+propagated at the sampling rate and updated with each fresh pressure by the barometric formula of `baro`. With J2S (the
+vector from the joint centre to the sensor) the height is relative to the joint centre, without J2S to the start.
 
-The covariance is that of the modelled noise. A wrong tilt makes an acceleration that lasts, and that shows in the
-innovation: its mean over half a second is the error of the height against the barometer's. Its square is added to the
-variance, and so is what the barometer itself is wrong by: the air and a start in motion, as in `baro`.
+The covariance covers the modelled noise. An error of the tilt causes a sustained acceleration, and the mean innovation
+over half a second measures the resulting error of the height. The variance of the output adds the square of this mean
+and the barometer's errors that are not noise (the air, a start in motion; see `baro`).
 """
 
 from __future__ import annotations
@@ -23,31 +23,41 @@ from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
+from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuSamples
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.baro import (
     START_S,
+    BaroParameters,
+    BaroSamples,
     StartState,
-    listen,
+    average_start,
     measure,
     metres_per_pascal,
     start_height,
     start_variance,
 )
-from linkpose.filters.tilt import TiltParameters, TiltState, advance, correct_by_accel, describe, keep, recall
+from linkpose.filters.tilt import (
+    TiltParameters,
+    TiltState,
+    advance,
+    correct_by_accel,
+    describe,
+    load_state,
+    store_state,
+)
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-_LASTING_S = 0.5  # over which the innovation is averaged
+_INNOVATION_S = 0.5  # s: averaging time of the innovation, some ten pressures; doubled, σ follows the error later
 
 
 class VerticalParameters(NamedTuple):
-    """What the filter assumes of the vertical acceleration."""
+    """Noise of the vertical acceleration, 1σ each. Doubled, the height follows the barometer more closely."""
 
-    accel_noise_m_s2: float = 0.3  # one sample's, with what a wrong tilt lets through
-    bias_walk_m_s2: float = 0.02  # of the bias in a second
-    bias_std_m_s2: float = 0.1  # of the bias at the start
-    gap_accel_m_s2: float = 5.0  # where the accelerometer did not see
+    accel_noise_m_s2: float = 0.3  # m/s² per sample: noise, and gravity that leaks in through the error of the tilt
+    bias_walk_m_s2: float = 0.02  # (m/s²)/√s: random walk of the bias
+    bias_std_m_s2: float = 0.1  # m/s²: bias at the start: a tilt error of 0.6°
+    gap_accel_m_s2: float = 5.0  # m/s²: unmeasured acceleration in a gap, that of hand motion
 
 
 class VerticalState(NamedTuple):
@@ -55,9 +65,9 @@ class VerticalState(NamedTuple):
 
     mean: Floats  # (3,) h (m), v (m/s), b (m/s²)
     covariance: Floats  # (6,) hh hv hb vv vb bb
-    lasting: Floats  # (3,) mean innovation (m), over how long it has been taken (s), time of the last (s)
-    other: Floats  # (1,) variance of the last barometric height besides the noise's (m²)
-    started: NDArray[np.bool_]  # (1,) whether the start has passed
+    innovation: Floats  # (3,) mean innovation (m), time over which it has been averaged (s), time of the last one (s)
+    other: Floats  # (1,) variance of the last barometric height from other causes than noise (m²)
+    started: NDArray[np.bool_]  # (1,) whether the first second is over
 
     @staticmethod
     def fresh() -> VerticalState:
@@ -65,7 +75,7 @@ class VerticalState(NamedTuple):
 
 
 class ImuBaroFilter:
-    """Method C over blocks of samples."""
+    """Method C of [Link] over blocks of samples."""
 
     name = "imu-baro"
     columns = ("imu_baro_height_m", "imu_baro_height_std_m", "imu_baro_roll_deg", "imu_baro_pitch_deg")
@@ -78,13 +88,11 @@ class ImuBaroFilter:
         self._tilt = TiltState.fresh()
         self._start = StartState.fresh()
         self._vertical = VerticalState.fresh()
-        self._imu = ImuCalibration.of(rig.imu)
-        self._j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
-        self._noise_Pa = rig.baro.pressure_noise_Pa
+        self._baro_parameters = BaroParameters.of(rig)
 
     @property
     def rejected(self) -> int:
-        """Samples so far whose accelerometer, gyro or time could not be used, and fresh pressures that could not."""
+        """Number of samples so far with an unusable accelerometer, gyro or time, and of unusable fresh pressures."""
         return int(self._tilt.rejected[0] + self._start.rejected[0])
 
     def process(self, block: Measurements) -> Floats:
@@ -94,20 +102,22 @@ class ImuBaroFilter:
         """
         out = np.empty((len(block), 4))
         _process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, block.pressure_Pa, block.baro_fresh,
-            self._imu, self.tilt_parameters, self.vertical_parameters, self._j2s, self._noise_Pa,
+            ImuSamples.of(block), BaroSamples.of(block),
+            self._baro_parameters, self.tilt_parameters, self.vertical_parameters,
             self._tilt, self._start, self._vertical, out,
         )  # fmt: skip
         return out
 
 
 @inner
-def propagate(mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: VerticalParameters) -> tuple[Vec, Sym]:
-    """One step of the model; `accel` is Zᵀs_A − g (m/s²), of no use where not `seen`."""
+def propagate(
+    mean: Vec, p: Sym, accel: float, is_measured: bool, step_s: float, q: VerticalParameters
+) -> tuple[Vec, Sym]:
+    """One step of the model; `accel` is Zᵀs_A − g (m/s²), ignored unless it `is_measured`."""
     h, v, b = mean
     t = step_s
-    a = accel - b if seen else 0.0
-    noise = q.accel_noise_m_s2 if seen else q.gap_accel_m_s2
+    a = accel - b if is_measured else 0.0
+    noise = q.accel_noise_m_s2 if is_measured else q.gap_accel_m_s2
     # F = [1 t −t²/2; 0 1 −t; 0 0 1] on (h, v, b)
     s = 0.5 * t * t
     hh, hv, hb, vv, vb, bb = p
@@ -127,7 +137,7 @@ def propagate(mean: Vec, p: Sym, accel: float, seen: bool, step_s: float, q: Ver
 
 @inner
 def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym]:
-    """Kalman correction with a measured height, in Joseph's form."""
+    """Kalman update with a measured height, in Joseph's form."""
     gain = 1.0 / (p[0] + variance)
     k = (p[0] * gain, p[1] * gain, p[2] * gain)
     innovation = height - mean[0]
@@ -146,76 +156,66 @@ def correct(mean: Vec, p: Sym, height: float, variance: float) -> tuple[Vec, Sym
 
 
 @inner
-def hear(lasting: Vec, innovation: float, time_s: float) -> Vec:
-    """The lasting innovation (m), over how long it has been taken and the time of the last (s), with one more."""
-    mean, span_s, last_s = lasting
+def average_innovation(average: Vec, innovation: float, time_s: float) -> Vec:
+    """Include an innovation (m) in the average: its mean (m), the averaging time and the time of the last one (s)."""
+    mean, span_s, last_s = average
     step_s = time_s - last_s
     if not step_s > 0.0:
-        return lasting
-    span_s = min(span_s + step_s, _LASTING_S)
+        return average
+    span_s = min(span_s + step_s, _INNOVATION_S)
     return (mean + min(step_s / span_s, 1.0) * (innovation - mean), span_s, time_s)
 
 
 @compiled
 def _process(
-    time_s: Floats,
-    accel: Floats,
-    gyro: Floats,
-    flags: NDArray[np.uint32],
-    pressure_Pa: Floats,
-    fresh: NDArray[np.bool_],
-    imu: ImuCalibration,
+    samples: ImuSamples,
+    baro: BaroSamples,
+    rig: BaroParameters,
     tilt_parameters: TiltParameters,
     q: VerticalParameters,
-    j2s: Vec,
-    noise_Pa: float,
     tilt_state: TiltState,
     start: StartState,
     vertical: VerticalState,
     out: Floats,
 ) -> None:
-    now = recall(tilt_state)
+    now = load_state(tilt_state)
     mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
-    lasting = vec.load(vertical.lasting)
+    innovation = vec.load(vertical.innovation)
     rejected = 0
-    for i in range(len(time_s)):
-        a = (accel[i, 0], accel[i, 1], accel[i, 2])
-        w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        before = now.time
-        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
+    for i in range(len(samples.time_s)):
+        before, time_s = now.time, samples.time_s[i]
+        now, has_force, force, has_rate = advance(now, samples, i, rig.imu)
         rejected += not (has_force and has_rate)
         if has_force:
-            now = correct_by_accel(now, force, tilt_parameters.accel_memory, imu)
-        measured = listen(time_s[i], a, flags[i], pressure_Pa[i], fresh[i], imu, start)
+            now = correct_by_accel(now, force, tilt_parameters.accel_memory, rig.imu)
+        has_pressure = average_start(samples, baro, i, rig.imu, start)
         known = start.pressure[1] > 0.0
         if known and not vertical.started[0]:
-            # At rest until the start has passed: the height is where the tilt puts it, known as well as the mean is.
-            variance = (noise_Pa * metres_per_pascal(start)) ** 2
-            mean = (start_height(start, j2s), 0.0, 0.0)
+            # During the first second the link is assumed at rest: the height follows from the mean tilt.
+            variance = (rig.noise_Pa * metres_per_pascal(start)) ** 2
+            mean = (start_height(start, rig.j2s), 0.0, 0.0)
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
-            vertical.other[0] = start_variance(start, mean[0], j2s)
-            lasting = (0.0, 0.0, time_s[i])
-            vertical.started[0] = time_s[i] - start.time[0] > START_S
+            vertical.other[0] = start_variance(start, mean[0], rig.j2s)
+            innovation = (0.0, 0.0, time_s)
+            vertical.started[0] = time_s - start.time[0] > START_S
         elif known:
             if now.time > before:
                 step_s = now.time - before
                 lifted = vec.dot(now.tilt, force) - GRAVITY
-                seen = has_force and step_s <= LONGEST_STEP_S
-                mean, covariance = propagate(mean, covariance, lifted, seen, step_s, q)
-            if measured:
-                height, noise, vertical.other[0] = measure(
-                    pressure_Pa[i], time_s[i], w, flags[i], imu, j2s, noise_Pa, start
-                )
-                lasting = hear(lasting, height - mean[0], time_s[i])
+                is_measured = has_force and step_s <= LONGEST_STEP_S
+                mean, covariance = propagate(mean, covariance, lifted, is_measured, step_s, q)
+            if has_pressure:
+                height, noise, vertical.other[0] = measure(samples, baro, i, rig, start)
+                innovation = average_innovation(innovation, height - mean[0], time_s)
                 mean, covariance = correct(mean, covariance, height, noise)
         out[i, 0] = mean[0] if known else np.nan
-        out[i, 1] = math.sqrt(covariance[0] + lasting[0] ** 2 + vertical.other[0]) if known else np.nan
+        out[i, 1] = math.sqrt(covariance[0] + innovation[0] ** 2 + vertical.other[0]) if known else np.nan
         if math.isnan(now.time):
             out[i, 2] = out[i, 3] = np.nan
         else:
-            _, out[i, 2], out[i, 3] = describe(now, imu.delay, j2s)
-    keep(tilt_state, now, rejected)
+            _, out[i, 2], out[i, 3] = describe(now, rig.imu.delay, rig.j2s)
+    store_state(tilt_state, now, rejected)
     for j in range(3):
-        vertical.mean[j], vertical.lasting[j] = mean[j], lasting[j]
+        vertical.mean[j], vertical.innovation[j] = mean[j], innovation[j]
     for j in range(6):
         vertical.covariance[j] = covariance[j]

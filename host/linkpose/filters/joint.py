@@ -1,22 +1,23 @@
-"""`joint`: the tilt filter with the joint's constraint as a second measurement, the paper's Method A.
+"""`joint`: the tilt filter with the joint's constraint as a second measurement, Method A of [Link].
 
-The socket is fixed to the ground, so the sensor's acceleration follows from its angular motion alone (9):
-a = ([ω̇×] + [ω×][ω×]) d, with d = J2S. With ω = s_G − n_G and [n×][n×] = 0 that becomes a second reference for gravity,
+The joint centre is fixed to the ground, so the angular motion determines the sensor's acceleration (9):
+a = ([ω̇×] + [ω×][ω×]) d, where d = J2S is the vector from the joint centre to the sensor. With ω = s_G − n_G and
+[n×][n×] = 0 this gives a second reference for gravity,
 
     z_c = s_A − ([ṡ_G×] + [s_G×][s_G×]) d = g Z + ε_c + n_A                               (10), (12)
     ε_c = [d×] ṅ_G + G n_G,   G = [(s_G×d)×] + [s_G×][d×]                                  (11)
 
 applied after Method B's correction: K = gP(g²P + B)⁻¹, Z ← Z + K(z_c − gZ), P ← (I − gK)P (13), (14).
 
-ṡ_G is the backward difference of second order over the last three samples, c₀ s_k + c₁ s_k−1 + c₂ s_k−2: the one of
-first order belongs to the middle of the step and lags by half a sample. The noise of its three readings is independent,
+ṡ_G is the second-order backward difference over the last three samples, c₀ s_k + c₁ s_k−1 + c₂ s_k−2; the first-order
+difference belongs to the middle of the step and lags by half a sample. The noise of the three readings is independent:
 
     B = (c₀D + G) Σ_G (c₀D + G)ᵀ + (c₁² + c₂²) D Σ_G Dᵀ + Σ_A,   D = [d×]
 
-where the paper takes ṅ_G as white of its own. The displacement is Zᵀd (15), the height of the sensor over the joint's
-centre, and its standard deviation that of `tilt`, with the innovation z_c/g − Z for the residual.
+whereas [Link] assumes ṅ_G to be white noise of its own. The displacement is Zᵀd (15), the height of the sensor above
+the joint centre. Its standard deviation is that of `tilt`, with the innovation z_c/g − Z as the residual.
 
-Source: the link paper, equations (9)-(15).
+Source: [Link], equations (9)-(15).
 """
 
 from __future__ import annotations
@@ -25,39 +26,39 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.errors import MissingJ2S
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration
+from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration, ImuSamples
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.tilt import (
-    Now,
+    Registers,
     TiltParameters,
     TiltState,
     acceleration,
     advance,
+    average_accel,
+    average_residual,
     correct_by_accel,
     describe,
-    hear,
-    hear_accel,
     height_std,
-    keep,
-    recall,
+    load_state,
+    store_state,
 )
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-# Method B's correction takes a part only in a tilt known to about a milliradian: its model reads the acceleration off
-# the tilt, and one that is a guess (a start in motion, a gap) would be confirmed by it for a minute.
+# rad²: trace of P above which Method B's update is omitted, about 1 mrad per axis. Its model derives the acceleration
+# from the tilt, so that it would confirm an uncertain tilt (a start in motion, a gap) for about a minute. Doubled, such
+# a start settles more slowly.
 _UNSETTLED_RAD2 = 2e-6
 
 
 class History(NamedTuple):
     """The two samples before the present one, for the derivative of the rate; changed in place."""
 
-    time: Floats  # (2,) s: one and two samples ago, NaN where there is none next to the present
+    time: Floats  # (2,) s: one and two samples ago, NaN where that sample has no usable rate
     rate: Floats  # (2, 3) rad/s
 
     @staticmethod
@@ -66,7 +67,7 @@ class History(NamedTuple):
 
 
 class JointFilter:
-    """Method A over blocks of samples."""
+    """Method A of [Link] over blocks of samples."""
 
     name = "joint"
     columns = ("joint_height_m", "joint_height_std_m", "joint_roll_deg", "joint_pitch_deg")
@@ -83,31 +84,29 @@ class JointFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far whose accelerometer, gyro or time could not be used."""
+        """Number of samples so far whose accelerometer, gyro or time was not usable."""
         return int(self.state.rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
-        The standard deviation is that of the modelled noise and of the error that the residuals show beyond it.
+        The standard deviation covers the modelled noise and the error estimated from the low-frequency residual.
         """
         out = np.empty((len(block), 4))
-        _process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._j2s, self._j2s_std, self.state, self._history, out,
-        )  # fmt: skip
+        joint = (self._j2s, self._j2s_std)
+        _process(ImuSamples.of(block), self._imu, self.parameters, joint, self.state, self._history, out)
         return out
 
 
 @inner
 def weights(h1: float, h2: float) -> Vec:
-    """c₀, c₁, c₂ (1/s) of the derivative at the last of three samples h2 and h1 apart (s)."""
+    """c₀, c₁, c₂ (1/s) of the derivative at the last of three samples; h1 and h2 (s): last and first interval."""
     return ((2.0 * h1 + h2) / (h1 * (h1 + h2)), -(h1 + h2) / (h1 * h2), h1 / (h2 * (h1 + h2)))
 
 
 @inner
 def gravity_reference(force: Vec, rate: Vec, derivative: Vec, d: Vec) -> Vec:
-    """z_c of (12): the force less the acceleration that the angular motion gives the sensor."""
+    """z_c of (12): the force minus the acceleration caused by the angular motion."""
     tangential = vec.cross(derivative, d)
     inward = vec.cross(rate, vec.cross(rate, d))
     return (
@@ -133,8 +132,8 @@ def reference_noise(rate: Vec, c: Vec, d: Vec, imu: ImuCalibration) -> Sym:
 
 
 @inner
-def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu: ImuCalibration) -> Now:
-    """(12)-(14), with the rate's derivative from the present and the two last rates by the weights `c`."""
+def correct_by_joint(now: Registers, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu: ImuCalibration) -> Registers:
+    """(12)-(14); `c` are the weights of the present and the two previous rates in the derivative."""
     rate, tilt = now.rate, now.tilt
     derivative = (
         c[0] * rate[0] + c[1] * w1[0] + c[2] * w2[0],
@@ -152,34 +151,29 @@ def correct_by_joint(now: Now, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Vec, imu
     change = vec.apply(now.covariance, vec.apply(inverse, innovation))
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
     covariance = vec.parallel(now.covariance, noise, inverse)
-    now = Now(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt), now.lasting)
-    return hear(now, innovation)
+    now = Registers(now.time, now.rate, now.held, tilt, covariance, acceleration(force, tilt), now.residual)
+    return average_residual(now, innovation)
 
 
 @compiled
 def _process(
-    time_s: Floats,
-    accel: Floats,
-    gyro: Floats,
-    flags: NDArray[np.uint32],
+    samples: ImuSamples,
     imu: ImuCalibration,
     parameters: TiltParameters,
-    d: Vec,
-    d_std: float,
+    joint: tuple[Vec, float],
     state: TiltState,
     history: History,
     out: Floats,
 ) -> None:
-    now = recall(state)
+    now = load_state(state)
+    d, d_std = joint
     t1, t2 = history.time[0], history.time[1]
     w1, w2 = vec.load(history.rate[0]), vec.load(history.rate[1])
     rejected = 0
-    for i in range(len(time_s)):
-        a = (accel[i, 0], accel[i, 1], accel[i, 2])
-        w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
+    for i in range(len(samples.time_s)):
+        now, has_force, force, has_rate = advance(now, samples, i, imu)
         rejected += not (has_force and has_rate)
-        # A comparison with NaN is False: no derivative across a gap or a reading that could not be used.
+        # A comparison with NaN is False: no derivative across a gap or an unusable reading.
         derivable = has_force and has_rate and now.time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S
         if has_force and not (derivable and vec.trace(now.covariance) > _UNSETTLED_RAD2):
             now = correct_by_accel(now, force, parameters.accel_memory, imu)
@@ -187,8 +181,8 @@ def _process(
             c = weights(now.time - t1, t1 - t2)
             now = correct_by_joint(now, force, c, w1, w2, d, imu)
         elif has_force:
-            now = hear_accel(now)
-        if now.time != t1:  # a repeated stamp brings nothing new
+            now = average_accel(now)
+        if now.time != t1:  # a repeated timestamp adds no sample
             t2, w2 = t1, w1
             t1, w1 = (now.time if has_rate else math.nan), now.rate
         if math.isnan(now.time):
@@ -196,7 +190,7 @@ def _process(
         else:
             out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, d)
             out[i, 1] = height_std(now, d, d_std)
-    keep(state, now, rejected)
+    store_state(state, now, rejected)
     history.time[0], history.time[1] = t1, t2
     for j in range(3):
         history.rate[0, j], history.rate[1, j] = w1[j], w2[j]

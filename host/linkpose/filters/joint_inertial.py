@@ -16,27 +16,39 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
     BG,
     ESTIMATE,
+    HEIGHT,
     MA,
+    PITCH,
     PSI,
+    ROLL,
+    SIGMA,
+    YAW,
     D,
     Floats,
     SensorErrors,
+    X,
+    Y,
     fresh_state,
     record_of,
-    roll_pitch_deg,
 )  # fmt: skip
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Imu, Rig
 
 _HYPOTHESES = (CALIBRATED, DATA_SHEET)
+# Of `mix`'s table, in the order of the columns below.
+_COLUMNS = np.array(
+    [
+        HEIGHT, SIGMA + HEIGHT, ROLL, PITCH, YAW, SIGMA + YAW, X, Y, HEIGHT,
+        SIGMA + ROLL, SIGMA + PITCH, SIGMA + X, SIGMA + Y, SIGMA + HEIGHT,
+    ]
+)  # fmt: skip
 
 
 class InertialParameters(NamedTuple):
@@ -46,15 +58,15 @@ class InertialParameters(NamedTuple):
     # (rad/s)/√s: twice the rate random walk of an MPU-6050 at constant temperature (its Allan deviation is 0.003 °/s at
     # 100 s), since it also warms up. Doubled, the heading drifts by 10 % more.
     gyro_bias_walk_rad_s: float = 2e-5
-    # (rad/s)/√s: the most, where the constraint leaves over more than its floor. Chosen on a real pendulum: a quarter
-    # of it costs 5 % of the tilt there.
+    # (rad/s)/√s: upper bound, used where the residual of the constraint exceeds its floor. Chosen on a real pendulum:
+    # a quarter of it costs 5 % of the tilt there.
     most_bias_walk_rad_s: float = 4e-4
     # 1/√s, share of J2S's initial σ: lets an error of the model leave J2S again. Doubled, the height's σ grows by 10 %.
     j2s_walk: float = 0.001
-    # Least share of ‖ω×d‖ that the constraint leaves over: the sampling error of a trapezoid at 100 Hz.
+    # Least residual of the constraint, as a share of ‖ω×d‖: the sampling error of a trapezoid at 100 Hz.
     least_residual: float = 0.0013
     first_residual: float = 0.03  # the same share before it has been measured
-    residual_time_s: float = 4.0  # over which it is measured (s): some swings
+    residual_time_s: float = 4.0  # averaging time of its measurement (s): some swings
     # Play of the joint, bending of the link. At 1 mm/s the NEES of an uncalibrated height is 2.4, at 2.5 mm/s 1.4.
     velocity_floor_m_s: float = 0.0025
     # Parts of rate and force that scale and misalignment in the state do not explain (nonlinearity, vibration).
@@ -63,11 +75,11 @@ class InertialParameters(NamedTuple):
     # Bounds of the measured correlation time of the free velocity and of the misfits (s): taps of 2 Hz to slow circles.
     least_correlation_s: float = 0.1
     most_correlation_s: float = 1.0
-    largest_bias_rad_s: float = 1.0  # beyond it the state is impossible and the filter begins anew
+    largest_bias_rad_s: float = 1.0  # a larger gyro bias is impossible and restarts the filter
     # Free velocity (unused with a joint).
     first_speed_m_s: float = 0.5  # σ before it has been measured
     least_speed_m_s: float = 0.1  # σ at rest
-    most_speed_m_s: float = 2.0  # σ of an arm that throws
+    most_speed_m_s: float = 2.0  # σ of a throwing arm
     swing_time_s: float = 1.0  # over which acceleration is integrated to measure σ (s)
     speed_memory_s: float = 2.0  # over which the result is averaged (s)
     # A squared velocity beyond this many times its expected mean square shows a covariance that is too small.
@@ -88,7 +100,7 @@ def declared(errors: SensorErrors, imu: Imu) -> SensorErrors:
 
 
 class JointInertialFilter:
-    """The filter over blocks of samples. J2S is known to the rig's standard deviation and refined from there."""
+    """The filter over blocks of samples. J2S starts from the rig's value and standard deviation and is refined."""
 
     name = "joint-inertial"
     columns = (
@@ -101,19 +113,23 @@ class JointInertialFilter:
         "joint_inertial_x_m",
         "joint_inertial_y_m",
         "joint_inertial_z_m",
+        "joint_inertial_roll_std_deg",
+        "joint_inertial_pitch_std_deg",
+        "joint_inertial_x_std_m",
+        "joint_inertial_y_std_m",
+        "joint_inertial_z_std_m",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
-        """Raises ValueError where the rig has no J2S, not even a guess with its `j2s_std_m`."""
+        """Raises ValueError where the rig has no J2S, not even a rough one with a large `j2s_std_m`."""
         if rig.joint.j2s_m is None:
-            raise ValueError("joint-inertial needs J2S, at least as a guess")
+            raise ValueError("joint-inertial needs J2S, at least a rough value")
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
         self._states = [
             fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
         ]
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def states(self) -> tuple[Any, Any]:
@@ -128,12 +144,12 @@ class JointInertialFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far that could not be used, or whose innovation the gate rejected."""
+        """Number of samples so far that were unusable or whose innovation the gate rejected."""
         return int(self.state.rejected)
 
     @property
     def restarts(self) -> int:
-        """How often the state became impossible and was set anew."""
+        """Number of restarts after an impossible state."""
         return int(self.state.restarts)
 
     @property
@@ -155,13 +171,13 @@ class JointInertialFilter:
         """(3,) as estimated so far, beyond the rig's calibration."""
         return np.asarray(self.state.nominal[BA:MA].copy())
 
-    def start_from(self, learned: JointInertialFilter, backwards: bool = False) -> None:
+    def start_from(self, other_filter: JointInertialFilter, backwards: bool = False) -> None:
         """Begin with another filter's estimates of J2S and of the sensor errors; `backwards`: with time reversed.
 
-        The gyro bias drifts: the other filter's estimate is that of the end, where the reversed time begins.
+        The gyro bias drifts. The other filter's estimate belongs to the end of the recording, where this one starts.
         """
         first = BG if backwards else BA
-        for own, other in zip(self.states, learned.states, strict=True):
+        for own, other in zip(self.states, other_filter.states, strict=True):
             own.start_mean[first:PSI] = other.nominal[first:PSI]
             own.start_covariance[first:PSI, first:PSI] = other.covariance[first:PSI, first:PSI]
             if backwards:
@@ -170,19 +186,11 @@ class JointInertialFilter:
                 own.start_covariance[:, BG:BA] *= -1
 
     def process(self, block: Measurements) -> Floats:
-        """Estimates at each of the N samples: (N, 9) in the order of `columns`; NaN where not known yet."""
-        n = len(block)
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = [np.empty(n, ESTIMATE) for _ in self._states]
-        for states, estimate in zip(self._states, estimates, strict=True):
-            process(
-                block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-                self._imu, self._record, states, estimate,
-            )  # fmt: skip
-        found = mix(*estimates)
-        return np.column_stack(
-            [
-                found["height"], found["height_std"], *roll_pitch_deg(found["tilt"]),
-                np.degrees(found["yaw"]), np.degrees(found["yaw_std"]), found["x"], found["y"], found["height"],
-            ]
-        )  # fmt: skip
+        """Estimates at each of the N samples: (N, 14) in the order of `columns`; NaN where unknown so far."""
+        samples = ImuSamples.of(block)
+        first, second = np.empty(len(block), ESTIMATE), np.empty(len(block), ESTIMATE)
+        process(samples, self._imu, self._record, self._states[0], first)
+        process(samples, self._imu, self._record, self._states[1], second)
+        mixed = np.empty((len(block), 2 * SIGMA))
+        mix(first, second, mixed)
+        return mixed.take(_COLUMNS, axis=1)

@@ -1,14 +1,15 @@
-"""`joint-inertial` over a whole recording: each estimate from what came before it and from what came after.
+"""`joint-inertial` over a whole recording: each estimate uses all samples, those before it and those after it.
 
-A fixed-interval smoother of two filters. One runs forward; the other runs from the end, where the same equations hold
-with t, ω, b_g and v of the opposite sign and s_A, Z, b_a, d and the matrices as they are: it is the same filter on the
-recording reversed. Both begin with what a pass ahead has found of J2S and of the sensors' errors, which are constants.
-At each sample the two are weighted by the inverse of their variances,
+A two-filter fixed-interval smoother. One filter runs forward, the other backward from the end. Backward, the same
+equations hold with the signs of t, ω, b_g and v reversed and s_A, Z, b_a, d and the matrices unchanged, so that the
+backward filter is the same filter on the reversed recording. A preceding pass estimates J2S (the vector from the joint
+centre to the sensor) and the sensor error parameters; both filters start from these. At each sample the two estimates
+are weighted with their inverse variances,
 
     h = (h_f/σ_f² + h_b/σ_b²) σ²,   1/σ² = 1/σ_f² + 1/σ_b²
 
-and σ is no less than what J2S alone leaves, which both have in common. What is kept is each filter's estimate, 64
-bytes a sample: 23 MB for an hour at 100 Hz.
+and σ is at least the part caused by J2S, an error that both filters have in common. Memory: both filters' estimates, 64
+bytes per sample, 23 MB for an hour at 100 Hz.
 
 Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE
 Trans. Automatic Control 14(4), 1969.
@@ -22,11 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.filters.inertial.process import LONGEST_HOLD_S
-from linkpose.filters.inertial.state import roll_pitch_deg
+from linkpose.filters.inertial.state import roll_pitch
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig, Vector
 from linkpose.wire.messages import SampleFlags
+
+_HEIGHT, _STD, _ROLL, _PITCH, _YAW, _X, _Y, _Z, _ROLL_STD, _PITCH_STD, _Z_STD = (
+    JointInertialFilter.columns.index(f"joint_inertial_{name}")
+    for name in (
+        "height_m", "height_std_m", "roll_deg", "pitch_deg", "yaw_deg", "x_m", "y_m", "z_m", "roll_std_deg",
+        "pitch_std_deg", "z_std_m",
+    )
+)  # fmt: skip
 
 
 class JointInertialSmoother:
@@ -36,13 +45,13 @@ class JointInertialSmoother:
     columns = JointInertialFilter.columns
 
     def __init__(self, rig: Rig) -> None:
-        """The rig must know J2S, be it as roughly as `j2s_std_m` says."""
+        """Raises ValueError where the rig has no J2S; `j2s_std_m` of the rig states how uncertain it is."""
         self._rig = rig
         self._ahead = JointInertialFilter(rig)
 
     @property
     def rejected(self) -> int:
-        """Samples that the pass ahead could not use, or whose innovation its gate refused."""
+        """Number of samples in the first pass that were unusable or whose innovation the gate rejected."""
         return self._ahead.rejected
 
     @property
@@ -51,9 +60,9 @@ class JointInertialSmoother:
         return self._ahead.j2s_m
 
     def process(self, block: Measurements) -> Floats:
-        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
+        """Estimates at each of the N samples: (N, 14) in the order of `columns`.
 
-        The block is the whole recording: it is not added to what came before.
+        The block is a whole recording; each call starts anew.
         """
         self._ahead = JointInertialFilter(self._rig)
         self._ahead.process(block)
@@ -71,7 +80,7 @@ def _reversed_rig(rig: Rig) -> Rig:
 
 
 def _reversed(block: Measurements) -> Measurements:
-    """The recording as it would have been, had time run backwards; only what the filter reads is turned."""
+    """The recording with time reversed. Only the arrays that the filter reads are changed."""
     at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
     accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
     accel_bit, gyro_bit = np.uint32(SampleFlags.ACCEL_SATURATED), np.uint32(SampleFlags.GYRO_SATURATED)
@@ -86,10 +95,10 @@ def _reversed(block: Measurements) -> Measurements:
 
 
 def _next_reading(time_s: Floats, values: Floats) -> NDArray[np.int64]:
-    """At each sample the one whose reading is to be held there when time runs backwards.
+    """Index, for each sample, of the sample whose reading applies to it with time reversed.
 
-    A reading that is held belongs to the first of its samples. Backwards it is therefore to last from there on, over
-    the samples before it, and not over those that repeat it.
+    A repeated reading was measured at the first of its samples. With time reversed it therefore holds over the samples
+    before that one, not over its repetitions.
     """
     n = len(time_s)
     own = np.arange(n)
@@ -100,26 +109,30 @@ def _next_reading(time_s: Floats, values: Floats) -> NDArray[np.int64]:
 
 
 def _combined(forward: Floats, backward: Floats, j2s_m: Floats, j2s_covariance: Floats) -> Floats:
-    """The mean of both, weighted by the inverse variances of the height; one filter's estimate where the other is NaN.
+    """The mean, weighted by the inverse variances of the height; where one filter is NaN, the other's estimate.
 
     The heading is that of the forward filter: both headings are relative to their own first sample, and the forward
     filter already uses the biases of the whole recording.
     """
-    both = np.flatnonzero(~np.isnan(forward[:, 4]) & ~np.isnan(backward[:, 4]))
+    both = np.flatnonzero(~np.isnan(forward[:, _YAW]) & ~np.isnan(backward[:, _YAW]))
     if len(both):
-        backward[:, 4] += forward[both[0], 4] - backward[both[0], 4]
-    forward = np.where(np.isnan(forward[:, 2:3]), backward, forward)
-    backward = np.where(np.isnan(backward[:, 2:3]), forward, backward)
-    before, after = forward[:, 1] ** 2, backward[:, 1] ** 2
+        backward[:, _YAW] += forward[both[0], _YAW] - backward[both[0], _YAW]
+    forward = np.where(np.isnan(forward[:, _ROLL : _ROLL + 1]), backward, forward)
+    backward = np.where(np.isnan(backward[:, _ROLL : _ROLL + 1]), forward, backward)
+    before, after = forward[:, _STD] ** 2, backward[:, _STD] ** 2
     share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
     tilt = share[:, None] * _tilt(forward) + (1 - share[:, None]) * _tilt(backward)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     common = np.einsum("ni,ij,nj->n", tilt, j2s_covariance, tilt)
-    height = share * forward[:, 0] + (1 - share) * backward[:, 0]
-    roll, pitch = roll_pitch_deg(tilt)
-    x, y = _horizontal(np.radians(roll), np.radians(pitch), np.radians(forward[:, 4]), j2s_m)
-    std = np.sqrt(np.maximum(share * before, common))
-    return np.column_stack([height, std, roll, pitch, forward[:, 4], forward[:, 5], x, y, height])
+    found = forward.copy()
+    roll, pitch = roll_pitch(tilt)
+    found[:, _ROLL], found[:, _PITCH] = np.degrees(roll), np.degrees(pitch)
+    for column in (_ROLL_STD, _PITCH_STD):
+        found[:, column] = np.hypot(share * forward[:, column], (1 - share) * backward[:, column])
+    found[:, _X], found[:, _Y] = _horizontal(roll, pitch, np.radians(forward[:, _YAW]), j2s_m)
+    found[:, _HEIGHT] = found[:, _Z] = share * forward[:, _HEIGHT] + (1 - share) * backward[:, _HEIGHT]
+    found[:, _STD] = found[:, _Z_STD] = np.sqrt(np.maximum(share * before, common))
+    return found
 
 
 def _horizontal(roll: Floats, pitch: Floats, yaw: Floats, d: Floats) -> tuple[Floats, Floats]:
@@ -131,5 +144,5 @@ def _horizontal(roll: Floats, pitch: Floats, yaw: Floats, d: Floats) -> tuple[Fl
 
 def _tilt(estimate: Floats) -> Floats:
     """Z (N, 3) from roll and pitch."""
-    roll, pitch = np.radians(estimate[:, 2:4]).T
+    roll, pitch = np.radians(estimate[:, [_ROLL, _PITCH]]).T
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])

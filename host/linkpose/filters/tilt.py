@@ -1,29 +1,30 @@
-"""`tilt`: the unconstrained tilt Kalman filter with an acceleration model, the paper's Method B.
+"""`tilt`: the unconstrained tilt Kalman filter with an acceleration model, Method B of [Link].
 
-Frames: n is fixed, Z up; s is the sensor's. The state is the tilt Z = Zˢ, n's Z axis seen in s (unit vector).
+Frames: n is fixed with Z up, s is the sensor frame. The state is the tilt Z = Zˢ, the Z axis of n in s (unit vector).
 
     accelerometer  s_A = g Z + a + n_A       gyro  s_G = ω + n_G                          (2), (3)
     acceleration   a_k = c_a a_k−1 + ε                                                    (4)
     process        Z_k = exp(−Ts [s_G ×]) Z_k−1 + w,   Q = −Ts² [Z×] Σ_G [Z×]              (5), (7)
     measurement    z_k = s_A,k − c_a a⁺_k−1 = g Z_k + v,   M = ⅓ c_a² ‖a⁺_k−1‖² I + Σ_A    (6), (8)
 
-with a⁺_k = s_A,k − g Z⁺_k. Two refinements over the paper's (5): the rate over a step is the mean of the rates at its
-ends, and the rotation is exact, where I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
+with a⁺_k = s_A,k − g Z⁺_k. Two refinements of (5): the rate over a step is the mean of the rates at its ends, and the
+rotation is exact, whereas I − Ts [s_G,k−1 ×] lags by half a sample (0.9° at 3 rad/s).
 
-P is the covariance of the modelled noise, the least of the error: it holds neither the gyro's residual bias nor an
-acceleration that lasts. What it leaves out shows in the residual s_A/g − Z⁺. Averaged over some seconds in a frame that
-does not turn, the noise vanishes, and so do the accelerations, since velocities are bounded: what lasts is the error of
-the tilt. Along Z, where a tilt does not err, it is the accelerometer's own, which the tilt takes over unseen across Z.
-With the lasting residual r, and m for what a calibration leaves of the accelerometer's error (both in g),
+P covers the modelled noise only, neither the residual gyro bias nor a sustained acceleration. The low-frequency
+residual r, the mean of s_A/g − Z⁺ over some seconds in a frame that does not rotate, estimates the rest: noise averages
+out, and so do accelerations, because velocities are bounded. Perpendicular to Z, r is the tilt error; along Z, it is
+the error of the accelerometer. An equal accelerometer error perpendicular to Z is not observable. With the residual
+error m of a calibrated accelerometer (r and m in g), the variances beyond P are
 
-    σ² = ½ (‖r‖² + (r·Z)²) + m²                          beyond P, on each axis across Z
+    σ² = ½ (‖r‖² + (r·Z)²) + m²                          about each axis perpendicular to Z
     std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)² + σ_d²           of the height Zᵀd
 
-where 2σ⁴ is of what a link that leans loses in height, 1 − cos, and σ_d of J2S. No estimate is changed by it.
+where 2σ⁴ is the second-order term (1 − cos) of an upright link and σ_d the standard deviation of d = J2S, the vector
+from the joint centre to the sensor. They change the standard deviation only, never the estimate.
 
-Sources: the link paper, equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and
-external acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas.
-61(8), 2012.
+Sources: [Link], equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and external
+acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas. 61(8),
+2012.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from linkpose.filters._imu import (
     LONGEST_GAP_S,
     Floats,
     ImuCalibration,
+    ImuSamples,
     read_accel,
     read_gyro,
     rotation_variance,
@@ -50,48 +52,52 @@ from linkpose.filters._vector import Sym, Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-_GUESS_RAD2 = 0.005  # a tilt whose variances sum to more is a guess: 3° either way
-_SWING_SAMPLES = 30.0  # that an acceleration lasts
-_LASTING_S = 5.0  # over which the residual is averaged: some swings of a hand, and less than the filter's memory
-_ACCEL_ERROR_M_S2 = 0.03  # that a calibration leaves, on each axis
+# rad²: a tilt whose variances add up to more (3° about each axis) is too uncertain for the acceleration model (4).
+_UNCERTAIN_TILT_RAD2 = 0.005
+# Correlation time of an acceleration, in samples. Doubled, a start in motion takes twice as long to settle.
+_SWING_SAMPLES = 30.0
+# s: averaging time of the residual. Longer than a few swings of a hand, shorter than the time constant of the filter.
+# Doubled, σ follows a change of the tilt error later.
+_RESIDUAL_S = 5.0
+_ACCEL_ERROR_M_S2 = 0.03  # m/s², 1σ per axis after `calibrate imu`; doubled, σ at rest doubles
 
 
-class Lasting(NamedTuple):
-    """The mean residual of the last seconds, in registers."""
+class MeanResidual(NamedTuple):
+    """The low-frequency residual, in registers."""
 
-    mean: Vec  # in g, turned along with the sensor
-    span: float  # over how long it has been taken (s)
-    share: float  # of the present sample
+    mean: Vec  # in g, in the sensor frame
+    span: float  # time over which it has been averaged (s)
+    share: float  # weight of the present sample
 
 
-class Now(NamedTuple):
-    """The state in registers, while a block is worked through."""
+class Registers(NamedTuple):
+    """The state in registers while a block is processed."""
 
     time: float  # of the last sample (s), NaN before the first
     rate: Vec  # last usable rate (rad/s)
-    held: float  # for how long that rate has had to do (s)
+    held: float  # time since that rate was measured (s)
     tilt: Vec  # Z
     covariance: Sym  # of Z
     accel: Vec  # a⁺ (m/s²)
-    lasting: Lasting
+    residual: MeanResidual
 
 
 class TiltParameters(NamedTuple):
-    """What the filter assumes."""
+    """Parameters of the acceleration model."""
 
-    accel_memory: float = 0.1  # c_a: how much of the last sample's acceleration is still there
+    accel_memory: float = 0.1  # c_a of (4): share of the acceleration that remains after one sample; value of [Link]
 
 
 class TiltState(NamedTuple):
-    """What the filter remembers from one block to the next; changed in place."""
+    """The state between two blocks; changed in place."""
 
-    time: Floats  # (2,) of the last sample, NaN before the first; how long the rate has been held (s)
+    time: Floats  # (2,) s: time of the last sample, NaN before the first; time since the rate was measured
     rate: Floats  # (3,) last usable rate (rad/s)
     tilt: Floats  # (3,) Z
     covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
     accel: Floats  # (3,) a⁺ (m/s²)
-    lasting: Floats  # (4,) mean residual (in g), over how long it has been taken (s)
-    rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time could not be used
+    residual: Floats  # (4,) mean residual (in g), time over which it has been averaged (s)
+    rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time was not usable
 
     @staticmethod
     def fresh() -> TiltState:
@@ -100,7 +106,7 @@ class TiltState(NamedTuple):
 
 
 class TiltFilter:
-    """Method B over blocks of samples. Without J2S there is no height, and its columns are NaN."""
+    """Method B of [Link] over blocks of samples. Without J2S the columns of the height are NaN."""
 
     name = "tilt"
     columns = ("tilt_height_m", "tilt_height_std_m", "tilt_roll_deg", "tilt_pitch_deg")
@@ -114,41 +120,38 @@ class TiltFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far whose accelerometer, gyro or time could not be used."""
+        """Number of samples so far whose accelerometer, gyro or time was not usable."""
         return int(self.state.rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
 
-        The standard deviation is that of the modelled noise and of the error that the residuals show beyond it.
+        The standard deviation covers the modelled noise and the error estimated from the low-frequency residual.
         """
         out = np.empty((len(block), 4))
-        _process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._j2s, self._j2s_std, self.state, out,
-        )  # fmt: skip
+        _process(ImuSamples.of(block), self._imu, self.parameters, self._j2s, self._j2s_std, self.state, out)
         return out
 
 
 @inner
 def start(force: Vec, rate: Vec, imu: ImuCalibration) -> tuple[Vec, Sym]:
-    """Tilt and its covariance from one sample: the direction of the force, with the doubt that a motion brings."""
+    """Tilt and its covariance from one sample: the direction of the force, with the variance of an unknown motion."""
     variance = (imu.accel_variance + unknown_accel(force, rate)) / GRAVITY**2
     tilt = vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0)
     return tilt, vec.cross_square(tilt, min(variance, 1.0))
 
 
 @inner
-def predict(now: Now, time_s: float, step_s: float, rate: Vec, held_s: float, imu: ImuCalibration) -> Now:
-    """(5) over `step_s`, from the rates at its ends, the last of which has been held for `held_s`."""
+def predict(now: Registers, time_s: float, step_s: float, rate: Vec, held_s: float, imu: ImuCalibration) -> Registers:
+    """(5) over `step_s`, from the rates at its ends; the last of them has been held for `held_s`."""
     half, before = 0.5 * step_s, now.rate
     rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
     tilt = vec.turn_back(rotation, now.tilt)
     covariance = vec.turn_back_sym(rotation, now.covariance)
     covariance = vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
-    span = min(now.lasting.span + step_s, _LASTING_S)
-    lasting = Lasting(vec.turn_back(rotation, now.lasting.mean), span, step_s / span)
-    return Now(time_s, rate, held_s, tilt, covariance, now.accel, lasting)
+    span = min(now.residual.span + step_s, _RESIDUAL_S)
+    residual = MeanResidual(vec.turn_back(rotation, now.residual.mean), span, step_s / span)
+    return Registers(time_s, rate, held_s, tilt, covariance, now.accel, residual)
 
 
 @inner
@@ -158,20 +161,20 @@ def acceleration(force: Vec, tilt: Vec) -> Vec:
 
 
 @inner
-def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -> Now:
-    """(6), (8): the force less the acceleration that the model (4) expects.
+def correct_by_accel(now: Registers, force: Vec, memory: float, imu: ImuCalibration) -> Registers:
+    """(6), (8): update with the force minus the acceleration that the model (4) predicts.
 
-    The model presumes a tilt that is known: a⁺ = s_A − gZ⁺ says nothing where Z⁺ is a guess (a start in motion, a gap).
-    Then the acceleration is unknown, and so is that of the samples around: M is that of an average over them.
+    The model requires a known tilt, since a⁺ = s_A − gZ⁺. After a start in motion or a gap the tilt is uncertain and
+    the acceleration unknown over a whole swing; M then includes its variance over the samples of that swing.
     """
     tilt, p = now.tilt, now.covariance
     expected = (memory * now.accel[0], memory * now.accel[1], memory * now.accel[2])
     variance = vec.dot(expected, expected) / 3.0 + imu.accel_variance
-    if vec.trace(p) > _GUESS_RAD2:
+    if vec.trace(p) > _UNCERTAIN_TILT_RAD2:
         variance += _SWING_SAMPLES * unknown_accel(force, now.rate) / 3.0
     variance /= GRAVITY**2
     i = vec.inverse(vec.plus_diagonal(p, variance))
-    # Equal noise on all axes commutes with the covariance: the gain is symmetric, and P⁺ = (M/g²) K.
+    # M is a multiple of I and commutes with P: the gain is symmetric, and P⁺ = (M/g²) K.
     gain = (
         p[0] * i[0] + p[1] * i[1] + p[2] * i[2],
         p[0] * i[1] + p[1] * i[3] + p[2] * i[4],
@@ -188,32 +191,32 @@ def correct_by_accel(now: Now, force: Vec, memory: float, imu: ImuCalibration) -
     change = vec.apply(gain, innovation)
     tilt = vec.unit((tilt[0] + change[0], tilt[1] + change[1], tilt[2] + change[2]))
     accel = acceleration(force, tilt)
-    return Now(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), accel, now.lasting)
+    return Registers(now.time, now.rate, now.held, tilt, vec.scaled(variance, gain), accel, now.residual)
 
 
 @inner
-def hear(now: Now, residual: Vec) -> Now:
-    """Takes a sample's residual (in g) into the lasting one."""
-    m, share = now.lasting.mean, now.lasting.share
+def average_residual(now: Registers, residual: Vec) -> Registers:
+    """Includes a sample's residual (in g) in the low-frequency residual."""
+    m, share = now.residual.mean, now.residual.share
     mean = (
         m[0] + share * (residual[0] - m[0]),
         m[1] + share * (residual[1] - m[1]),
         m[2] + share * (residual[2] - m[2]),
     )
-    lasting = Lasting(mean, now.lasting.span, share)
-    return Now(now.time, now.rate, now.held, now.tilt, now.covariance, now.accel, lasting)
+    average = MeanResidual(mean, now.residual.span, share)
+    return Registers(now.time, now.rate, now.held, now.tilt, now.covariance, now.accel, average)
 
 
 @inner
-def hear_accel(now: Now) -> Now:
-    """Takes a⁺ as the sample's residual."""
-    return hear(now, (now.accel[0] / GRAVITY, now.accel[1] / GRAVITY, now.accel[2] / GRAVITY))
+def average_accel(now: Registers) -> Registers:
+    """Includes a⁺/g in the low-frequency residual."""
+    return average_residual(now, (now.accel[0] / GRAVITY, now.accel[1] / GRAVITY, now.accel[2] / GRAVITY))
 
 
 @inner
-def height_std(now: Now, j2s: Vec, j2s_std: float) -> float:
-    """Standard deviation of the height (m): of the modelled noise, of what lasts in the residual, and of J2S."""
-    mean, z = now.lasting.mean, now.tilt
+def height_std(now: Registers, j2s: Vec, j2s_std: float) -> float:
+    """Standard deviation of the height (m) from P, the low-frequency residual and J2S: std in the module docstring."""
+    mean, z = now.residual.mean, now.tilt
     along, height = vec.dot(mean, z), vec.dot(z, j2s)
     variance = 0.5 * (vec.dot(mean, mean) + along * along) + (_ACCEL_ERROR_M_S2 / GRAVITY) ** 2
     beyond = variance * (vec.dot(j2s, j2s) + (2.0 * variance - 1.0) * height * height)
@@ -222,16 +225,16 @@ def height_std(now: Now, j2s: Vec, j2s_std: float) -> float:
 
 @inner
 def step_between(now: float, last: float) -> tuple[bool, float]:
-    """Whether time has gone on, and by how much (s), at most LONGEST_GAP_S."""
+    """Whether the time has increased, and by how much (s), at most LONGEST_GAP_S."""
     step = now - last
     return step > 0.0, min(step, LONGEST_GAP_S)
 
 
 @inner
-def describe(now: Now, delay_s: float, j2s: Vec) -> Vec:
-    """Height Zᵀd (15) (m), roll and pitch (°), at the time of the stamp.
+def describe(now: Registers, delay_s: float, j2s: Vec) -> Vec:
+    """Height Zᵀd (15) (m), roll and pitch (°) at the timestamp.
 
-    Readings that are `delay_s` late tell the tilt of then: it is turned on by the last rate.
+    The readings describe the motion `delay_s` earlier; the tilt is extrapolated with the latest angular rate.
     """
     tilt = now.tilt
     if delay_s > 0.0:
@@ -241,49 +244,48 @@ def describe(now: Now, delay_s: float, j2s: Vec) -> Vec:
 
 
 @inner
-def recall(state: TiltState) -> Now:
+def load_state(state: TiltState) -> Registers:
     """The state in registers."""
-    return Now(
+    return Registers(
         state.time[0],
         vec.load(state.rate),
         state.time[1],
         vec.load(state.tilt),
         vec.load_sym(state.covariance),
         vec.load(state.accel),
-        Lasting(vec.load(state.lasting), state.lasting[3], 0.0),
+        MeanResidual(vec.load(state.residual), state.residual[3], 0.0),
     )
 
 
 @inner
-def keep(state: TiltState, now: Now, rejected: int) -> None:
-    """The registers back into the state, and more rejected samples."""
+def store_state(state: TiltState, now: Registers, rejected: int) -> None:
+    """Store the registers in the state and add to the number of rejected samples."""
     state.time[0], state.time[1] = now.time, now.held
     for j in range(3):
         state.rate[j] = now.rate[j]
         state.tilt[j] = now.tilt[j]
         state.accel[j] = now.accel[j]
-        state.lasting[j] = now.lasting.mean[j]
+        state.residual[j] = now.residual.mean[j]
     for j in range(6):
         state.covariance[j] = now.covariance[j]
-    state.lasting[3] = now.lasting.span
+    state.residual[3] = now.residual.span
     state.rejected[0] += rejected
 
 
 @inner
-def advance(
-    now: Now, time_s: float, raw_accel: Vec, raw_gyro: Vec, flags: int, imu: ImuCalibration
-) -> tuple[Now, bool, Vec, bool]:
-    """Predicts up to a sample, or starts: the state, whether the force can be used, the force, whether the rate can."""
-    has_force, force = read_accel(raw_accel, flags, imu)
-    has_rate, rate = read_gyro(raw_gyro, flags, imu)
+def advance(now: Registers, samples: ImuSamples, i: int, imu: ImuCalibration) -> tuple[Registers, bool, Vec, bool]:
+    """Predict up to a sample, or start: the state, whether the force is usable, the force, whether the rate is."""
+    time_s, flags = samples.time_s[i], samples.flags[i]
+    has_force, force = read_accel(vec.row(samples.accel, i), flags, imu)
+    has_rate, rate = read_gyro(vec.row(samples.gyro, i), flags, imu)
     if math.isnan(now.time):
         if not (has_force and has_rate and math.isfinite(time_s)):
             return now, False, force, False
         tilt, covariance = start(force, rate, imu)
-        nothing = Lasting((0.0, 0.0, 0.0), 0.0, 1.0)
-        return Now(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt), nothing), True, force, True
-    goes_on, step_s = step_between(time_s, now.time)
-    if not goes_on:
+        none = MeanResidual((0.0, 0.0, 0.0), 0.0, 1.0)
+        return Registers(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt), none), True, force, True
+    has_passed, step_s = step_between(time_s, now.time)
+    if not has_passed:
         return now, False, force, False
     held = 0.0 if has_rate else now.held + step_s
     if not has_rate:
@@ -293,10 +295,7 @@ def advance(
 
 @compiled
 def _process(
-    time_s: Floats,
-    accel: Floats,
-    gyro: Floats,
-    flags: NDArray[np.uint32],
+    samples: ImuSamples,
     imu: ImuCalibration,
     parameters: TiltParameters,
     j2s: Vec,
@@ -304,19 +303,17 @@ def _process(
     state: TiltState,
     out: Floats,
 ) -> None:
-    now = recall(state)
+    now = load_state(state)
     rejected = 0
-    for i in range(len(time_s)):
-        a = (accel[i, 0], accel[i, 1], accel[i, 2])
-        w = (gyro[i, 0], gyro[i, 1], gyro[i, 2])
-        now, has_force, force, has_rate = advance(now, time_s[i], a, w, flags[i], imu)
+    for i in range(len(samples.time_s)):
+        now, has_force, force, has_rate = advance(now, samples, i, imu)
         rejected += not (has_force and has_rate)
         if has_force:
             now = correct_by_accel(now, force, parameters.accel_memory, imu)
-            now = hear_accel(now)
+            now = average_accel(now)
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
             out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, j2s)
             out[i, 1] = height_std(now, j2s, j2s_std)
-    keep(state, now, rejected)
+    store_state(state, now, rejected)

@@ -15,36 +15,37 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration
+from linkpose.filters._imu import ImuCalibration, ImuSamples
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
     BG,
     ESTIMATE,
+    HEIGHT,
+    ROLL,
+    YAW,
     Floats,
     SensorErrors,
     fresh_state,
     record_of,
-    roll_pitch_deg,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-# Without a joint little is observable of scale and misalignment: those of a good part are assumed, and any bias that a
-# part has at switch-on.
+# Without a joint, scale and misalignment are hardly observable: the values of a good part are assumed, with the full
+# range of biases at switch-on.
 _ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
 # Half the χ² of 21 sensor errors: 3.8σ of all of them at once.
 _LARGEST_DISTANCE = 150.0
-# Without a joint, what the models leave over shows in the bias only: its walk is that of a joint with much play.
+# Without a joint, unmodelled errors appear in the bias only: its walk is that of a joint with much play.
 PARAMETERS = InertialParameters(
     has_joint=0.0, gyro_bias_walk_rad_s=3e-4, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5
 )
 
 
 class TiltInertialFilter:
-    """The filter over blocks of samples. Without J2S there is no height, and its columns are NaN."""
+    """The filter over blocks of samples. Without J2S the columns of the height are NaN."""
 
     name = "tilt-inertial"
     columns = (
@@ -52,6 +53,10 @@ class TiltInertialFilter:
         "tilt_inertial_height_std_m",
         "tilt_inertial_roll_deg",
         "tilt_inertial_pitch_deg",
+        "tilt_inertial_roll_std_deg",
+        "tilt_inertial_pitch_std_deg",
+        "tilt_inertial_yaw_deg",
+        "tilt_inertial_yaw_std_deg",
     )
 
     def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
@@ -63,7 +68,6 @@ class TiltInertialFilter:
             declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu)
-        self._frozen = FrozenDetector()
 
     @property
     def state(self) -> Any:
@@ -72,12 +76,12 @@ class TiltInertialFilter:
 
     @property
     def rejected(self) -> int:
-        """Samples so far whose accelerometer, gyro or time could not be used."""
+        """Number of samples so far whose accelerometer, gyro or time was not usable."""
         return int(self.state.rejected)
 
     @property
     def restarts(self) -> int:
-        """How often the state became impossible and was set anew."""
+        """Number of restarts after an impossible state."""
         return int(self.state.restarts)
 
     @property
@@ -86,13 +90,14 @@ class TiltInertialFilter:
         return np.asarray(self.state.nominal[BG:BA].copy())
 
     def process(self, block: Measurements) -> Floats:
-        """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4)."""
-        dead = self._frozen.frozen(block.time_s, np.hstack([block.accel_m_s2, block.gyro_rad_s]))
-        estimates = np.empty(len(block), ESTIMATE)
-        process(
-            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, dead,
-            self._imu, self._record, self._states, estimates,
-        )  # fmt: skip
-        if not self._has_height:
-            estimates["height"] = estimates["height_std"] = np.nan
-        return np.column_stack([estimates["height"], estimates["height_std"], *roll_pitch_deg(estimates["tilt"])])
+        """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
+        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 8))
+        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
+        values, stds = estimates["value"], np.minimum(estimates["std"], np.pi)
+        height, height_std = values[:, HEIGHT], estimates["std"][:, HEIGHT]
+        table[:, 0], table[:, 1] = (height, height_std) if self._has_height else (np.nan, np.nan)
+        np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
+        np.degrees(stds[:, ROLL:YAW], out=table[:, 4:6])
+        np.degrees(values[:, YAW], out=table[:, 6])
+        np.degrees(stds[:, YAW], out=table[:, 7])
+        return table

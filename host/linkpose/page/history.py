@@ -69,7 +69,7 @@ class Replay:
         self._end = max(1, int(np.searchsorted(self._values[:, 0], time_s, side="right")))
 
     @property
-    def newest(self) -> Floats | None:
+    def newest(self) -> Floats:
         """The row (columns,) at this place."""
         row: Floats = self._values[self._end - 1]
         return row

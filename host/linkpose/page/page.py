@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import math
 import socket
 import threading
 from collections import deque
@@ -14,11 +13,12 @@ import numpy as np
 
 from linkpose import quantities
 from linkpose.errors import LinkposeError
+from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import Status
-from linkpose.presentation import Exclusions, RowReader, best_filter, fault_lines, working_sensors
-from linkpose.quantities import ANGLE, EXCLUDED, HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.presentation import Exclusions, fault_lines, working_sensors
+from linkpose.quantities import EXCLUDED
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -74,8 +74,6 @@ class Page:
         self.stopped = threading.Event()  # set when the user presses "stop"
         self._title, self._on_mark = title, on_mark
         self._columns = list(columns)
-        self._at = {column: at for at, column in enumerate(columns)}
-        self._rows = RowReader(columns)
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
         self._exclusions = Exclusions()
@@ -84,15 +82,9 @@ class Page:
         self._marks: list[float] = []
         self._changed = threading.Event()
         self._closing = threading.Event()
-        self._server = _serve(host, port or free_port(host), is_named=port is not None)
+        self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self._of_filter = quantities.by_filter(self._columns)
-        self._reference_at = [
-            (part.quantity, at)
-            for column, at in self._at.items()
-            if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
-        ]
-        self._follows_mice = any(EXCLUDED in of for of in self._of_filter.values())
+        self._follows_mice = any(EXCLUDED in of for of in quantities.by_filter(columns).values())
         self._build(rig, surroundings)
         self._updates = 0
         self._clients: set[int] = set()
@@ -131,20 +123,12 @@ class Page:
 
     def _build(self, rig: Rig, surroundings: Surroundings | None) -> None:
         from linkpose.page.panel import Panel
-        from linkpose.page.scene import ChainScene, LinkScene, RobotScene
 
-        server, filters = self._server, self._of_filter.values()
+        server = self._server
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         self._panel = Panel(server, self._columns, self._changed.set)
-        self._scene: LinkScene | RobotScene | ChainScene
-        if any(QW in of for of in filters):
-            self._scene = ChainScene(server)
-        elif any(HEADING in of for of in filters) and not any(HEIGHT in of for of in filters):
-            self._scene = RobotScene(server, surroundings)
-        else:
-            j2s = rig.joint.known_j2s_m
-            self._scene = LinkScene(server, None if j2s is None else np.array(j2s))
+        self._drawing = Drawing(server, self._columns, rig, surroundings)
         if self._replay is not None:
             self._build_player(self._replay)
         elif self._on_mark is not None:
@@ -198,7 +182,7 @@ class Page:
             for row in self._queue.popleft():
                 self._history.add(row)
                 if self._follows_mice:
-                    self._exclusions.follow(float(row[0]), self._rows.read(row.tolist()))
+                    self._exclusions.follow(float(row[0]), self._drawing.read(row))
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -213,10 +197,10 @@ class Page:
 
     def _draw(self) -> None:
         newest, status = self._history.newest, self._status
-        row = self._rows.read(newest.tolist()) if newest is not None else {}
+        row = self._drawing.read(newest) if newest is not None else {}
         if self._replay is not None:
             self._exclusions.follow(self._place_s, row)
-        name = self._panel.chosen or self._best(row)
+        name = self._panel.chosen or self._drawing.best(row)
         with self._server.atomic():
             self._draw_health(newest, status)
             if newest is not None and name is not None:
@@ -225,19 +209,10 @@ class Page:
 
     def _draw_estimates(self, newest: Floats, row: Any, name: str, status: Status) -> None:
         self._panel.draw_headline(row, name)
-        if status.j2s is not None and hasattr(self._scene, "set_j2s"):
-            self._scene.set_j2s(status.j2s.mean_m)
-        path = self._path(name) if self._scene.is_path_due else None
-        self._scene.draw(row, name, self._reference(newest), path)
+        j2s_m = status.j2s.mean_m if status.j2s is not None else None
+        self._drawing.draw(newest, row, name, self._history, j2s_m)
         if self._updates % CHART_INTERVAL == 0:
             self._panel.draw_charts(self._history.window(), name)
-
-    def _best(self, row: Any) -> str | None:
-        for quantity in (HEIGHT, HEADING, ROLL, ANGLE, QW):
-            name = best_filter(row, self._rows.filters, quantity)
-            if name is not None:
-                return name
-        return None
 
     def _draw_health(self, newest: Floats | None, status: Status) -> None:
         health, words = status.health, []
@@ -254,22 +229,6 @@ class Page:
         faults = fault_lines(health) if health is not None else []
         working = working_sensors(health) if health is not None else []
         self._panel.draw_health(self._title, "   ".join(words), working, faults + self._exclusions.lines())
-
-    def _reference(self, newest: Floats) -> dict[Quantity, float]:
-        return {quantity: float(newest[at]) for quantity, at in self._reference_at}
-
-    def _path(self, name: str) -> Floats | None:
-        """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path."""
-        of = self._of_filter.get(name, {})
-        if not {X, Y, HEADING} <= of.keys():
-            return None
-        rows = self._history.path()
-        names = [of[X], of[Y], of[HEADING], quantities.std_column(of[X]), quantities.std_column(of[Y])]
-        names += [quantities.covariance_column(name, X, Y), X.column, Y.column]
-        unknown = np.full(len(rows), math.nan)
-        path = np.column_stack([rows[:, self._at[n]] if n in self._at else unknown for n in names])
-        path[:, 5] = np.nan_to_num(path[:, 5])  # without its column: the axes of the ellipse are those of the map
-        return path
 
 
 def j2s_text(found: FoundJ2s) -> str:
@@ -306,7 +265,7 @@ def _try_to_bind(host: str, port: int) -> None:
         probe.bind(address)
 
 
-def _serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
+def serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
     """The server. It prints nothing: stdout is for results."""
     if is_named:  # viser itself would take the next free port, and wait forever for an address of another machine
         try:

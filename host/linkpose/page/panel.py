@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import html
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from linkpose import quantities
-from linkpose.presentation import Row, pose_text, signed_angle, with_std
+from linkpose.presentation import Row, angle_with_std, joint_angle, joint_name, pose_text, with_std
 from linkpose.quantities import (
     ANGLE,
-    CHAIN_ROTATION,
     HEADING,
     HEIGHT,
     HEIGHT1,
@@ -138,11 +136,12 @@ class Panel:
     def draw_headline(self, row: Row, name: str) -> None:
         """Shows the newest values of the filter `name`."""
         values = row.get(name, {})
+        angle = joint_angle(values)
         if HEIGHT in values:
             first, lines = with_std(*values[HEIGHT], "m", 4), [_angles(values)]
             caption = "height over the joint"
-        elif ANGLE in values or QW in values:
-            first, lines, caption = _joint_text(values), [], "joint angle"
+        elif angle is not None:
+            first, lines, caption = angle_with_std(*angle), [], joint_name(values)
         elif HEADING in values:
             first, *lines = pose_text(values)
             caption = "place and heading"
@@ -166,20 +165,8 @@ def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
     parts = []
     for quantity in (ROLL, PITCH, YAW):
         if quantity in values:
-            value, std = values[quantity]
-            bound = f" ±{std:.2g}°" if math.isfinite(value + std) else ""
-            parts.append(f"{quantity.name} {signed_angle(value)}{bound}")
+            parts.append(f"{quantity.name} {angle_with_std(*values[quantity])}")
     return "   ".join(parts)
-
-
-def _joint_text(values: Mapping[Quantity, tuple[float, float]]) -> str:
-    """The angle of a hinge, or the whole angle of a ball joint's rotation, with its standard deviation."""
-    if ANGLE in values:
-        value, std = values[ANGLE]
-    else:
-        w, *_ = (values[q][0] for q in CHAIN_ROTATION)
-        value, std = math.degrees(2 * math.acos(min(abs(w), 1.0))) if math.isfinite(w) else math.nan, values[QW][1]
-    return signed_angle(value) + (f" ±{std:.2g}°" if math.isfinite(value + std) else "")
 
 
 def with_gap_rows(rows: Floats) -> Floats:

@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from linkpose.page import geometry
-from linkpose.presentation import Row
-from linkpose.quantities import CHAIN_ROTATION, HEADING, PITCH, ROLL, YAW, Quantity, X, Y
+from linkpose.presentation import Row, best_filter
+from linkpose.quantities import CHAIN_ROTATION, HEADING, HEIGHT, PITCH, QW, ROLL, YAW, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
+from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     import viser
 
     from linkpose.localization.grid import GridMap
+    from linkpose.sensors.rig import Rig
 
 Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)
 _ELLIPSES = 12  # along a path
 _PATH_INTERVAL = 10  # redraws of the scene between two of the path, which is larger
-_LINK_M = 0.5  # length of each link of a chain, as drawn
+_UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
+_BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
 _FLOOR_M = 0.002  # of lines over the ground, so that the ground does not hide parts of them
 
 
@@ -73,10 +76,7 @@ class LinkScene:
         size = 0.07 * length
         self._sensor = scene.add_box("/link/sensor", _ORANGE, (size, 0.75 * size, 0.3 * size))
         self._axes = scene.add_frame("/link/axes", axes_length=2.5 * size, axes_radius=0.07 * size)
-        vertices, faces = geometry.cone()
-        self._cone = scene.add_mesh_simple(
-            "/link/cone", vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
-        )
+        self._cone = _add_cone(scene, "/link/cone")
         self._length_m = 0.0
         self._drawn_j2s: Floats | None = None
         self.set_j2s(j2s_m)
@@ -201,34 +201,83 @@ class RobotScene:
 
 
 class ChainScene:
-    """Two links at a joint: link 1 stands upright, link 2 has the estimated rotation relative to it.
+    """Two links at their joint, each with its sensor, and the cone of ±2σ of the joint's rotation about link 2.
 
-    The attitude of link 1 is not among the estimates of a chain, so the scene shows the motion of the joint alone.
+    Link 1 has the attitude that the best filter of its sensor estimates; without one it stands upright. Bars and
+    sensors lie as the rig states; a part of it that is unknown is drawn as if both sensors' z axes lay along straight
+    links. With a known J2S, the fixed joint stays in its place, otherwise the joint between the links does.
     """
 
     is_path_due = False
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        scene = server.scene
-        _ground(scene, 2.4)
-        scene.add_icosphere("/joint", 0.035, _BLACK, position=(0.0, 0.0, _LINK_M))
-        self._second = scene.add_frame("/second", show_axes=False, position=(0.0, 0.0, _LINK_M), visible=False)
-        for name, colour, z, sensor_z in (
-            ("/first", _GREY, 0.5 * _LINK_M, 0.5 * _LINK_M),
-            ("/second/link", _BLUE, 0.5 * _LINK_M, 0.7 * _LINK_M),
-        ):
-            scene.add_cylinder(f"{name}/bar", 0.02, _LINK_M, colour, position=(0.0, 0.0, z))
-            scene.add_box(f"{name}/sensor", _ORANGE, (0.08, 0.06, 0.05), position=(0.0, 0.0, sensor_z))
-        scene.add_frame("/second/axes", axes_length=0.2, axes_radius=0.006, position=(0.0, 0.0, _LINK_M))
-        server.initial_camera.position = (1.3, -1.9, 1.3)
-        server.initial_camera.look_at = (0.0, 0.0, 0.6)
+    def __init__(self, server: viser.ViserServer, rig: Rig) -> None:
+        scene, chain = server.scene, rig.chain
+        r1, r2 = np.array(chain.r1_m or _UNKNOWN_R1_M), np.array(chain.r2_m or _UNKNOWN_R2_M)
+        j2s = None if rig.joint.known_j2s_m is None or chain.r1_m is None else np.array(rig.joint.known_j2s_m)
+        end = _BEYOND_SENSOR * r1 if j2s is None else r1 - j2s  # of link 1, from the joint between the links
+        size = float(np.linalg.norm(end)) + _BEYOND_SENSOR * float(np.linalg.norm(r2))
+        self._fixed_m = None if j2s is None else end
+        self._base_m = np.array([0.0, 0.0, 1.1 * size])
+        _ground(scene, 2.4 * size)
+        self._joint = scene.add_frame("/joint", show_axes=False, position=self._base_m)
+        scene.add_icosphere("/joint/ball", 0.04 * size, _BLACK)
+        self._links = [
+            scene.add_frame(f"/joint/link{number}", show_axes=False, visible=number == 1) for number in (1, 2)
+        ]
+        for number, place, reach, colour in ((1, r1, end, _GREY), (2, r2, _BEYOND_SENSOR * r2, _BLUE)):
+            name, length = f"/joint/link{number}", float(np.linalg.norm(reach))
+            turn = geometry.turn_z_to(reach)
+            scene.add_cylinder(f"{name}/bar", 0.02 * size, length, colour, position=0.5 * reach, wxyz=turn)
+            scene.add_box(f"{name}/sensor", _ORANGE, (0.09 * size, 0.07 * size, 0.03 * size), position=place)
+            scene.add_frame(f"{name}/axes", axes_length=0.15 * size, axes_radius=0.005 * size, position=place)
+        if j2s is not None:
+            scene.add_icosphere("/joint/link1/fixed", 0.05 * size, _BLACK, position=end)
+        self._cone, self._reach_m = _add_cone(scene, "/joint/link2/cone"), float(np.linalg.norm(_BEYOND_SENSOR * r2))
+        self._cone.wxyz = geometry.turn_z_to(r2)
+        server.initial_camera.position = (0.9 * size, -1.5 * size, 1.0 * size)
+        server.initial_camera.look_at = (0.0, 0.0, 0.7 * size)
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
-        values = row.get(name, {})
-        rotation = np.array([values.get(q, (math.nan, math.nan))[0] for q in CHAIN_ROTATION])
-        self._second.visible = is_known = bool(np.isfinite(rotation).all())
+        nothing = (math.nan, math.nan)
+        first = best_filter(row, row, ROLL)
+        angles = [row[first].get(q, nothing)[0] if first is not None else math.nan for q in (ROLL, PITCH, YAW)]
+        attitude = geometry.attitude(*angles)
+        if not np.isfinite(attitude).all():
+            attitude = np.array([1.0, 0.0, 0.0, 0.0])
+        chain = best_filter(row, row, QW)
+        values = row[chain] if chain is not None else {}
+        rotation = np.array([values.get(q, nothing)[0] for q in CHAIN_ROTATION])
+        self._links[0].wxyz = attitude
+        if self._fixed_m is not None:
+            self._joint.position = self._base_m - geometry.turned(attitude, self._fixed_m)
+        self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
-            self._second.wxyz = rotation / np.linalg.norm(rotation)
+            self._links[1].wxyz = geometry.product(attitude, rotation / np.linalg.norm(rotation))
+        radius = geometry.cone_radius(self._reach_m, values.get(QW, nothing)[1]) if is_known else 0.0
+        self._cone.visible = radius > 0.0
+        if radius > 0.0:
+            self._cone.scale = (radius, radius, self._reach_m)
+
+
+def _add_cone(scene: viser.SceneApi, name: str) -> viser.MeshHandle:
+    """A cone of ±2σ, hidden until it is scaled."""
+    vertices, faces = geometry.cone()
+    return scene.add_mesh_simple(
+        name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
+    )
+
+
+def scene_of(
+    server: viser.ViserServer, filters: Iterable[Mapping[Quantity, str]], rig: Rig, surroundings: Surroundings | None
+) -> LinkScene | RobotScene | ChainScene:
+    """The scene for the quantities that the filters estimate."""
+    estimated = {quantity for of in filters for quantity in of}
+    if QW in estimated:
+        return ChainScene(server, rig)
+    j2s = rig.joint.known_j2s_m
+    if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
+        return RobotScene(server, surroundings)
+    return LinkScene(server, None if j2s is None else np.array(j2s))
 
 
 def _ground(scene: viser.SceneApi, size_m: float) -> None:

@@ -77,12 +77,12 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
         )  # fmt: skip
 
 
-def check_output(path: Path | None, force: bool) -> None:
+def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMATS) -> None:
     """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
     if path is None or path == STDOUT:
         return
-    if path.suffix.lower() not in FORMATS:
-        raise UnknownPicture(path, FORMATS)
+    if path.suffix.lower() not in formats:
+        raise UnknownPicture(path, formats)
     if path.exists() and not force:
         raise FileExists(path)
     if not path.absolute().parent.is_dir():

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from linkpose.evaluation.errors import Errors
-    from linkpose.evaluation.scores import Evaluation, Score
+    from linkpose.evaluation.scores import Evaluation
+    from linkpose.evaluation.scoring import Score
 
 _VECTOR_PARTS = {"position": ("x", "y", "z"), "velocity": ("vx", "vy")}
 _TABLE_ROW_INCHES = 0.21

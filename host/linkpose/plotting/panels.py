@@ -16,6 +16,10 @@ from linkpose.sensors.measurements import Floats
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from linkpose.evaluation.errors import Errors
+
+MOST_RATIO = 4.0  # of two filters' errors in one panel: the smaller one still takes a quarter of the height
+
 
 def has(sources: Sources, *wanted: Quantity) -> bool:
     """Whether any filter, or where there is none the reference, has one of these quantities."""
@@ -73,16 +77,13 @@ def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
         axes.set_ylim(low - margin, high + margin)
 
 
-def errors(axes: Axes, sources: Sources, name: str) -> None:
+def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> None:
     """Errors of a scored quantity with ±2σ about zero; the legend gives each filter's RMSE."""
     unit, order = "", list[str]()
     drawn: list[Floats] = []
     stds: list[Floats] = []
-    for track in sources.tracks:
-        score = sources.scores.get((track.file, track.name))
-        of = score.errors.get(name) if score else None
-        if of is None:
-            continue
+    scored = _scored(sources, name)[:1] if best_only else _scored(sources, name)
+    for track, of in scored:
         unit = unit_text(of.unit)
         text = f"{track.label} {of.statistics().rmse:.3g} {unit} rms"
         draw(axes, of.time_s, of.error, label=text, **line_style(track.name, track.file))
@@ -97,6 +98,18 @@ def errors(axes: Axes, sources: Sources, name: str) -> None:
     shade_unknown(axes, sources.tracks)
     finish(axes, f"{name} error ({unit})")
     legend_above(axes, best_first=order)
+
+
+def _scored(sources: Sources, name: str) -> list[tuple[Track, Errors]]:
+    """The drawn filters that have errors of a quantity, best first."""
+    scored = ((track, sources.scores.get((track.file, track.name))) for track in sources.tracks)
+    return [(track, score.errors[name]) for track, score in scored if score and name in score.errors]
+
+
+def hides_best(sources: Sources, name: str) -> bool:
+    """Whether the errors of other filters are so much larger that the best filter's ±2σ would look like a line."""
+    limits = [error_limit([of.error], [of.std] if of.std is not None else []) for _, of in _scored(sources, name)]
+    return len(limits) > 1 and max(limits) > MOST_RATIO * limits[0] > 0.0
 
 
 def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
@@ -124,12 +137,18 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
 
 
 def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> None:
-    """Limits the y axis to 99.5 % of the errors and 90 % of ±2σ, so that a short transient flattens nothing."""
+    """Limits the y axis to `error_limit` on both sides of zero, or above it for errors that are distances."""
+    limit = error_limit(errors, stds)
+    if limit > 0:
+        is_signed = bool(stds) or any(bool((value < 0).any()) for value in errors)
+        axes.set_ylim(-limit if is_signed else 0.0, limit)
+
+
+def error_limit(errors: Sequence[Floats], stds: Sequence[Floats]) -> float:
+    """Largest value to show: 99.5 % of the errors and 90 % of ±2σ, so that a short transient flattens nothing."""
     sizes = [np.quantile(known, 0.995) for value in errors if len(known := np.abs(value[np.isfinite(value)]))]
     sizes += [2 * np.quantile(known, 0.9) for std in stds if len(known := std[np.isfinite(std)])]
-    limit = 1.2 * max(map(float, sizes), default=0.0)
-    if limit > 0:
-        axes.set_ylim(-limit, limit)
+    return 1.2 * max(map(float, sizes), default=0.0)
 
 
 def note_hidden(sources: Sources) -> str:

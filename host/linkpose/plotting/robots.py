@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _MARKS = 12  # heading ticks and ellipses along a path
 _MOST_CELLS = 3000  # of a map, along a side
+_WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the whole width
 
 TimePanel = tuple[float, Callable[["Axes"], None]]
 
@@ -38,8 +39,22 @@ class Scene:
 
 def path_panel(sources: Sources, scene: Scene | None) -> Callable[[Axes], None] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
-    tracks = [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
-    return (lambda axes: _path(axes, tracks, scene or Scene())) if tracks else None
+    tracks = _with_path(sources)
+    wide = is_wide(sources, scene)
+    return (lambda axes: _path(axes, tracks, scene or Scene(), wide)) if tracks else None
+
+
+def is_wide(sources: Sources, scene: Scene | None) -> bool:
+    """Whether a path, without a map, extends so much further along x than along y that a square would be empty."""
+    if scene is not None and scene.grid is not None:
+        return False
+    tracks = _with_path(sources)
+    extents = [[np.ptp(v[np.isfinite(v)]) for v in (track.values[X], track.values[Y])] for track in tracks]
+    return bool(extents) and bool(max(e[0] for e in extents) > _WIDE_RATIO * max(e[1] for e in extents))
+
+
+def _with_path(sources: Sources) -> list[Track]:
+    return [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
 
 
 def time_panels(sources: Sources) -> list[TimePanel]:
@@ -55,7 +70,7 @@ def time_panels(sources: Sources) -> list[TimePanel]:
     return found
 
 
-def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
+def _path(axes: Axes, tracks: Sequence[Track], scene: Scene, wide: bool) -> None:
     _draw_scene(axes, scene)
     for track in reversed(tracks):
         style = line_style(track.name, track.file) if track.name else TRUTH
@@ -64,11 +79,12 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene) -> None:
         axes.plot(x[keep], y[keep], label=track.label, **style)
         _mark(axes, track, str(style["color"]))
     axes.set_aspect("equal", "datalim")
-    axes.set_box_aspect(1.0)
+    if not wide:
+        axes.set_box_aspect(1.0)
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
-    legend_above(axes, 3, [track.label for track in tracks])
+    legend_above(axes, 6 if wide else 3, [track.label for track in tracks])
 
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
@@ -118,7 +134,17 @@ def _mark(axes: Axes, track: Track, colour: str) -> None:
     if HEADING in track.values:
         angle = np.radians(track.values[HEADING][at])
         axes.quiver(
-            x[at], y[at], np.cos(angle), np.sin(angle), color=colour, angles="xy", width=0.007, scale=20, zorder=4
+            x[at],
+            y[at],
+            np.cos(angle),
+            np.sin(angle),
+            color=colour,
+            angles="xy",
+            units="inches",
+            width=0.04,
+            scale_units="inches",
+            scale=3.0,
+            zorder=4,
         )
     if X in track.std and Y in track.std:
         for i in at:

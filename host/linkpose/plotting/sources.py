@@ -9,7 +9,8 @@ import numpy as np
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
-from linkpose.evaluation.scores import Score, evaluate
+from linkpose.evaluation.scores import evaluate
+from linkpose.evaluation.scoring import Score
 from linkpose.evaluation.series import interval
 from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES

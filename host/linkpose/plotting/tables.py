@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 _WIDTH_INCHES = 10.0
 _INCHES = 1.05  # per unit of height
+_WIDE_PATH = 3.6  # height of a path above the panels
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +45,18 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A part of the figure: panels with a common time axis, and a path beside them for a robot."""
+    """A part of the figure: panels with a common time axis, and for a robot a path beside or above them."""
 
     panels: list[Panel]
     path: Callable[[Axes], None] | None = None
+    is_wide: bool = False  # the path lies above the panels, over the whole width
 
     @property
     def height(self) -> float:
         """Of the section, in units of _INCHES."""
         over_time = sum(panel.share for panel in self.panels)
+        if self.is_wide:
+            return over_time + _WIDE_PATH
         return max(over_time, 5.5) if self.path else over_time
 
 
@@ -83,10 +87,14 @@ def plot_tables(
 
 
 def _lay_out(part: SubFigure, section: Section) -> None:
-    """Panels below each other with one time axis; a path to the left of them."""
+    """Panels below each other with one time axis; a path to the left of them or above."""
     rows = len(section.panels)
     shares = [panel.share for panel in section.panels]
-    if section.path is not None:
+    above = int(section.is_wide)
+    if section.path is not None and above:
+        grid = part.add_gridspec(rows + 1, 1, height_ratios=[_WIDE_PATH, *shares])
+        section.path(part.add_subplot(grid[0, 0]))
+    elif section.path is not None:
         grid = part.add_gridspec(
             max(rows, 1), 2 if rows else 1, height_ratios=shares or [1.0], width_ratios=[1.35, 1.0][: 2 if rows else 1]
         )
@@ -95,7 +103,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         grid = part.add_gridspec(rows, 1, height_ratios=shares)
     first: Any = None
     for row, panel in enumerate(section.panels):
-        axes = part.add_subplot(grid[row, -1], sharex=first)
+        axes = part.add_subplot(grid[row + above, -1], sharex=first)
         first = first or axes
         panel.draw(axes)
         axes.tick_params(labelbottom=row == rows - 1)
@@ -111,6 +119,8 @@ def _link(sources: Sources) -> Section | None:
     if panels.has(sources, HEIGHT):
         found.append(Panel(3.0, lambda axes: panels.values(axes, sources, HEIGHT, legend=True)))
         if _scored(sources, HEIGHT):
+            if panels.hides_best(sources, "height"):
+                found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
             found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "height")))
         elif _estimated(sources, HEIGHT):
             found.append(Panel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
@@ -142,7 +152,7 @@ def _robot(sources: Sources, scene: robots.Scene | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
     path = robots.path_panel(sources, scene)
     over_time = [Panel(share, draw) for share, draw in robots.time_panels(sources)]
-    return Section(over_time, path) if path or over_time else None
+    return Section(over_time, path, robots.is_wide(sources, scene)) if path or over_time else None
 
 
 def _readings(table: Table) -> Section | None:

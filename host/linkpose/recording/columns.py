@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -69,5 +70,10 @@ def text(block: Block, layout: Layout) -> str:
     table = np.column_stack(
         [*head, part.pressure_Pa, part.baro_temp_degC, part.baro_fresh, *imu2, *mag, mice, part.flags],
     )
-    line = ",".join(code for _, code in _columns(layout)) + "\n"
-    return ((line * len(table)) % tuple(table.ravel().tolist())).replace("nan", "")
+    return ((_line(layout) * len(table)) % tuple(table.ravel().tolist())).replace("nan", "")
+
+
+@lru_cache(maxsize=16)
+def _line(layout: Layout) -> str:
+    """The format of a row."""
+    return ",".join(code for _, code in _columns(layout)) + "\n"

@@ -62,14 +62,14 @@ class CsvFile:
         self._write_beside()
         self.write(",".join(columns) + "\n" if plain else head(kind, metadata, columns))
 
-    def write(self, text: str) -> None:
-        """Adds whole lines. They are with the operating system at once: killing this process does not lose them.
+    def write(self, text: str | bytes) -> None:
+        """Adds whole lines, in UTF-8. The operating system has them at once: killing this process does not lose them.
 
         Raises CannotWrite when the file was removed or replaced: what is written then is lost with this process.
         """
         if self._has_name and os.fstat(self._fd).st_nlink == 0:
             raise CannotWrite(self.path, "it was removed while it was being written")
-        write_all(self._fd, self.path, text.encode())
+        write_all(self._fd, self.path, text.encode() if isinstance(text, str) else text)
 
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""

@@ -41,7 +41,7 @@ class ParquetTable:
         except ImportError as error:
             raise MissingLibrary("pyarrow", path) from error
         self._path, self._pyarrow = path, pyarrow
-        self._failures = (pyarrow.ArrowException, OSError)
+        self._failures = (pyarrow.ArrowException, OSError, UnicodeDecodeError)  # the last one for names of columns
         try:
             self._file = pyarrow.parquet.ParquetFile(path, memory_map=False)
             schema = self._file.schema_arrow
@@ -49,7 +49,7 @@ class ParquetTable:
             raise self._unreadable(error) from error
         self.names = [name for name in schema.names if not name.startswith(_INDEX)]
         if not self.names or not self._file.metadata.num_rows:
-            raise FileFormatError(path, f"{path} has no row; nothing was recorded")
+            raise self._without_rows()
         if len(set(self.names)) < len(self.names):
             raise FileFormatError(path, f"{path} has two columns of one name")
         own = (schema.metadata or {}).get(PARQUET_KEY)
@@ -76,10 +76,15 @@ class ParquetTable:
                     progress(min(1.0, line / total))
         except self._failures as error:
             raise self._unreadable(error) from error
+        if line == 1:  # a damaged file may state rows that it does not hold
+            raise self._without_rows()
 
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
+
+    def _without_rows(self) -> FileFormatError:
+        return FileFormatError(self._path, f"{self._path} has no row; nothing was recorded")
 
     def _unreadable(self, error: Exception) -> FileFormatError:
         return FileFormatError(self._path, f"{self._path} is no Parquet table of numbers: {error}")

@@ -38,7 +38,7 @@ from linkpose.sensors.devices import MAX_MICE, impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.wire.frames import OtherProtocol
-from linkpose.wire.messages import PROTOCOL_MAJOR, Hello, SampleFlags
+from linkpose.wire.messages import PROTOCOL_MAJOR, DeviceFamily, Hello, SampleFlags
 
 if TYPE_CHECKING:
     from linkpose.sensors.health import Change, HealthMonitor
@@ -69,15 +69,23 @@ class Recording:
     unusable: str = ""  # why no filter can use the recording; "" if one can
 
     @property
-    def dlpf(self) -> int | None:
-        """The MPU-6050's low-pass setting (DLPF_CFG, 0 to 6) in force; None if the file does not contain it."""
-        return _dlpf(self.metadata)
+    def imu_delay_s(self) -> float | None:
+        """Mean age (s) of the inertial readings at their timestamps; None if the file does not contain the setting of
+        the sensor's low-pass filter."""
+        return _imu_delay_s(self.metadata)
 
 
-def _dlpf(metadata: dict[str, Any]) -> int | None:
+def _imu_delay_s(metadata: dict[str, Any]) -> float | None:
     settings = metadata.get("settings")
-    value = settings.get("dlpf") if isinstance(settings, dict) else None
-    return value if isinstance(value, int) and 0 <= value < len(mpu6050.DLPF_DELAY_S) else None
+    dlpf = settings.get("dlpf") if isinstance(settings, dict) else None
+    if not isinstance(dlpf, int) or not 0 <= dlpf < mpu6050.DLPF_SETTINGS:
+        return None
+    devices = metadata.get("devices")  # absent in recordings of protocol 1, all of which are of an MPU-6050
+    first = devices[0] if isinstance(devices, list) and devices else None
+    family = first.get("family") if isinstance(first, dict) else None
+    if not isinstance(family, int) or family not in list(DeviceFamily):
+        family = DeviceFamily.MPU6050
+    return mpu6050.delay_s(dlpf, family)
 
 
 def load_recording(path: str | PathLike[str]) -> Recording:
@@ -145,9 +153,9 @@ class RecordingFile:
         return self._source.rate_hz
 
     @property
-    def dlpf(self) -> int | None:
-        """As Recording.dlpf."""
-        return _dlpf(self.metadata)
+    def imu_delay_s(self) -> float | None:
+        """As Recording.imu_delay_s."""
+        return _imu_delay_s(self.metadata)
 
     @property
     def sensors(self) -> list[str]:
@@ -428,7 +436,11 @@ class _CaptureSource:
         self._mouse_ports = self._samples = self._corrupt = self._lost = self._gaps = 0
         self.settings = self._find_settings()
         self.rate_hz = self.stated_rate_hz = float(self.settings.sample_rate_hz)
-        self.metadata: dict[str, Any] = {"device": str(path), "settings": self.settings.as_dict()}
+        self.metadata: dict[str, Any] = {
+            "device": str(path),
+            "settings": self.settings.as_dict(),
+            "devices": [{"family": family} for family in self.settings.imu_families],
+        }
         self.listed_sensors: list[str] = []
         others = ["imu2"] * self.settings.has_imu2 + ["baro"] + ["mag"] * self.settings.has_mag
         self.sensors = ["imu", *others, *(f"mouse{port}" for port in range(1, self._mouse_ports + 1))]

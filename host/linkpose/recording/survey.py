@@ -41,7 +41,7 @@ class Survey:
         self.gaps: list[RecordedGap] = []  # the first ones
         self.gap_count = self.lost = 0
         self.seen: set[str] = set()  # sensors that gave a value, usable or not
-        self.has_gyro = self.has_gyro2 = self.has_pressure = False  # a usable value
+        self.has_gyro = self.has_gyro2 = self.has_pressure = self.has_mag = False  # a usable value
         self.mice = 0  # ports up to the last that gave a count
         self._rate_hz = rate_hz
         self._rest = _Rest(max(2, round(_WINDOW_S * rate_hz)))
@@ -61,6 +61,7 @@ class Survey:
         self.has_gyro = self.has_gyro or bool(np.isfinite(checked.gyro_rad_s).any())
         self.has_gyro2 = self.has_gyro2 or checked.has_imu2
         self.has_pressure = self.has_pressure or bool(checked.baro_fresh.any())
+        self.has_mag = self.has_mag or bool(checked.mag_fresh.any())
         self._rest.add(checked)
 
     @property

@@ -41,9 +41,8 @@ def read_thinned(path: Path, progress: Progress | None = None) -> Table:
 
 def _thin(file: TableFile, parts: list[Part], rest: Iterator[Part]) -> Table:
     file.require("time_s")
-    share = file.share_read
-    total = sum(map(len, parts)) / share if share else math.inf
-    thinner = _Thinner(max(1, math.ceil(total / _REGULAR_ROWS)), len(file.names))
+    total = sum(map(len, parts)) / max(file.share_read, 1e-6)
+    thinner = Thinner(total, len(file.names))
     kept = []
     while parts:
         kept.append(thinner.thin(parts.pop(0)))
@@ -51,14 +50,14 @@ def _thin(file: TableFile, parts: list[Part], rest: Iterator[Part]) -> Table:
     return file.table(kept, thinner.whole)
 
 
-class _Thinner:
-    """Selects rows of consecutive parts."""
+class Thinner:
+    """Selects rows of consecutive parts: some at equal distances, and those with the extremes of each column."""
 
-    def __init__(self, distance: int, columns: int) -> None:
-        """Every row of number `distance` is kept, and the extremes of so many columns."""
-        self._distance = distance
-        windows = max(1, _EXTREME_ROWS // (2 * columns))
-        self._window = max(2, math.ceil(distance * _REGULAR_ROWS / windows))
+    def __init__(self, total: float, columns: int, share: float = 1.0) -> None:
+        """Of about `total` rows of so many columns; `share` of the usual number of rows is kept."""
+        self._distance = max(1, math.ceil(total / (share * _REGULAR_ROWS)))
+        windows = max(1, int(share * _EXTREME_ROWS) // (2 * columns))
+        self._window = max(2, math.ceil(total / windows))
         self._rows = self._gaps = self._lost = 0
         self._interval_s = 0.0
         self._last_s = math.nan

@@ -37,7 +37,7 @@ _IMU = slice(
 _IMU2 = slice(COUNT_FIELDS.index("accel2_x"), COUNT_FIELDS.index("gyro2_z") + 1)
 _MAG = slice(COUNT_FIELDS.index("mag_x"), COUNT_FIELDS.index("mag_z") + 1)
 _MAG_COUNT = COUNT_FIELDS.index("mag_count")
-_BARO = [COUNT_FIELDS.index(name) for name in ("baro_ut", "baro_up", "baro_count")]
+_BARO = slice(COUNT_FIELDS.index("baro_ut"), COUNT_FIELDS.index("baro_count") + 1)  # UT, UP, count
 
 # Rounding steps in one unit of each IMU column. `rint(value * steps) / steps` gives the same bits for any block length.
 _IMU_STEPS = 10.0 ** np.array(
@@ -66,6 +66,11 @@ class BoardSettings:
         """The settings in the metadata of a recording."""
         names = ("sample_rate_hz", "accel_range_g", "gyro_range_deg_s", "dlpf", "baro_oversampling")
         return {name: getattr(self, name) for name in names}
+
+    @property
+    def imu_delay_s(self) -> float:
+        """Mean age (s) of the first inertial sensor's readings at their timestamps."""
+        return mpu6050.delay_s(self.dlpf, self.imu_families[0])
 
     @property
     def has_imu2(self) -> bool:
@@ -156,7 +161,7 @@ class Converter:
             others |= self._convert_mag(raw.counts, flags)
         baro, fresh = self._convert_baro(raw.counts[:, _BARO], flags)
         return Measurements(
-            np.round(time_s, TIME_DECIMALS),
+            time_s.round(TIME_DECIMALS),
             np.ascontiguousarray(imu[:, :3]),
             np.ascontiguousarray(imu[:, 4:]),
             np.ascontiguousarray(imu[:, 3]),
@@ -184,12 +189,8 @@ class Converter:
 
     def _convert_mag(self, counts: Integers, flags: Integers) -> dict[str, Any]:
         """Field (N, 3), µT, each reading repeated until the next, and where a new reading arrived (N,)."""
-        valid, count = flags & MAG_VALID != 0, counts[:, _MAG_COUNT]
-        fresh = valid.copy()
-        fresh[1:] &= ~valid[:-1] | (count[1:] != count[:-1])
-        if len(flags):
-            fresh[0] &= count[0] != self._mag_count
-            self._mag_count = int(count[-1]) if valid[-1] else None
+        valid = flags & MAG_VALID != 0
+        fresh, self._mag_count = _new_readings(valid, counts[:, _MAG_COUNT], self._mag_count)
         field = np.rint(counts[:, _MAG] * self._mag_scale * _MAG_STEPS) / _MAG_STEPS
         return {"mag_uT": np.where(valid[:, None], field, np.nan), "mag_fresh": fresh}
 
@@ -201,24 +202,24 @@ class Converter:
         size = len(flags)
         if not size or not self._has_baro:
             return np.full((size, 2), np.nan), np.zeros(size, np.bool_)
-        valid, count = flags & BARO_VALID != 0, counts[:, 2]
-        fresh = valid.copy()
-        fresh[1:] &= ~valid[:-1] | (count[1:] != count[:-1])
-        fresh[0] &= count[0] != self._baro_count
-        if fresh.any():
-            readings = np.concatenate([self._baro, self._compensate(counts[fresh])])
-            baro = readings[np.cumsum(fresh)]
+        valid = flags & BARO_VALID != 0
+        fresh, self._baro_count = _new_readings(valid, counts[:, 2], self._baro_count)
+        if fresh.all():
+            baro = self._compensate(counts)
         else:
-            baro = np.repeat(self._baro, size, axis=0)
-        baro[~valid] = np.nan
-        self._baro, self._baro_count = baro[-1:].copy(), int(count[-1]) if valid[-1] else None
+            readings = np.concatenate([self._baro, self._compensate(counts[fresh])]) if fresh.any() else self._baro
+            baro = readings[np.cumsum(fresh)]
+            baro[~valid] = np.nan
+        self._baro = baro[-1:].copy()
         return baro, fresh & np.isfinite(baro[:, 0])
 
     def _compensate(self, counts: Integers) -> Floats:
         """Pressure (Pa) and temperature (degC) of readings (N, 2); NaN for an impossible one."""
         temperature, pressure = self.settings.barometer.compensate(counts[:, 0], counts[:, 1])
         decimals = 10.0**PRESSURE_DECIMALS
-        return np.column_stack([np.rint(pressure * decimals) / decimals, np.round(temperature, TEMPERATURE_DECIMALS)])
+        baro = np.empty((len(counts), 2))
+        baro[:, 0], baro[:, 1] = np.rint(pressure * decimals) / decimals, temperature.round(TEMPERATURE_DECIMALS)
+        return baro
 
     def _convert_mice(self, raw: RawSamples, flags: Integers) -> Floats:
         """Counts (N, ports, 2); NaN where a port has no mouse or its reading is invalid."""
@@ -227,3 +228,19 @@ class Converter:
             return np.empty((len(flags), 0, 2))
         valid = (flags[:, None] & _MOUSE_BITS[:ports] != 0) & (_PORTS[:ports] < raw.mouse_count[:, None])
         return np.where(valid[:, :, None], raw.mice[:, :ports], np.nan)
+
+
+def _new_readings(
+    valid: NDArray[np.bool_], count: Integers, before: int | None
+) -> tuple[NDArray[np.bool_], int | None]:
+    """Where (N,) a sensor's count of readings shows a new one, and the last count; None where it was not valid.
+
+    `before` is the last count of the preceding block.
+    """
+    if not len(valid):
+        return valid, before
+    fresh = valid.copy()
+    if len(valid) > 1:
+        fresh[1:] &= ~valid[:-1] | (count[1:] != count[:-1])
+    fresh[0] &= count[0] != before
+    return fresh, int(count[-1]) if valid[-1] else None

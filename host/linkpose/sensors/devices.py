@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from enum import IntFlag
 from typing import NamedTuple
 
@@ -143,6 +144,33 @@ def mouse_remarks(hello: Hello) -> Iterator[str]:
         for lack, text in _LACKS.items():
             if mouse.lacks & lack:
                 yield f"The mouse at port {port} {text.format(counts_per_mm=mouse.counts_per_mm)}"
+
+
+MOUSE_COUNTS = 255  # that a packet of a PS/2 mouse holds: 9 bits, two's complement
+USUAL_POLL_S = 0.0075  # a poll of usual mice with its margin: firmware/README.md, "Mice"
+# Above it a mouse's counts are no limit in practice: most office sensors lose the surface at 0.3 to 0.5 m/s, good ones
+# at 1 m/s. Twice of it warns of mice that are fast enough.
+ENOUGH_SPEED_M_S = 1.0
+
+
+def mouse_speed_limit(counts_per_m: float, sample_rate_hz: float, poll_s: float = 0.0) -> float:
+    """Speed (m/s) above which the counts of a mouse overflow between two polls.
+
+    A round of polls takes whole ticks; `poll_s` is the longest poll measured, 0 if unknown.
+    """
+    ticks = math.ceil(max(poll_s, USUAL_POLL_S) * sample_rate_hz - 1e-9)
+    return MOUSE_COUNTS * sample_rate_hz / (ticks * counts_per_m)
+
+
+def slow_mouse_remarks(counts_per_m: Sequence[float], sample_rate_hz: float, poll_s: float = 0.0) -> Iterator[str]:
+    """One sentence for each mouse, port 1 first, whose counts overflow below ENOUGH_SPEED_M_S."""
+    for port, counts in enumerate(counts_per_m, 1):
+        limit = mouse_speed_limit(counts, sample_rate_hz, poll_s)
+        if limit < ENOUGH_SPEED_M_S:
+            yield (
+                f"Mouse {port} counts {counts:.0f} per metre: above {limit:.2f} m/s its counts overflow and movement "
+                "is lost. Drive slower, or use a mouse with fewer counts per metre"
+            )
 
 
 def check_hello(hello: Hello) -> None:

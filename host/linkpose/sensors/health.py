@@ -32,6 +32,10 @@ FROZEN_REPEATS = 10  # for sensors slower than 50 Hz
 STUCK_S = 0.5
 STUCK_REPEATS = 25
 LIVELY_REPEATS = 5  # an axis that repeats so often is too quiet to compare another axis with it
+# A block of at least so many samples is tested as a whole for repeats that matter: more than STUCK_REPEATS, so that the
+# repeats at its end began in it. With twice of it, more blocks are followed sample by sample.
+_LIVELY_BLOCK = 64
+_SHORT_RUN = 8  # repeats of an axis at the end of the block before, up to which a block is tested as a whole
 # BMP180: noise 3 to 6 Pa, one new reading in 30 ms.
 BARO_FROZEN_S = 1.0
 BARO_FROZEN_REPEATS = 20
@@ -76,6 +80,7 @@ _REASON = {
     Cause.FROZEN: "repeats the same reading",
     Cause.OUT_OF_RANGE: "gives impossible readings",
     Cause.STUCK: "repeats one axis while the others change",
+    Cause.STARTING: "is still being set up",
 }
 _WIRING = "Check its wiring and its supply"
 _POWER = "Unplug the board and plug it in again; if it happens again, check the wiring or replace the sensor"
@@ -212,25 +217,47 @@ class _Repeats:
         """Whether each value (N, K) equals the one before."""
         before = np.full((1, values.shape[1]), np.nan) if self._last is None else self._last
         self._last = values[-1:].copy()
-        return np.asarray(values == np.concatenate([before, values[:-1]]))
+        return np.asarray(values == (before if len(values) == 1 else np.concatenate([before, values[:-1]])))
 
     def restart(self, time_s: Floats) -> None:
         """As `run` of a block in which nothing repeats."""
         self._count, self._begin_s = np.zeros(1, np.int64), time_s[-1:].copy()
+
+    def forget(self) -> None:
+        """As if no block came before, but for the last value."""
+        self._count = self._begin_s = None
+
+    @property
+    def longest(self) -> int:
+        """How often the last value of any column has repeated."""
+        return 0 if self._count is None else int(self._count.max())
 
     def run(self, same: Bools, time_s: Floats) -> tuple[NDArray[np.int64], Floats]:
         """`same` (N, K): the sample continues the run of the one before."""
         size, columns = same.shape
         count = self._count if self._count is not None else np.zeros(columns, np.int64)
         begin_s = self._begin_s if self._begin_s is not None else np.full(columns, np.nan)
-        rows = np.arange(size)[:, None]
-        start = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
-        inside = start >= 0
-        counts = np.where(inside, rows - start, rows + 1 + count)
-        begins = np.where(inside, time_s[start], begin_s)
+        if size == 1:  # live
+            counts, begins = np.where(same, count + 1, 0), np.where(same, begin_s, time_s)
+        else:
+            rows = np.arange(size)[:, None]
+            start = np.maximum.accumulate(np.where(same, -1, rows), axis=0)
+            inside = start >= 0
+            counts = np.where(inside, rows - start, rows + 1 + count)
+            begins = np.where(inside, time_s[start], begin_s)
         self._count, self._begin_s = counts[-1], begins[-1]
         with np.errstate(invalid="ignore"):
             return counts, time_s[:, None] - begins
+
+
+def _has_run(same: Bools, length: int) -> bool:
+    """Whether any column of `same` (N, …) is True for at least `length` rows in a row."""
+    done = 1  # same[i] is now True where that many rows from i on are
+    while done < length and same.any():
+        step = min(done, length - done)
+        same = same[: len(same) - step] & same[step:]
+        done += step
+    return bool(same.any())
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,12 +311,34 @@ class _Imu:
             for each in (self._axes, self._stuck, self._burst):
                 each.restart(time_s)
             return self._judge(codes, values, temp, flags)
+        if self._is_lively(same):
+            self._follow_end(same, time_s)
+            return self._judge(codes, values, temp, flags)
         counts, _ = self._axes.run(same, time_s)
         stuck_s = self._check_axes(same, counts, time_s)
         repeats, held_s = self._burst.run(np.asarray(same.all(axis=1))[:, None], time_s)
         codes[stuck_s.max(axis=1, initial=0.0) >= STUCK_S - 1e-6] = Cause.STUCK
         codes[(repeats[:, 0] >= FROZEN_REPEATS) & (held_s[:, 0] >= FROZEN_S - 1e-6)] = Cause.FROZEN
         return self._judge(codes, values, temp, flags)
+
+    def _is_lively(self, same: Bools) -> bool:
+        """Whether nothing repeats so often, in this block and the ones before, that it can be stuck or frozen.
+
+        `same` (N, 6): each value equals the one before. The test takes a tenth of the time of following all repeats.
+        """
+        if len(same) < _LIVELY_BLOCK or self._axes.longest > _SHORT_RUN or self._burst.longest > 1:
+            return False
+        all_same = np.asarray(same.all(axis=1))
+        return not (_has_run(same, STUCK_REPEATS - _SHORT_RUN) or _has_run(all_same, FROZEN_REPEATS - 1))
+
+    def _follow_end(self, same: Bools, time_s: Floats) -> None:
+        """The repeats at the end of a lively block: all of them began within its last rows."""
+        same, time_s = same[-_LIVELY_BLOCK:], time_s[-_LIVELY_BLOCK:]
+        for each in (self._axes, self._stuck, self._burst):
+            each.forget()
+        counts, _ = self._axes.run(same, time_s)
+        self._check_axes(same, counts, time_s)
+        self._burst.run(np.asarray(same.all(axis=1))[:, None], time_s)
 
     def _judge(self, codes: Codes, values: Floats, temp: Floats, flags: NDArray[np.integer[Any]]) -> Codes:
         """Add to `codes` what a sample shows by itself."""

@@ -38,9 +38,23 @@ def temperature_scale(family: int) -> tuple[float, float]:
     return TEMPERATURE.get(DeviceFamily(family), (0.0, math.nan))
 
 
-# Group delay through the low-pass filter at DLPF_CFG 0 to 6, the slower of the two sensors; the other is at most 1 ms
-# faster. Source: RM-MPU-6000A 4.3 "Configuration". The successors' filters are within 1 ms of it (PS-MPU-6500A 4.2).
-DLPF_DELAY_S = (0.00098, 0.0020, 0.0030, 0.0049, 0.0085, 0.0138, 0.0190)
+# Group delay (s) through the low-pass filter at DLPF_CFG 0 to 6, of the slower of accelerometer and gyro; the other is
+# at most 1 ms faster. Sources: RM-MPU-6000A 4.3; RM-MPU-6500A and RM-MPU-9250A, registers 0x1A and 0x1D. The ICM-20600
+# family's data sheets state the bandwidths of the MPU-6500 and no delays.
+_DELAY_6050_S = (0.00098, 0.0020, 0.0030, 0.0049, 0.0085, 0.0138, 0.0190)
+_DELAY_6500_S = (0.00188, 0.0029, 0.0039, 0.0059, 0.0099, 0.01785, 0.03348)
+_DELAYS_S = {DeviceFamily.MPU6500: _DELAY_6500_S, DeviceFamily.ICM20600: _DELAY_6500_S}
+DLPF_SETTINGS = len(_DELAY_6050_S)
+# The sensor samples at 1 kHz by its own clock: at a tick its latest sample is 0 to 1 ms old.
+MEAN_AGE_S = 0.0005
+
+
+def delay_s(dlpf: int, family: int = DeviceFamily.MPU6050) -> float:
+    """Mean age (s) of a reading at its timestamp, with DLPF_CFG 0 to 6: filter delay and age of the sample.
+
+    An unknown chip is assumed to filter as an MPU-6050.
+    """
+    return _DELAYS_S.get(DeviceFamily(family), _DELAY_6050_S)[dlpf] + MEAN_AGE_S
 
 
 SELF_TEST_LIMIT = 0.14  # deviation from the factory's response, MPU-6050 (data sheet, 6.1 and 6.2)
@@ -53,7 +67,8 @@ def self_test_limit(result: SelfTestResult) -> float:
 
 
 def self_test_deviation(result: SelfTestResult) -> dict[str, float | None]:
-    """Relative deviation of each axis's self-test response from the factory's; None if no factory response is stored.
+    """Relative deviation of each axis's self-test response from the factory's; None if no factory response is stored
+    or the chip is unknown.
 
     Sources: MPU-6050: RM-MPU-6000A 4.1, readings at 8 g and 250 deg/s. Successors: AN-MPU-9250A-03, factory response
     2620 · 1.01^(code − 1) counts at 2 g and 250 deg/s.
@@ -67,7 +82,9 @@ def self_test_deviation(result: SelfTestResult) -> dict[str, float | None]:
 
 
 def _factory_responses(result: SelfTestResult, axis: int) -> tuple[float, float]:
-    """The factory's response (counts) of the accelerometer and the gyro of an axis, 0 to 2; 0: none is stored."""
+    """The factory's response (counts) of the accelerometer and the gyro of an axis, 0 to 2; 0: not known."""
+    if result.family == DeviceFamily.UNKNOWN_IMU:
+        return 0.0, 0.0
     trims = (result.trim_1, result.trim_2, result.trim_3, result.trim_4, result.trim_5, result.trim_6)
     if result.family == DeviceFamily.MPU6050:
         accel_code = (trims[axis] >> 3 & 0x1C) | (trims[3] >> (4 - 2 * axis) & 3)

@@ -88,9 +88,9 @@ class Chain:
 
     joint: str = "ball"  # or "hinge"
     r1_m: Vector | None = None  # None: unknown; the chain filter estimates it
-    r1_std_m: float = 0.005  # standard deviation, each axis (m); measured with a ruler
+    r1_std_m: float | Vector = 0.005  # standard deviation (m), one for all axes or one for each; measured with a ruler
     r2_m: Vector | None = None
-    r2_std_m: float = 0.005
+    r2_std_m: float | Vector = 0.005
     axis1: Vector | None = None  # of any length; None: unknown
     axis1_std_deg: float = 3.0  # standard deviation about each axis across it
     axis2: Vector | None = None
@@ -164,13 +164,11 @@ class Rig:
         """The rig with another J2S, assumed accurate to 0.1 mm (1σ)."""
         return replace(self, joint=Joint(j2s_m))
 
-    def with_delay_of(self, dlpf: int | None) -> Rig:
-        """The rig for readings with this low-pass setting (DLPF_CFG, 0 to 6); a delay that the rig states is kept."""
-        from linkpose.sensors.mpu6050 import DLPF_DELAY_S
-
-        if dlpf is None or self.imu.delay_s is not None:
+    def with_delay(self, delay_s: float | None) -> Rig:
+        """The rig for inertial readings of this mean age (s), None: unknown. A delay that the rig states is kept."""
+        if delay_s is None or self.imu.delay_s is not None:
             return self
-        return replace(self, imu=replace(self.imu, delay_s=DLPF_DELAY_S[dlpf]))
+        return replace(self, imu=replace(self.imu, delay_s=delay_s))
 
     def as_dict(self) -> dict[str, Any]:
         """The rig as plain tables, for JSON and TOML."""

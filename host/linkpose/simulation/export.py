@@ -20,6 +20,7 @@ from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats
 from linkpose.simulation import board
+from linkpose.simulation.chain import ChainRun
 from linkpose.simulation.indoor import CELL_M, IndoorRun, office_floor
 from linkpose.simulation.link import LinkRun
 from linkpose.simulation.mice import MiceRun
@@ -57,21 +58,27 @@ def check_length(duration_s: float, rate_hz: float) -> None:
 
 
 def write_link(run: LinkRun, recording: Path, truth: Path, force: bool) -> None:
-    """The recording of a link, and its truth: height, attitude and position of the sensor from the joint."""
+    """The recording of a link or a chain, and its truth, whose columns are those of `run.truth_columns`."""
     check_outputs((recording, truth), force)
-    write_truth_blocks(truth, _link_truth(run), {"device": run.description, "j2s_m": run.j2s_m}, force)
+    write_truth_blocks(truth, _truth_blocks(run), {"device": run.description, "j2s_m": run.j2s_m}, force)
     settings: Configure = board.DEFAULTS._replace(sample_rate_hz=round(run.rate_hz))
     write_recording(
         recording, board.hello(settings, sensors=run.hello_sensors), run.samples(), run.description, run.rig, force
     )
 
 
-def _link_truth(run: LinkRun) -> Iterator[Mapping[str, Floats]]:
+def write_chain(run: ChainRun, recording: Path, truth: Path, rig: Path | None, force: bool) -> None:
+    """As `write_link`; `rig` receives the rig file with the mounting of both sensors."""
+    check_outputs((recording, truth, *([rig] if rig else [])), force)
+    write_link(run, recording, truth, force)
+    if rig:
+        run.calibrated_rig.save(rig)
+
+
+def _truth_blocks(run: LinkRun) -> Iterator[Mapping[str, Floats]]:
     """Block by block: a day at 100 Hz would not fit the memory at once."""
-    names = ("time_s", "height_m", "roll_deg", "pitch_deg", "x_m", "y_m", "yaw_deg")
     for start in range(0, run.count or 0, _BLOCK):
-        exact = run.at(np.arange(start, min(start + _BLOCK, run.count or 0)) / run.rate_hz)
-        yield {name: getattr(exact, name) for name in names}
+        yield run.truth_columns(np.arange(start, min(start + _BLOCK, run.count or 0)) / run.rate_hz)
 
 
 def write_mice(run: MiceRun, resolution: int, recording: Path, truth: Path, force: bool) -> None:

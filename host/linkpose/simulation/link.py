@@ -7,7 +7,7 @@ the reading's number (its noise), so that a run is the same whether it is made w
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from linkpose.sensors.conversion import BoardSettings, Converter, RawSamples
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import Imu, Joint, Noise, Rig, Vector
+from linkpose.sensors.rig import Imu, Joint, Mag, Noise, Rig, Vector
 from linkpose.simulation import baro, imu
 from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
@@ -33,6 +33,7 @@ Integers = NDArray[np.int64]
 PAPER_J2S_M: Vector = (-0.09, -0.04, 1.65)
 PAPER_DURATION_S = 65.0
 _BLOCK = 1000  # samples made at once
+_TRUTH_COLUMNS = ("time_s", "height_m", "roll_deg", "pitch_deg", "x_m", "y_m", "yaw_deg")
 
 
 class PaperTest(NamedTuple):
@@ -133,13 +134,17 @@ class LinkRun:
         rests: bool = False,
         imu2: bool = False,
         mag: bool = False,
+        mag_disturbance: str | None = None,
         noise_of: Rig | None = None,
+        swing_rad: float | None = None,
     ) -> None:
-        """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer.
+        """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer,
+        whose field `mag_disturbance` (a key of mag.DISTURBANCES) disturbs.
 
         `duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
         swinging the link, as `calibrate imu` asks for. `noise_of` is a rig whose noise and remaining biases the sensors
-        have, in place of those of `errors`. Raises LinkposeError for a value that cannot be.
+        have, in place of those of `errors`. `swing_rad` is the rms of the swing; None: the Test's mean acceleration.
+        Raises LinkposeError for a value that cannot be.
         """
         _check(test, seed, duration_s, rate_hz, errors, j2s_m)
         self.test, self.seed, self.duration_s = test, seed, duration_s
@@ -154,8 +159,12 @@ class LinkRun:
         if rests:
             self._motion = SixSides(duration_s or PAPER_DURATION_S)
         else:
-            self._motion = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
-            self._motion.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
+            swung = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
+            if swing_rad is None:
+                swung.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
+            else:
+                swung.amplitude_rad = swing_rad
+            self._motion = swung
         rngs = [np.random.default_rng([seed, stream, test]) for stream in (_ERRORS, _IMU2_ERRORS)]
         if noise_of is None:
             self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw(errors, rng) for rng in rngs)
@@ -163,6 +172,12 @@ class LinkRun:
             self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw_from(noise_of, rng, rate_hz) for rng in rngs)
         noise = noise_of.noise if noise_of is not None else Noise()
         self._drifts = {s: imu.BiasDrift(noise, (seed, s, _DRIFT, test)) for s in (_IMU_NOISE, _IMU2_NOISE)}
+        if mag_disturbance is not None and (mag_disturbance not in mag_model.DISTURBANCES or not mag):
+            known = ", ".join(mag_model.DISTURBANCES)
+            raise LinkposeError(
+                f"there is no magnetic disturbance {mag_disturbance!r}: take {known}, and a magnetometer"
+            )
+        self.mag_disturbance = mag_disturbance
         self._hard_iron_uT = mag_model.hard_iron(errors, np.random.default_rng([seed, _MAG_ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
@@ -185,7 +200,8 @@ class LinkRun:
     @property
     def rig(self) -> Rig:
         """The rig file that belongs to the run. Nothing filters its readings: they have no delay."""
-        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0))
+        mag = mag_model.calibration(self.errors) if self.hello_sensors & Sensors.MAG else Mag()
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), mag=mag)
 
     def at(self, time_s: Floats) -> LinkTruth:
         """The truth at any instants (N,), s. After the end the link stays at rest."""
@@ -217,32 +233,49 @@ class LinkRun:
             raise LinkposeError("a run without an end has no whole truth: give it a duration")
         return self.at(np.arange(self.count) / self.rate_hz)
 
+    def truth_columns(self, time_s: Floats) -> Mapping[str, Floats]:
+        """The truth at any instants (N,) as columns of a truth file: height, attitude and position of the sensor."""
+        exact = self.at(time_s)
+        return {name: getattr(exact, name) for name in _TRUTH_COLUMNS}
+
     def imu_counts(self, time_s: Floats, first: int) -> NDArray[np.int16]:
         """Raw accel xyz, temperature, gyro xyz (N, 7) as in the MPU-6050's burst, at any instants (N,).
 
         `first` is the number of the first of these readings since the start: it names their noise.
         """
-        return self._imu_counts(time_s, first, self._d, self.imu_errors, _IMU_NOISE)
+        return self._imu_counts(time_s, first, self._felt(time_s, self._d), self.imu_errors, _IMU_NOISE)
 
     def imu2_counts(self, time_s: Floats, first: int) -> NDArray[np.int16]:
         """As `imu_counts`, of the second sensor."""
-        return self._imu_counts(time_s, first, self._d / 2, self.imu2_errors, _IMU2_NOISE)
+        return self._imu_counts(time_s, first, self._second(time_s), self.imu2_errors, _IMU2_NOISE)
+
+    def _felt(self, time_s: Floats, at_m: Floats) -> tuple[Floats, Floats]:
+        """Specific force (N, 3) m/s² and rate (N, 3) rad/s of a sensor at `at_m` (3,) from the joint, in its axes."""
+        moving = self._motion.at(time_s)
+        return STANDARD_GRAVITY * moving.tilt + moving.acceleration(at_m), moving.rate_rad_s
+
+    def _second(self, time_s: Floats) -> tuple[Floats, Floats]:
+        """As `_felt`, of the second sensor."""
+        return self._felt(time_s, self._d / 2)
 
     def mag_field(self, time_s: Floats, first: int) -> Floats:
         """Field that the magnetometer measures (N, 3), µT, in the link's axes; `first` as for `imu_counts`."""
         noise = imu.white((self.seed, _MAG_NOISE, self.test), first, len(time_s), 3)
         noise = mag_model.NOISE_UT * (self.errors != "none") * noise
-        return mag_model.field(self._motion.at(time_s)) + self._hard_iron_uT + noise
+        moving = self._motion.at(time_s)
+        field = mag_model.field(moving) + self._hard_iron_uT + noise
+        if self.mag_disturbance is not None:
+            field = field + mag_model.disturbance(self.mag_disturbance, moving, time_s)
+        return field
 
     def _imu_counts(
-        self, time_s: Floats, first: int, at_m: Floats, errors: imu.ImuErrors, stream: int
+        self, time_s: Floats, first: int, felt: tuple[Floats, Floats], errors: imu.ImuErrors, stream: int
     ) -> NDArray[np.int16]:
-        """Counts of a sensor at `at_m` (3,) from the joint; `stream` names its noise."""
-        moving = self._motion.at(time_s)
-        force = STANDARD_GRAVITY * moving.tilt + moving.acceleration(at_m)
+        """Counts of a sensor with this force and rate; `stream` names its noise."""
+        force, rate = felt
         noise = imu.white((self.seed, stream, self.test), first, len(time_s), 7)
         accel = force @ errors.accel_matrix.T + errors.accel_bias_m_s2 + errors.accel_noise_m_s2 * noise[:, :3]
-        rate = moving.rate_rad_s @ errors.gyro_matrix.T + errors.gyro_bias_rad_s
+        rate = rate @ errors.gyro_matrix.T + errors.gyro_bias_rad_s
         chip_degC = _temperature(time_s) + 2.0  # the chip warms itself
         gyro_drift, accel_drift = self._drifts[stream].at(time_s, chip_degC)
         rate = rate + errors.gyro_noise_rad_s * noise[:, 4:] + gyro_drift

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.sensors.magnetometer import scale
+from linkpose.sensors.rig import Mag
 from linkpose.simulation.imu import to_counts
 from linkpose.simulation.motion import Kinematics
 from linkpose.wire.messages import DeviceFamily
@@ -18,14 +21,59 @@ NOISE_UT = 0.2  # QMC5883L, 13-52-04, table 2: 2 mG RMS at 8 G
 # Hard iron of the board: ±20 µT uncalibrated (GY-87 boards with steel screws); 2.5 % of that after a calibration.
 _HARD_IRON_UT = {"none": 0.0, "calibrated": 0.5, "datasheet": 20.0}
 
+# What disturbs the field, and from when on (s). Strengths (µT) are those that a magnetometer shows half a metre away.
+DISTURBANCES = {
+    "desk": "a steel desk is rolled near and stays",
+    "motor": "a motor on the link switches on and off",
+    "iron": "somebody walks past with iron, once in a minute",
+}
+_BEGINS_S, _ROLLING_S = 20.0, 3.0
+_DESK_UT, _MOTOR_UT, _IRON_UT = np.array([9.0, 14.0, -8.0]), np.array([6.0, -9.0, 4.0]), 25.0
+_MOTOR_PERIOD_S, _MOTOR_RIPPLE_HZ = 16.0, 7.0
+_WALK_PERIOD_S, _WALK_S = 60.0, 2.5
+
 
 def hard_iron(level: str, rng: np.random.Generator) -> Floats:
     """Constant offset (3,) of one specimen, µT."""
     return np.asarray(_HARD_IRON_UT[level] * rng.uniform(-1, 1, 3))
 
 
+def calibration(level: str) -> Mag:
+    """The rig's [mag] of a simulated magnetometer: none where the specimen is not calibrated."""
+    if level == "datasheet":
+        return Mag()
+    strength, dip = math.hypot(NORTH_UT, UP_UT), math.degrees(math.atan2(-UP_UT, NORTH_UT))
+    residual = math.hypot(NOISE_UT, 0.5 * _HARD_IRON_UT[level])
+    return Mag((0.0, 0.0, 0.0), field_uT=round(strength, 3), residual_uT=round(residual, 3), dip_deg=round(dip, 2))
+
+
+def disturbance(kind: str, moving: Kinematics, time_s: Floats) -> Floats:
+    """Field of iron or a motor (N, 3) in the sensor's axes, µT; `kind` is a key of DISTURBANCES."""
+    since = np.maximum(time_s - _BEGINS_S, 0.0)
+    if kind == "motor":  # fixed to the link
+        runs = (since > 0) & (since % _MOTOR_PERIOD_S < _MOTOR_PERIOD_S / 2)
+        ripple = 1.0 + 0.5 * np.sin(2 * np.pi * _MOTOR_RIPPLE_HZ * time_s)
+        return np.outer(runs * ripple, _MOTOR_UT)
+    x, y, z = axes(moving)
+    if kind == "desk":
+        share = np.minimum(since / _ROLLING_S, 1.0)
+        east, north, up = np.outer(_DESK_UT, share)
+    else:
+        phase = (since + _WALK_PERIOD_S / 2) % _WALK_PERIOD_S - _WALK_PERIOD_S / 2
+        strength = (since > 0) * _IRON_UT / (1 + (phase / _WALK_S) ** 2) ** 1.5
+        angle = np.arctan2(phase, _WALK_S)
+        east, north, up = strength * np.cos(angle), strength * np.sin(angle), -0.3 * strength
+    return np.asarray(north[:, None] * x + east[:, None] * y + up[:, None] * z)
+
+
 def field(moving: Kinematics) -> Floats:
     """The earth's field (N, 3) in the sensor's axes, µT: R_nsᵀ (north, 0, up)."""
+    north, _, up = axes(moving)
+    return NORTH_UT * north + UP_UT * up
+
+
+def axes(moving: Kinematics) -> tuple[Floats, Floats, Floats]:
+    """n's axes seen in the sensor's, (N, 3) each: the columns of R_nsᵀ."""
     sin_pitch, cos_pitch = -moving.tilt[:, 0], np.hypot(moving.tilt[:, 1], moving.tilt[:, 2])
     roll = np.arctan2(moving.tilt[:, 1], moving.tilt[:, 2])
     sin_roll, cos_roll = np.sin(roll), np.cos(roll)
@@ -37,7 +85,7 @@ def field(moving: Kinematics) -> Floats:
             sin_roll * sin_yaw + cos_roll * sin_pitch * cos_yaw,
         ]
     )
-    return NORTH_UT * north + UP_UT * moving.tilt
+    return north, np.cross(moving.tilt, north), moving.tilt
 
 
 def counts(field_uT: Floats) -> NDArray[np.int16]:

@@ -71,6 +71,10 @@ class HandMotion:
 
     def at(self, time_s: Floats) -> Kinematics:
         """Kinematics at `time_s` (N,), s."""
+        return _kinematics(self.angles(time_s))
+
+    def angles(self, time_s: Floats) -> Floats:
+        """Roll, pitch and yaw (rad), each with two derivatives: (derivative order, angle, N)."""
         envelope = self._envelope(time_s)
         angle = np.empty((3, 3, len(time_s)))  # derivative order, axis, instant
         for axis in range(3):
@@ -83,7 +87,7 @@ class HandMotion:
             angle[2, axis] = self.amplitude_rad * (
                 envelope[2] * swing[0] + 2 * envelope[1] * swing[1] + envelope[0] * swing[2]
             )
-        return _kinematics(angle)
+        return angle
 
     def scale_to(self, mean_accel_m_s2: float, j2s_m: Floats, over_s: float) -> None:
         """Sets the amplitude so that the mean ‖a‖ over the first `over_s` seconds is `mean_accel_m_s2`.

@@ -1,6 +1,7 @@
 """`sim://...`: simulated boards as pyserial ports, for any code that opens a port.
 
-    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&drift_ppm=0&speed=1
+    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&mag_disturbance=desk&drift_ppm=0&speed=1
+    sim://chain?joint=hinge&seed=0&errors=calibrated&drift_ppm=0&speed=1
     sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8&drift_ppm=0&speed=1
 
 `speed` is how much faster than real time the board lives; 0 is as fast as it is read. `drift_ppm` is how much its clock
@@ -130,7 +131,7 @@ def _parse(url: str) -> tuple[Callable[[Configure], Run], dict[str, float]]:
     if speed < 0 or abs(drift) > 10_000:
         raise LinkposeError("speed must be 0 or more, and drift_ppm within 10000")
     if parts.netloc not in _RIGS:
-        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type {' or '.join(map(_address, _RIGS))}")
+        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type {', '.join(map(_address, _RIGS))}")
     rig, known = _RIGS[parts.netloc]
     make_run = rig(options)
     if options:
@@ -150,6 +151,7 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
     if len(words) != 3:
         raise LinkposeError("j2s must be three numbers: j2s=X,Y,Z in metres")
     x, y, z = (_number({"j2s": word}, "j2s", 0) for word in words)
+    disturbance = options.pop("mag_disturbance", None)
     imu2, mag = (_number(options, name, 0) != 0 for name in ("imu2", "mag"))
 
     def make_run(settings: Configure) -> LinkRun:
@@ -164,7 +166,29 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
             gyro_range_deg_s=settings.gyro_range_deg_s,
             oversampling=settings.baro_oversampling,
             imu2=imu2,
-            mag=mag,
+            mag=mag or disturbance is not None,
+            mag_disturbance=disturbance,
+        )
+
+    return make_run
+
+
+def _chain(options: dict[str, str]) -> Callable[[Configure], Run]:
+    from linkpose.simulation.chain import ChainRun
+
+    joint, seed = options.pop("joint", "hinge"), int(_number(options, "seed", 0))
+    errors = options.pop("errors", "calibrated")
+
+    def make_run(settings: Configure) -> ChainRun:
+        return ChainRun(
+            joint,
+            seed,
+            None,
+            settings.sample_rate_hz,
+            errors,
+            accel_range_g=settings.accel_range_g,
+            gyro_range_deg_s=settings.gyro_range_deg_s,
+            oversampling=settings.baro_oversampling,
         )
 
     return make_run
@@ -195,7 +219,8 @@ def _mice(options: dict[str, str]) -> Callable[[Configure], Run]:
 
 # Simulated board -> what makes it from its options, and their names.
 _RIGS: dict[str, tuple[Callable[[dict[str, str]], Callable[[Configure], Run]], str]] = {
-    "link": (_link, "test, seed, errors, j2s, imu2, mag"),
+    "link": (_link, "test, seed, errors, j2s, imu2, mag, mag_disturbance"),
+    "chain": (_chain, "joint, seed, errors"),
     "mice": (_mice, "seed, mice, path, errors, fault"),
 }
 

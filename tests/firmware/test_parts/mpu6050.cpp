@@ -17,6 +17,7 @@ class FakeSensor {
   uint8_t registers[128] = {};
   int resets = 0;
   bool frozen = false;
+  bool zeros = false;
   uint8_t bursts = 0;
 
   FakeSensor() { lose_power(); }
@@ -42,7 +43,7 @@ class FakeSensor {
   }
   // Asleep, it reads all zeros; with its self-test on, the axes read more.
   bool burst(uint8_t* data) {
-    const bool asleep = registers[0x6B] & 0x40;
+    const bool asleep = registers[0x6B] & 0x40 || zeros;
     for (uint8_t i = 0; i < 14; i++) {
       const uint8_t excited = registers[i < 6 ? 0x1C : 0x1B] & 0xE0 ? 0x10 : 0;
       data[i] = asleep ? 0 : static_cast<uint8_t>(i + excited);
@@ -200,6 +201,23 @@ TEST_CASE("MPU-6050: the successors get the accelerometer's own filter setting, 
   CHECK(genuine.ticks_to_valid(20) > 0);
   CHECK(genuine.sensor.registers[0x1D] == 0);
   CHECK(genuine.sensor.registers[0x37] == 2);  // the magnetometer's bus is connected
+}
+
+TEST_CASE("MPU-6050: a sensor that is blank or frozen from the start has failed, and is not being set up for ever") {
+  for (const bool zeros : {false, true}) {
+    Rig rig;
+    rig.sensor.zeros = zeros;
+    rig.sensor.frozen = !zeros;
+    for (int i = 0; i < 100; i++) rig.tick();
+    CHECK(rig.driver.present());
+    CHECK(rig.driver.ever_found());
+    CHECK(!rig.driver.healthy());
+    CHECK(rig.driver.invalid(static_cast<uint8_t>(zeros ? Mpu6050::Cause::kBlank : Mpu6050::Cause::kFrozen)) > 0);
+    rig.sensor.zeros = rig.sensor.frozen = false;
+    CHECK(rig.ticks_to_valid(30) > 0);
+    CHECK(rig.driver.healthy());
+    CHECK(rig.reading.valid);
+  }
 }
 
 TEST_CASE("MPU-6050: a burst that repeats for 0.2 s is frozen until it changes") {

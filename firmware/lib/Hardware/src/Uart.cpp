@@ -52,6 +52,7 @@ void begin() {
   static_assert(F_CPU % (8 * wire::kBaud) == 0, "the baud rate is exact");
   UCSR0C = _BV(UCSZ01) | _BV(UCSZ00);
   UCSR0B = _BV(RXEN0) | _BV(TXEN0) | _BV(RXCIE0);
+  UDR0 = 0;  // ends the frame that a reset has cut, so that HELLO is not lost with it
 }
 
 bool put(uint8_t type, const void* body, uint8_t size) {

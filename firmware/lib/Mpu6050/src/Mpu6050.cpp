@@ -208,13 +208,12 @@ void Mpu6050::verified(bool kept, uint32_t now_us) {
 }
 
 void Mpu6050::accept_burst(bool ok, const uint8_t* data, uint32_t now_us, Reading& reading) {
+  if (ok && state_ == State::kSettle && due(now_us)) run(now_us);  // whatever it reads: that is its state from now on
   const Cause cause = ok ? judge(data, now_us, reading) : Cause::kSilent;
   note(cause, reading);
   // A sensor that failed or returns nonsense is asked at once for its id and whether it has kept its settings.
-  if (cause == Cause::kSilent || cause == Cause::kBlank) {
+  if (cause == Cause::kSilent || (cause == Cause::kBlank && state_ != State::kSettle)) {
     identify_after(now_us, 0);
-  } else if (state_ == State::kSettle && due(now_us) && cause == Cause::kStarting) {
-    run(now_us);
   } else if (test_ != Test::kOff && cause == Cause::kStarting) {
     average(reading);
   }

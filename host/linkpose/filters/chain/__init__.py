@@ -16,27 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters._imu import ImuSamples
 from linkpose.filters.chain.process import process
 from linkpose.filters.chain.state import ESTIMATE, ChainParameters, Floats, fresh_bank, fresh_states, record_of
-from linkpose.sensors.frozen import FrozenDetector
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
-from linkpose.wire.messages import SampleFlags
 
 _ROTATION = ("chain_qw", "chain_qx", "chain_qy", "chain_qz", "chain_rotation_std_deg")
 _ANGLE = ("chain_angle_deg", "chain_angle_std_deg")
 _HEIGHTS = ("chain_height1_m", "chain_height1_std_m", "chain_height2_m", "chain_height2_std_m")
-_NEEDED = np.uint32(SampleFlags.IMU_VALID | SampleFlags.IMU2_VALID)
-_CLIPPED = np.uint32(
-    SampleFlags.ACCEL_SATURATED
-    | SampleFlags.GYRO_SATURATED
-    | SampleFlags.ACCEL2_SATURATED
-    | SampleFlags.GYRO2_SATURATED
-)
-# Readings of a sensor at rest may repeat to the last bit (low-pass filter, little noise): below this rate of all axes
-# they do not show a frozen sensor.
-_RESTING_RAD_S = 0.05
-_LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
 
 
 class ChainFilter:
@@ -49,12 +37,16 @@ class ChainFilter:
 
     def __init__(self, rig: Rig, parameters: ChainParameters | None = None) -> None:
         self.parameters = parameters or ChainParameters()
-        self._rig = rig
         self._record = record_of(self.parameters)
         self._bank = fresh_bank(rig)
         self._states = fresh_states(rig, self.parameters, self._bank[0])
         self._noise = np.square([rig.imu.gyro_noise_rad_s, rig.imu.accel_noise_m_s2])
-        self._frozen = FrozenDetector(), FrozenDetector()
+        self._calibration = np.array(  # offset and scale of the accelerometer, gyro bias; of each sensor
+            [
+                [rig.imu.accel_offset_m_s2, rig.imu.accel_scale, rig.imu.gyro_bias_rad_s],
+                [[0.0] * 3, [1.0] * 3, [0.0] * 3],
+            ]
+        )
         self._is_hinge, self._is_fixed = bool(self._bank[0].hinge >= 0), bool(self._bank[0].fixed >= 0)
 
     @property
@@ -105,43 +97,28 @@ class ChainFilter:
             if backwards:
                 state.gyro_bias = -other.gyro_bias
 
-    def run(self, block: Measurements) -> Any:
-        """The estimates (N,) as records of `state.ESTIMATE`."""
-        accel, gyro, valid = self._readings(block)
-        estimates = np.recarray(len(block), ESTIMATE)
-        process(
-            block.time_s, accel, gyro, valid, self._bank, self._states, self._record, self._noise, estimates
-        )  # fmt: skip
-        return estimates
-
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, len(columns)); NaN where not known yet."""
-        return self.table(self.run(block))
+        estimates = np.empty(len(block), ESTIMATE)
+        # A sensor that is absent has arrays without memory of their own.
+        accel2, gyro2 = np.ascontiguousarray(block.accel2_m_s2), np.ascontiguousarray(block.gyro2_rad_s)
+        second = ImuSamples(block.time_s, accel2, gyro2, block.flags)
+        process(
+            ImuSamples.of(block), second, self._calibration, self._bank, self._states, self._record, self._noise,
+            estimates,
+        )  # fmt: skip
+        return self._table(estimates)
 
-    def table(self, found: Any) -> Floats:
+    def _table(self, found: NDArray[Any]) -> Floats:
         """Records of ESTIMATE (N,) as columns."""
-        parts = [found.q, np.degrees(found.rotation_std)[:, None]]
+        table = np.empty((len(found), len(self.columns)))
+        table[:, :4] = found["q"]
+        np.degrees(found["rotation_std"], out=table[:, 4])
+        at = len(_ROTATION)
         if self._is_hinge:
-            parts.append(np.degrees(np.column_stack([found.angle, found.angle_std])))
+            np.degrees(found["angle"], out=table[:, at])
+            np.degrees(found["angle_std"], out=table[:, at + 1])
+            at += len(_ANGLE)
         if self._is_fixed:
-            parts.append(np.stack([found.height, found.height_std], axis=2).reshape(-1, 4))
-        return np.hstack(parts)
-
-    def _readings(self, block: Measurements) -> tuple[Floats, Floats, Floats]:
-        """Calibrated readings of both sensors (N, 2, 3), and which samples can be used (N,), 1 or 0."""
-        imu = self._rig.imu
-        accel = (block.accel_m_s2 - np.asarray(imu.accel_offset_m_s2)) / np.asarray(imu.accel_scale)
-        gyro = block.gyro_rad_s - np.asarray(imu.gyro_bias_rad_s)
-        both = np.stack([accel, block.accel2_m_s2], axis=1), np.stack([gyro, block.gyro2_rad_s], axis=1)
-        with np.errstate(invalid="ignore"):
-            in_range = np.logical_and.reduce([(np.abs(values) < _LARGEST).all(axis=(1, 2)) for values in both])
-        raw = (
-            np.hstack([block.accel_m_s2, block.gyro_rad_s]),
-            np.hstack([block.accel2_m_s2, block.gyro2_rad_s]),
-        )
-        dead: NDArray[np.bool_] = np.zeros(len(block), np.bool_)
-        for detector, values in zip(self._frozen, raw, strict=True):
-            turns = (np.abs(values[:, 3:]) > _RESTING_RAD_S).any(axis=1)
-            dead |= detector.frozen(block.time_s, values) & turns
-        flagged = (block.flags & _NEEDED == _NEEDED) & (block.flags & _CLIPPED == 0)
-        return both[0], both[1], (in_range & ~dead & flagged).astype(np.float64)
+            table[:, at::2], table[:, at + 1 :: 2] = found["height"], found["height_std"]
+        return table

@@ -16,8 +16,13 @@ from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY
 from linkpose.filters._vector import Vec
+from linkpose.filters.inertial.rest import REST_S
 from linkpose.filters.inertial.state import BA, SIZE, Record, V, Z
 from linkpose.filters.inertial.update import project, sub_covariance, update_vector
+
+# A square velocity beyond 1 / _RISE of the mean is no swing of the same motion but a faster one: the mean follows at
+# once. At 1 a regular swing would count by its peaks: BROAD 3 % worse, a chain of links 6 % better.
+_RISE = 1.0 / 3.0
 
 
 @inner
@@ -25,7 +30,8 @@ def follow_speed(s: Record, turn: Vec, force: Vec, h: float, q: Record) -> None:
     """Measure σ² over a step that turned the sensor by `turn` (rad).
 
     The force is the reading, without the estimated errors: a filter that shrinks the force would shrink σ with it, and
-    trust its error the more. The acceleration's mean square is measured beside it.
+    trust its error the more. The acceleration's mean square is measured beside it. A rest changes nothing: the next
+    motion is assumed to be as fast as the last.
     """
     swing = vec.turn_back(turn, vec.load(s.swing))
     accel = vec.axpy(-GRAVITY, vec.load(s.tilt), force)
@@ -33,8 +39,10 @@ def follow_speed(s: Record, turn: Vec, force: Vec, h: float, q: Record) -> None:
     vec.store(s.swing, swing)
     own = vec.trace(sub_covariance(s.covariance, Z)) * (GRAVITY * q.swing_time_s) ** 2
     square = max(vec.dot(swing, swing) - own, 0.0) / 3.0
+    if s.rest_s > REST_S:
+        return
     keep = min(h / q.speed_memory_s, 1.0)
-    square = s.speed_square + keep * (square - s.speed_square)
+    square = max(_RISE * square, s.speed_square + keep * (square - s.speed_square))
     s.speed_square = min(max(square, q.least_speed_m_s**2), q.most_speed_m_s**2)
     s.accel_square += keep * (vec.dot(accel, accel) / 3.0 - s.accel_square)
 

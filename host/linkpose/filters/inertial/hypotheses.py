@@ -11,12 +11,11 @@ Source: D. T. Magill, "Optimal adaptive estimation of sampled stochastic process
 
 from __future__ import annotations
 
-from typing import Any
+import math
 
-import numpy as np
-from numpy.typing import NDArray
-
-from linkpose.filters.inertial.state import Floats, SensorErrors
+from linkpose.compiling import compiled, inner
+from linkpose.filters import _vector as vec
+from linkpose.filters.inertial.state import HEIGHT, PITCH, ROLL, SIGMA, Floats, Record, SensorErrors
 
 # What a calibration leaves (simulated twelve-position calibration, ../simulation/link.py), and what the MPU-6050's data
 # sheet allows (zero-rate output ±20 °/s after a rough subtraction, zero-g output ±50 mg, scale ±3 %, cross-axis ±2 %).
@@ -32,36 +31,49 @@ _OCCAM = 8.0
 _MOST = 50.0  # log odds beyond which the other filter has no weight
 
 
-def log_odds(first: Floats, second: Floats) -> Floats:
+def log_odds(first: float, second: float) -> float:
     """Log odds of the first hypothesis, from half the χ² of the sensor errors that each filter has estimated."""
-    return np.clip(_LOG_ODDS + _OCCAM * second - first, -_MOST, _MOST)
+    return min(max(_LOG_ODDS + _OCCAM * second - first, -_MOST), _MOST)
 
 
-def mix(a: NDArray[Any], b: NDArray[Any]) -> dict[str, Floats]:
-    """The mean of two filters' estimates (arrays (N,) of ESTIMATE) as arrays (N,); `tilt` is (N, 3), not normalised.
+_log_odds = inner(log_odds)
 
-    A variance includes how far the filters differ. Where one filter has no height, the other's counts alone.
+
+@compiled
+def mix(first: Record, second: Record, out: Floats) -> None:
+    """The mean of two filters' estimates (N,) of ESTIMATE: values and then σ (N, 12), in its order; angles in degrees.
+
+    A variance includes how far the filters differ. Where one filter has no position, the other's counts alone.
     """
-    share = 1.0 / (1.0 + np.exp(-log_odds(a["distance"], b["distance"])))
-    unknown_a, unknown_b = np.isnan(a["height"]), np.isnan(b["height"])
-    lone = np.where(unknown_b & ~unknown_a, 1.0, share)
-    lone = np.where(unknown_a & ~unknown_b, 0.0, lone)
-    found: dict[str, Floats] = {"tilt": a["tilt"] * share[:, None] + b["tilt"] * (1.0 - share)[:, None]}
-    for name in ("height", "x", "y"):
-        found[name] = _mixed(lone, a[name], b[name])
-    found["height_std"] = _mixed_std(lone, a["height"], a["height_std"], b["height"], b["height_std"])
-    turn = (b["yaw"] - a["yaw"] + np.pi) % (2 * np.pi) - np.pi
-    found["yaw"] = (a["yaw"] + (1.0 - share) * turn + np.pi) % (2 * np.pi) - np.pi
-    found["yaw_std"] = np.minimum(_mixed_std(share, 0.0 * turn, a["yaw_std"], turn, b["yaw_std"]), np.pi)
-    return found
+    for i in range(len(first)):
+        a, b = first[i], second[i]
+        probability = 1.0 / (1.0 + math.exp(-_log_odds(a.distance, b.distance)))
+        unknown_a, unknown_b = math.isnan(a.value[HEIGHT]), math.isnan(b.value[HEIGHT])
+        share = 1.0 if unknown_b and not unknown_a else 0.0 if unknown_a and not unknown_b else probability
+        for k in range(ROLL):
+            out[i, k], out[i, SIGMA + k] = _mixed(share, a, b, k, b.value[k] - a.value[k])
+        for k in range(ROLL, SIGMA):
+            angle, std = _mixed(probability, a, b, k, vec.wrapped(b.value[k] - a.value[k]))
+            out[i, k], out[i, SIGMA + k] = math.degrees(vec.wrapped(angle)), math.degrees(min(std, math.pi))
+        # Near the vertical, the mean of two angles is not that of their tilts.
+        tilt = (
+            _mean(probability, a.tilt[0], b.tilt[0]),
+            _mean(probability, a.tilt[1], b.tilt[1]),
+            _mean(probability, a.tilt[2], b.tilt[2]),
+        )
+        out[i, ROLL], out[i, PITCH] = vec.roll_pitch(tilt)
 
 
-def _mixed(share: Floats, a: Floats, b: Floats) -> Floats:
-    return np.where(share == 1.0, a, np.where(share == 0.0, b, share * a + (1.0 - share) * b))
+@inner
+def _mixed(share: float, a: Record, b: Record, k: int, apart: float) -> tuple[float, float]:
+    """Mean and σ of value k, where b's is `apart` from a's."""
+    mean = _mean(share, a.value[k], b.value[k] if share == 0.0 else a.value[k] + apart)
+    both = share * (1.0 - share)
+    between = 0.0 if both == 0.0 else both * (apart * apart)
+    return mean, math.sqrt(_mean(share, a.std[k] * a.std[k], b.std[k] * b.std[k]) + between)
 
 
-def _mixed_std(share: Floats, a: Floats, a_std: Floats, b: Floats, b_std: Floats) -> Floats:
-    """Standard deviation of a mixture of two."""
-    apart = _mixed(share, np.square(a - b), 0.0 * a) * (1.0 - share)
-    apart = np.where(share * (1.0 - share) == 0.0, 0.0, apart)
-    return np.sqrt(_mixed(share, np.square(a_std), np.square(b_std)) + apart)
+@inner
+def _mean(share: float, a: float, b: float) -> float:
+    """`share` of a and the rest of b; one alone where its share is 1, whatever the other is."""
+    return a if share == 1.0 else b if share == 0.0 else share * a + (1.0 - share) * b

@@ -10,12 +10,13 @@ import math
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
+    GRAVITY,
     ImuCalibration,
+    ImuSamples,
     blind_for,
     is_bounded,
     read_accel,
@@ -24,9 +25,11 @@ from linkpose.filters._imu import (
     unknown_accel,
 )
 from linkpose.filters._vector import Vec
+from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
 from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
 from linkpose.filters.inertial.joint_velocity import update_joint_velocity
+from linkpose.filters.inertial.noise import follow_noise, start_noise, with_noise
 from linkpose.filters.inertial.propagate import (
     add_noise,
     angular_rate,
@@ -43,8 +46,25 @@ from linkpose.filters.inertial.rest import (
     follow_steadiness,
     update_bias_from_rest,
     update_bias_from_steadiness,
+    update_tilt_from_rest,
 )
-from linkpose.filters.inertial.state import BA, BG, MG, PSI, SIZE, D, Floats, Record, V, Z
+from linkpose.filters.inertial.state import (
+    BA,
+    BG,
+    HEIGHT,
+    MG,
+    PITCH,
+    PSI,
+    ROLL,
+    SIZE,
+    YAW,
+    D,
+    Record,
+    V,
+    X,
+    Y,
+    Z,
+)
 from linkpose.filters.inertial.update import sub_covariance
 
 # Least interval between two updates (s). A faster pace gains nothing: what the models leave over is correlated.
@@ -55,44 +75,49 @@ _LONGEST_BLIND_S = 0.3
 LONGEST_HOLD_S = 0.1
 _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: a spike, or at least no smooth motion
+_JUMP_VARIANCES = 100.0  # and beyond the measured noise: six times the σ of a difference of two readings
 _NO_JUMP = cast(bool, np.bool_(False))  # the compiler would take a Python constant for a type of its own
 _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 # Start in motion: angular acceleration (rad/s²) at rest, and per rad/s of rate (1/s).
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
+_START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
 _LOST, _LOST_M2_S2 = 0.5, 0.01
+# σ of what was learned grows by this factor then: after two or three losses in a row it is that of the start.
+_WIDEN = 3.0
 _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
+_LEAST_LEVEL = 1e-4  # square of the horizontal part of an axis below which the angles that it gives are undefined
 _UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the height is not known
 
 
 @compiled
 def process(
-    time_s: Floats, accel: Floats, gyro: Floats, flags: NDArray[np.uint32], dead: NDArray[np.bool_],
-    imu: ImuCalibration, parameters: Record, states: Record, out: Record,
+    samples: ImuSamples, imu: ImuCalibration, parameters: Record, states: Record, out: Record
 ) -> None:  # fmt: skip
-    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
-
-    Shapes: time_s (N,) s; accel (N, 3) m/s²; gyro (N, 3) rad/s; flags (N,); dead (N,), True where the sensor is frozen.
-    """
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate."""
     s, q = states[0], parameters[0]
-    for i in range(len(time_s)):
-        has_force, force = read_accel((accel[i, 0], accel[i, 1], accel[i, 2]), flags[i], imu)
-        has_rate, rate = read_gyro((gyro[i, 0], gyro[i, 1], gyro[i, 2]), flags[i], imu)
-        has_force, has_rate = has_force and not dead[i], has_rate and not dead[i]
-        good, first, h = has_force and has_rate, math.isnan(s.time), time_s[i] - s.time
-        if good and first and math.isfinite(time_s[i]):
-            _begin(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+    for i in range(len(samples.time_s)):
+        time_s, flags = samples.time_s[i], samples.flags[i]
+        accel, gyro = vec.load(samples.accel[i]), vec.load(samples.gyro[i])
+        dead = is_frozen(s.last_readings, time_s, accel, gyro)
+        has_force, force = read_accel(accel, flags, imu)
+        has_rate, rate = read_gyro(gyro, flags, imu)
+        has_force, has_rate = has_force and not dead, has_rate and not dead
+        good, first, h = has_force and has_rate, math.isnan(s.time), time_s - s.time
+        noisy = with_noise(s, imu)
+        if good and first and math.isfinite(time_s):
+            _begin(s, force, rate, noisy, q)
+            _take_sample(s, time_s, force, rate)
         elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
-            _bridge(s, h, rate, imu)
-            _align(s, force, rate, imu, q)
-            _take_sample(s, time_s[i], force, rate)
+            _bridge(s, h, rate, noisy)
+            _align(s, force, rate, noisy, q)
+            _take_sample(s, time_s, force, rate)
         elif 0.0 < h < math.inf:
-            good = _advance(s, time_s[i], dead[i], has_force, force, has_rate, rate, imu, q) and good
+            good = _advance(s, time_s, dead, has_force, force, has_rate, rate, imu, noisy, q) and good
         else:
             good = False
         s.rejected += 0 if good else 1
-        _report(s, time_s[i], imu, out[i])
+        _report(s, time_s, imu, out[i])
 
 
 @inner
@@ -105,6 +130,7 @@ def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
     vec.store(s.newest_rate, rate)
     vec.store(s.angle, (0.0, 0.0, 0.0))
     vec.store(s.force_change, (0.0, 0.0, 0.0))
+    start_noise(s, force, rate)
     clear_increments(s)
 
 
@@ -116,15 +142,22 @@ def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         for j in range(SIZE):
             s.covariance[i, j] = s.start_covariance[i, j]
     s.distance = _distance(s)
+    s.rate_noise = s.force_noise = 0.0
     if s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0:
         vec.store(s.tilt, vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0))
         vec.store(s.north, heading_axis(vec.load(s.tilt)))
+    _forget_motion(s, q)
+    _align(s, force, rate, imu, q)
+
+
+@inner
+def _forget_motion(s: Record, q: Record) -> None:
+    """What was measured of the motion is measured again: the constraint's residual, the excited directions, a rest."""
     s.residual_square, s.reach_square = 0.5 * q.first_residual**2, 0.5
     s.rest_s = 0.0
     for i in range(3):
         for j in range(3):
             s.spread[i, j] = 0.0
-    _align(s, force, rate, imu, q)
 
 
 @inner
@@ -139,8 +172,9 @@ def _align(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         accel = imu.accel_variance + reach * (_START_RAD_S2**2 + speed * (_SWING_PER_S**2 + speed))
         align_to_gravity(s, force, accel, vec.cross(rotation, d), speed * reach + 1e-4)
         return
-    s.speed_square = max(q.first_speed_m_s**2, s.speed_square)  # what has been measured of it stays
-    align_to_gravity(s, force, imu.accel_variance + unknown_accel(force, rate), (0.0, 0.0, 0.0), s.speed_square)
+    accel = unknown_accel(force, rate)
+    s.speed_square = max(q.first_speed_m_s**2, s.speed_square, _START_SWING_S**2 * accel)
+    align_to_gravity(s, force, imu.accel_variance + accel, (0.0, 0.0, 0.0), s.speed_square)
     vec.store(s.swing, (0.0, 0.0, 0.0))
     vec.store(s.mean_force, force)
     vec.store(s.mean_rate, rate)
@@ -160,9 +194,12 @@ def _bridge(s: Record, h: float, rate: Vec, imu: ImuCalibration) -> None:
 @inner
 def _advance(
     s: Record, time_s: float, dead: bool, has_force: bool, force: Vec, has_rate: bool, rate: Vec, imu: ImuCalibration,
-    q: Record,
+    noisy: ImuCalibration, q: Record,
 ) -> bool:  # fmt: skip
-    """One sample later. False where its reading is rejected as a spike."""
+    """One sample later. False where its reading is rejected as a spike.
+
+    `imu` holds the declared noise, by which a rest is recognised, `noisy` the noise as measured.
+    """
     before_force, before_rate, newest = vec.load(s.force), vec.load(s.rate), vec.load(s.newest_rate)
     had_rate = s.blind_s == 0.0
     h = time_s - s.time
@@ -174,17 +211,20 @@ def _advance(
     rate = rate if has_rate or is_bounded(rate) else newest
     waits = has_force and has_rate and h < LONGEST_HOLD_S and _same(force, before_force)
     jerk = vec.minus(rate, newest)
-    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2
+    jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2 + _JUMP_VARIANCES * noisy.gyro_variance
     if time_s > s.turned_at and not (waits and (jumped or _same(rate, newest))):
-        _turn(s, time_s - s.turned_at, has_rate, rate, jumped, imu)
+        _turn(s, time_s - s.turned_at, has_rate, rate, jumped, noisy)
     if waits:
         return True
     change = vec.minus(force, before_force)
-    jumped = q.has_joint > 0.0 and (jumped or vec.dot(change, change) > _JUMP_M_S2**2)
+    jumped = q.has_joint > 0.0 and (
+        jumped or vec.dot(change, change) > _JUMP_M_S2**2 + _JUMP_VARIANCES * noisy.accel_variance
+    )
     if jumped and s.span > 0.0:  # so that this reading is judged alone
-        _update(s, had_rate, _NO_JUMP, before_rate, before_rate, imu, q)
-    _integrate(s, h, force, change, imu)
+        _update(s, had_rate, _NO_JUMP, before_rate, before_rate, imu, noisy, q)
+    _integrate(s, h, force, change, noisy)
     if has_force and has_rate:
+        follow_noise(s, force, rate, h, imu)
         follow_rest(s, force, rate, h, imu)
     if not q.has_joint:
         follow_speed(s, vec.scale(h, angular_rate(s, rate)), force, h, q)
@@ -192,7 +232,7 @@ def _advance(
             follow_steadiness(s, force, rate, h, imu, q)
     taken = True
     if jumped or s.span > _UPDATE_INTERVAL_S:
-        taken = _update(s, has_rate, jumped, before_rate, rate, imu, q)
+        taken = _update(s, has_rate, jumped, before_rate, rate, imu, noisy, q)
     if not taken:
         # A spike: its effect on this step is uncertain, and the next step does without it.
         add_noise(s, 0.0, 0.25 * h * h * vec.dot(change, change))
@@ -204,7 +244,7 @@ def _advance(
     vec.store(s.rate, rate)
     vec.store(s.newest_rate, rate)
     vec.store(s.force_change, change)
-    _restart_if_lost(s, force, rate, imu, q)
+    _restart_if_lost(s, force, rate, noisy, q)
     return taken
 
 
@@ -239,23 +279,27 @@ def _integrate(s: Record, h: float, force: Vec, change: Vec, imu: ImuCalibration
 
 
 @inner
-def _update(s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> bool:
+def _update(
+    s: Record, has_rate: bool, jumped: bool, before: Vec, rate: Vec, imu: ImuCalibration, noisy: ImuCalibration,
+    q: Record,
+) -> bool:  # fmt: skip
     """Bring the covariance up to the mean and apply the measurements. False where the reading is rejected."""
     h, impulse, taken = s.span, vec.load(s.impulse), True
     lasting = max(2.0 * correlation_time(s, q) / h, 1.0)
     rotation = lasting * q.gyro_misfit**2 * vec.dot(vec.load(s.turned), vec.load(s.turned))
     velocity = lasting * q.accel_misfit**2 * vec.dot(impulse, impulse)
-    force = _steady_force(s, vec.scale(1.0 / h, impulse), imu)
+    force = _steady_force(s, vec.scale(1.0 / h, impulse), noisy, q)
     propagate_covariance(s, force, rotation, velocity, _bias_walk(s, q) ** 2 * h)
     clear_increments(s)
     for i in range(D, PSI):
         s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[D, D] * h
     decay_to_prior(s, h)
+    update_bias_from_rest(s, h, noisy)
     if q.has_joint:
-        update_bias_from_rest(s, h, imu)
         if has_rate:
-            taken = update_joint_velocity(s, jumped, before, rate, h, imu, q)
+            taken = update_joint_velocity(s, jumped, before, rate, h, noisy, q)
     else:
+        update_tilt_from_rest(s, h, noisy)
         update_free_velocity(s, h, q)
         if has_rate and s.no_force_s + s.clipped_s == 0.0:
             update_bias_from_steadiness(s, rate, h, imu, q)
@@ -277,11 +321,15 @@ def _bias_walk(s: Record, q: Record) -> float:
 
 
 @inner
-def _steady_force(s: Record, force: Vec, imu: ImuCalibration) -> Vec:
-    """The force, as far as it has moved by more than noise does.
+def _steady_force(s: Record, force: Vec, imu: ImuCalibration, q: Record) -> Vec:
+    """The part of the force that may update the accelerometer's matrix M_a.
 
-    At rest, a force with its noise would update the accelerometer's matrix: the same noise is in v.
+    What is in v too would be explained by M_a = 1, whatever it is (errors in variables). At rest that is the noise: the
+    force counts as far as it has moved by more than noise does. Without a joint it is all acceleration, since the model
+    0 = v + e has the true velocity in e: gravity alone counts.
     """
+    if not q.has_joint:
+        return vec.scale(GRAVITY, vec.load(s.tilt))
     slack = _STEADY_SIGMAS * math.sqrt(imu.accel_variance)
     steady = vec.load(s.steady_force)
     ahead = vec.minus(force, steady)
@@ -320,7 +368,24 @@ def _restart_if_lost(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: R
         return
     s.restarts += 1
     clear_increments(s)
-    _begin(s, force, rate, imu, q)
+    if not possible:
+        _begin(s, force, rate, imu, q)
+        return
+    _widen_parameters(s)
+    _forget_motion(s, q)
+    _align(s, force, rate, imu, q)
+
+
+@inner
+def _widen_parameters(s: Record) -> None:
+    """Keep the estimates of J2S and the sensor errors, with a wider σ: at most that of the start."""
+    p = s.covariance
+    for i in range(BG, PSI):
+        factor = min(_WIDEN, math.sqrt(s.start_covariance[i, i] / max(p[i, i], 1e-300)))
+        for j in range(SIZE):
+            p[i, j] *= factor
+        for j in range(SIZE):
+            p[j, i] *= factor
 
 
 @inner
@@ -340,42 +405,65 @@ def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     ahead = corrected(s.nominal, MG, ahead)
     tilt, north = vec.turn_back(ahead, vec.load(s.tilt)), vec.turn_back(ahead, vec.load(s.north))
     west, d = vec.cross(tilt, north), vec.load(s.j2s)
-    vec.store(row.tilt, tilt)
-    row.height, row.x, row.y = vec.dot(tilt, d), vec.dot(north, d), vec.dot(west, d)
-    row.height_std = _height_std(s, tilt, d, vec.axpy(1.0, vec.load(s.turned), ahead))
-    row.yaw = math.atan2(west[0], north[0])
-    row.yaw_std = _yaw_std(s, tilt, north, west)
+    _report_values(tilt, north, west, d, row)
+    _report_stds(s, vec.scale(-1.0, vec.axpy(1.0, vec.load(s.turned), ahead)), tilt, north, west, d, row)
     row.distance = s.distance
+    unknown = 0
     if math.isnan(s.time) or max(s.blind_s, s.no_force_s) > _NO_SENSOR_S:
         vec.store(row.tilt, (math.nan, math.nan, math.nan))
-        row.height = row.height_std = row.x = row.y = row.yaw = row.yaw_std = math.nan
+        unknown = YAW + 1
     elif vec.quadratic(sub_covariance(s.covariance, D), tilt) > _UNKNOWN_HEIGHT_M**2:
-        row.height = row.height_std = row.x = row.y = math.nan
+        unknown = Y + 1
+    for i in range(unknown):
+        row.value[i] = row.std[i] = math.nan
 
 
 @inner
-def _yaw_std(s: Record, tilt: Vec, north: Vec, west: Vec) -> float:
-    """σ of the yaw, atan2(Y_x, X_x) (rad).
+def _report_values(tilt: Vec, north: Vec, west: Vec, d: Vec, row: Record) -> None:
+    """Position of the sensor and the angles of its attitude R_z(yaw) R_y(pitch) R_x(roll)."""
+    vec.store(row.tilt, tilt)
+    row.value[HEIGHT], row.value[X], row.value[Y] = vec.dot(tilt, d), vec.dot(north, d), vec.dot(west, d)
+    row.value[ROLL] = math.atan2(tilt[1], tilt[2])
+    row.value[PITCH] = math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))
+    row.value[YAW] = math.atan2(west[0], north[0])
 
-    The attitude error is the rotation θ = ψ Z − Z × δZ, which turns X by X × θ and Y by Y × θ.
+
+@inner
+def _report_stds(s: Record, back: Vec, tilt: Vec, north: Vec, west: Vec, d: Vec, row: Record) -> None:
+    """σ of each reported value; `back` is the rotation to the attitude at which the covariance was propagated (rad).
+
+    The attitude error is the rotation θ = ψ Z − Z × δZ, which turns X by X × θ and Y by Y × θ. The gradient of
+    yaw = atan2(Y_x, X_x) with respect to θ follows from these; that of Xᵀd is d × X, that of Yᵀd is d × Y.
     """
-    scale = 1.0 / max(north[0] * north[0] + west[0] * west[0], 1e-4)
+    none = (0.0, 0.0, 0.0)
+    row.std[HEIGHT] = _std(s, vec.turn_back(back, d), 0.0, tilt)  # δ(Zᵀd) = dᵀδZ + Zᵀδd
+    slope = vec.cross(d, north)
+    row.std[X] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), north)
+    slope = vec.cross(d, west)
+    row.std[Y] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), west)
+    level = max(tilt[1] * tilt[1] + tilt[2] * tilt[2], _LEAST_LEVEL)
+    slope = (0.0, tilt[2] / level, -tilt[1] / level)
+    row.std[ROLL] = _std(s, vec.turn_back(back, slope), 0.0, none)
+    level = math.sqrt(level)
+    slope = (-level, tilt[0] * tilt[1] / level, tilt[0] * tilt[2] / level)
+    row.std[PITCH] = _std(s, vec.turn_back(back, slope), 0.0, none)
+    level = max(north[0] * north[0] + west[0] * west[0], _LEAST_LEVEL)
     slope = (0.0, west[0] * north[2] - north[0] * west[2], north[0] * west[1] - west[0] * north[1])
-    slope = vec.scale(scale, slope)
-    along, across = vec.dot(slope, tilt), vec.cross(tilt, slope)
-    p, variance = s.covariance, vec.quadratic(sub_covariance(s.covariance, Z), across)
-    variance += along * along * p[PSI, PSI]
-    for i in range(3):
-        variance += 2.0 * along * across[i] * p[Z + i, PSI]
-    return math.sqrt(max(variance, 0.0))
+    slope = vec.scale(1.0 / level, slope)
+    row.std[YAW] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), none)
 
 
 @inner
-def _height_std(s: Record, tilt: Vec, d: Vec, turned: Vec) -> float:
-    """σ of Zᵀd (m), the sensor having `turned` (rad) since the covariance was propagated: δ(Zᵀd) = dᵀδZ + Zᵀδd."""
-    p, lever = s.covariance, vec.turn_back(vec.scale(-1.0, turned), d)
-    variance = vec.quadratic(sub_covariance(p, Z), lever) + vec.quadratic(sub_covariance(p, D), tilt)
+def _std(s: Record, across: Vec, along: float, towards: Vec) -> float:
+    """σ of a value with the gradients `across` (of Z), `along` (of ψ) and `towards` (of J2S)."""
+    g, p, variance = s.gradient, s.covariance, 0.0
     for i in range(3):
-        for j in range(3):
-            variance += 2.0 * lever[i] * tilt[j] * p[Z + i, D + j]
+        g[i], g[3 + i] = across[i], towards[i]
+    g[6] = along
+    for i in range(7):
+        row = i if i < 3 else i + D - 3  # J2S and ψ are neighbours
+        part = 0.5 * g[i] * p[row, row]
+        for j in range(i):
+            part += g[j] * p[row, j if j < 3 else j + D - 3]
+        variance += 2.0 * g[i] * part
     return math.sqrt(max(variance, 0.0))

@@ -1,4 +1,4 @@
-"""Rest as a measurement of the gyro bias: by a test of stillness, and without a threshold by steadiness."""
+"""Rest as a measurement of gyro bias and tilt: by a test of stillness, and without a threshold by steadiness."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._vector import Vec
-from linkpose.filters.inertial.state import BA, BG, Record
-from linkpose.filters.inertial.update import constrain_attitude, sub_covariance, update_scalar
+from linkpose.filters.inertial.propagate import specific_force
+from linkpose.filters.inertial.state import BA, BG, MA, SIZE, Record, Z
+from linkpose.filters.inertial.update import constrain_attitude, project, sub_covariance, update_scalar, update_vector
 
-_REST_S = 0.5  # of stillness before the mean rate counts as the bias (s): longer than a turning point of a slow swing
+# Stillness before the mean rate counts as the gyro bias and the mean force as gravity (s): longer than a turning point
+# of a slow swing. Doubled, a launch soon after switch-on leans the tilt.
+REST_S = 0.5
 # A link that is held still turns by no more than this in all (rad, 1σ): a hand's tremor through a metre of lever.
 # Divided by the length of the rest it bounds the mean rate. Doubling it doubles the heading's drift after a short rest.
 _SWAY_RAD = 5e-4
-_MOST_SWAY_RAD_S = _SWAY_RAD / _REST_S
+_MOST_SWAY_RAD_S = _SWAY_RAD / REST_S
 _REST_SIGMAS = 5.0  # within which the readings must stay: one sound sample in 10⁶ ends a rest
 _TURN_SIGMAS = 3.0  # a mean rate this far from the bias estimate is a turn at constant rate
+_SWAY_M_S = 0.05  # change of velocity over a rest (m/s, 1σ): a hand's tremor
+_NORM_M_S2 = 0.5  # 1σ of the force along Z at rest (m/s²): 3 % scale and 50 mg, an uncalibrated MPU-6050
 _GATE = 25.0  # χ² with one degree of freedom: five standard deviations
 
 
@@ -33,8 +38,10 @@ def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration)
         return
     if still == 0.0:
         vec.store(s.rest_force, force)
+        vec.store(s.rest_force_sum, (0.0, 0.0, 0.0))
         vec.store(s.rest_rate_sum, (0.0, 0.0, 0.0))
     s.rest_s = still + h
+    vec.store(s.rest_force_sum, vec.axpy(h, force, vec.load(s.rest_force_sum)))
     vec.store(s.rest_rate_sum, vec.axpy(h, rate, vec.load(s.rest_rate_sum)))
 
 
@@ -45,7 +52,7 @@ def update_bias_from_rest(s: Record, h: float, imu: ImuCalibration) -> None:
     `h`: time since the last update (s), over which the noise of the gyro counts as correlated.
     """
     p, rest_s = s.covariance, s.rest_s
-    if rest_s <= _REST_S:
+    if rest_s <= REST_S:
         return
     variance = imu.gyro_variance * h / rest_s + (_SWAY_RAD / rest_s) ** 2
     if vec.trace(sub_covariance(p, BG)) <= 6.0 * variance:
@@ -57,6 +64,37 @@ def update_bias_from_rest(s: Record, h: float, imu: ImuCalibration) -> None:
     for j in range(3):
         update_scalar(s, BG + j, s.rest_rate_sum[j] / rest_s - s.nominal[BG + j], variance)
     constrain_attitude(s)
+
+
+@inner
+def update_tilt_from_rest(s: Record, h: float, imu: ImuCalibration) -> None:
+    """The mean force since the rest began is gravity: f − g Z = g δZ + δb_a + δM_a s_A + e.
+
+    The velocity of a rest is constant, which need not be zero: no velocity is assumed. Along Z the force shows no tilt,
+    only the sensor's own scale and offset, which are those of a calibrated sensor in the state: it counts little.
+    `h`: time since the last update (s), over which the noise of the accelerometer counts as correlated.
+    """
+    rest_s = s.rest_s
+    if rest_s <= REST_S:
+        return
+    reading, jacobian = vec.scale(1.0 / rest_s, vec.load(s.rest_force_sum)), s.jacobian
+    for c in range(3):
+        for j in range(SIZE):
+            jacobian[c, j] = 0.0
+        jacobian[c, Z + c] = GRAVITY
+        jacobian[c, BA + c] = 1.0
+        for k in range(3):
+            jacobian[c, MA + 3 * c + k] = reading[k]
+    variance = imu.accel_variance * h / rest_s + (_SWAY_M_S / rest_s) ** 2
+    expected = project(s)
+    if vec.trace(expected) <= 6.0 * variance:
+        return
+    tilt = vec.load(s.tilt)
+    innovation = vec.axpy(-GRAVITY, tilt, specific_force(s, reading))
+    whole = vec.plus_diagonal(expected, variance + _NORM_M_S2**2)
+    inverse = vec.inverse(vec.add(whole, -(_NORM_M_S2**2), vec.cross_square(tilt, 1.0)))
+    distance = vec.quadratic(inverse, innovation)
+    update_vector(s, innovation, vec.scaled(min(1.0, _GATE / max(distance, 1.0)), inverse))
 
 
 @inner

@@ -23,6 +23,8 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters.frozen import MEMORY, fresh_memory
+
 Floats = NDArray[np.float64]
 Record = Any  # one record of STATE, ESTIMATE or PARAMETERS; a pointer in compiled code
 
@@ -65,15 +67,22 @@ _FIELDS = np.dtype(
         ("blind_s", "f8"),  # how long no usable rate has arrived (s)
         ("no_force_s", "f8"),  # how long no force has arrived (s)
         ("clipped_s", "f8"),  # how long the accelerometer has been saturated (s)
+        ("last_readings", "f8", (MEMORY,)),  # of `frozen.is_frozen`
         # Increments accumulated since the last propagation of the covariance.
         ("span", "f8"),  # s
         ("turned", *_VECTOR),  # rotation (rad)
         ("impulse", *_VECTOR),  # ∫ force (m/s)
         ("rotation_variance", "f8"),  # each axis (rad²)
         ("velocity_variance", "f8"),  # each axis (m²/s²)
+        # Noise of the readings.
+        ("force_differences", "f8", (4, 3)),  # last force and its differences up to the third
+        ("rate_differences", "f8", (4, 3)),
+        ("force_noise", "f8"),  # measured variance of each axis (m²/s⁴)
+        ("rate_noise", "f8"),  # rad²/s²
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
+        ("rest_force_sum", *_VECTOR),  # ∫ force over the rest (m/s)
         ("rest_rate_sum", *_VECTOR),  # ∫ rate over the rest (rad)
         ("steady_force", *_VECTOR),  # force without its noise (m/s²)
         ("residual_square", "f8"),  # mean square of the joint constraint's excess residual (m²/s²)
@@ -88,6 +97,7 @@ _FIELDS = np.dtype(
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
+        ("gradient", "f8", (7,)),  # of a reported value with respect to Z, d and ψ
         ("work", "f8", (7, SIZE)),
         # Counters.
         ("rejected", "i8"),
@@ -115,15 +125,14 @@ def _with_parts(dtype: np.dtype[Any], whole: str, parts: dict[str, int]) -> np.d
 
 STATE = _with_parts(_FIELDS, "nominal", {"tilt": Z, "velocity": V, "gyro_bias": BG, "accel_bias": BA, "j2s": D})
 
+# Places of the reported values; σ follow them in a table, in the same order.
+HEIGHT, X, Y, ROLL, PITCH, YAW, SIGMA = (_index(k) for k in range(7))
+
 ESTIMATE = np.dtype(
     [
-        ("height", "f8"),  # Zᵀd (m)
-        ("height_std", "f8"),
+        ("value", "f8", (6,)),  # height Zᵀd, x, y (m); roll, pitch, yaw (rad)
+        ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
-        ("x", "f8"),  # m
-        ("y", "f8"),
-        ("yaw", "f8"),  # rad
-        ("yaw_std", "f8"),
         ("distance", "f8"),  # `distance` of the state
     ],
     align=True,
@@ -165,6 +174,7 @@ def fresh_state(
     states = np.zeros(1, STATE).view(np.recarray)
     state: Any = states[0]
     state.time = np.nan
+    state.last_readings[:] = fresh_memory()
     state.prior[:] = errors.variances()
     state.start_mean[D:PSI] = j2s_m
     state.start_covariance[:] = np.diag(state.prior + np.repeat([0.0, j2s_std_m**2, 0.0], [D, 3, 1]))
@@ -173,7 +183,7 @@ def fresh_state(
     return states
 
 
-def roll_pitch_deg(tilt: Floats) -> tuple[Floats, Floats]:
-    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖) (degrees, (N,)) of tilts (N, 3) of any length."""
+def roll_pitch(tilt: Floats) -> tuple[Floats, Floats]:
+    """roll = atan2(Z_y, Z_z), pitch = atan2(−Z_x, ‖(Z_y, Z_z)‖) (rad, (N,)) of tilts (N, 3) of any length."""
     roll = np.arctan2(tilt[:, 1], tilt[:, 2])
-    return np.degrees(roll), np.degrees(np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2])))
+    return roll, np.arctan2(-tilt[:, 0], np.hypot(tilt[:, 1], tilt[:, 2]))

@@ -20,8 +20,9 @@ import numpy as np
 
 from linkpose.compiling import compiled, inner
 from linkpose.errors import CannotRun
+from linkpose.filters._vector import wrapped
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
-from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
+from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
 from linkpose.filters.mice.reading import (
     BIAS_STD,
     HOLD_S,

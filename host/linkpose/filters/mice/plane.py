@@ -43,9 +43,3 @@ def turned_mean(angle: float) -> complex:
     half = 0.5 * angle
     share = math.sin(half) / half if abs(half) > 1e-6 else 1.0
     return scaled(share, unit(half))
-
-
-@inner
-def wrapped(angle: float) -> float:
-    """The angle (rad) in [−π, π)."""
-    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import compiled, inner
+from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number
 from linkpose.filters.mice.least_squares import squared_speed
-from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit, wrapped
+from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.measure import arm, update

@@ -1,0 +1,75 @@
+"""Draws rows of estimates into a scene, for the live page and for files that hold an animation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose import quantities
+from linkpose.page.history import History, Replay
+from linkpose.page.scene import scene_of
+from linkpose.presentation import Row, RowReader, best_filter
+from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.sensors.measurements import Floats
+from linkpose.sensors.rig import Rig
+
+if TYPE_CHECKING:
+    import viser
+
+    from linkpose.page.scene import Surroundings
+
+_SHOWN_BY = (QW, HEIGHT, HEADING, ROLL)  # the first that is known selects the best filter
+
+
+class Drawing:
+    """A scene and the columns of the estimates that it shows."""
+
+    def __init__(
+        self, server: viser.ViserServer, columns: Sequence[str], rig: Rig, surroundings: Surroundings | None
+    ) -> None:
+        """`columns` are those of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; others are a reference."""
+        self._rows = RowReader(columns)
+        self._at = {column: at for at, column in enumerate(columns)}
+        self._of_filter = quantities.by_filter(columns)
+        self._reference_at = [
+            (part.quantity, at)
+            for column, at in self._at.items()
+            if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
+        ]
+        self._scene = scene_of(server, self._of_filter.values(), rig, surroundings)
+
+    def read(self, newest: Floats) -> Row:
+        """A row (columns,) by filter and quantity."""
+        return self._rows.read(newest.tolist())
+
+    def best(self, row: Row) -> str | None:
+        """The best filter with a value in this row; without any value, the best filter at all."""
+        found = [(q, name) for q in _SHOWN_BY if (name := best_filter(row, self._rows.filters, q)) is not None]
+        known = [name for q, name in found if math.isfinite(row[name][q][0])]
+        return next(iter(known + [name for _, name in found]), None)
+
+    def draw(self, newest: Floats, row: Row, name: str, history: History | Replay, j2s_m: Floats | None = None) -> None:
+        """Draws the newest row as the filter `name` estimates it; `j2s_m` (3,) is J2S if it is being estimated."""
+        if j2s_m is not None and hasattr(self._scene, "set_j2s"):
+            self._scene.set_j2s(j2s_m)
+        path = self._path(name, history) if self._scene.is_path_due else None
+        self._scene.draw(row, name, self._reference(newest), path)
+
+    def _reference(self, newest: Floats) -> dict[Quantity, float]:
+        return {quantity: float(newest[at]) for quantity, at in self._reference_at}
+
+    def _path(self, name: str, history: History | Replay) -> Floats | None:
+        """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path."""
+        of = self._of_filter.get(name, {})
+        if not {X, Y, HEADING} <= of.keys():
+            return None
+        rows = history.path()
+        names = [of[X], of[Y], of[HEADING], quantities.std_column(of[X]), quantities.std_column(of[Y])]
+        names += [quantities.covariance_column(name, X, Y), X.column, Y.column]
+        unknown = np.full(len(rows), math.nan)
+        path = np.column_stack([rows[:, self._at[n]] if n in self._at else unknown for n in names])
+        path[:, 5] = np.nan_to_num(path[:, 5])  # without its column: the axes of the ellipse are those of the map
+        return path

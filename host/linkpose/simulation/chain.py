@@ -1,0 +1,164 @@
+"""Two links with a sensor on each: a leg that hangs from a fixed joint, with a hinge or a ball joint at the knee.
+
+Link 1 moves about its fixed joint as the link of `simulation.link` does. Link 2 turns relative to it under the same
+envelope: at rest at the start and at the end. Rotations R take vectors of sensor 2's axes into sensor 1's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.errors import LinkposeError
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
+from linkpose.sensors.rig import CHAIN_JOINTS, Chain, Imu, Joint, Rig, Vector, to_vector
+from linkpose.simulation.link import LinkRun
+from linkpose.simulation.motion import HandMotion, Kinematics
+
+Floats = NDArray[np.float64]
+
+DURATION_S = 60.0
+J2S_M: Vector = (0.03, 0.06, -0.25)  # from the fixed joint to sensor 1, half-way down a thigh of 0.45 m
+R1_M: Vector = (0.03, 0.06, 0.20)  # from the knee to sensor 1
+_R2_ALIGNED_M = np.array([0.02, 0.05, -0.15])  # from the knee to sensor 2, in sensor 1's axes while the leg is straight
+_AXIS1 = np.array([0.05, 1.0, 0.10])  # of the hinge, in sensor 1's axes: to the side, as a strap leaves it
+_STRAP = ((2, 0.45), (0, 0.2))  # how sensor 2 is turned on its link: about z, then about x (rad)
+_SWING1_RAD, _SWING2_RAD = 0.35, 0.4  # rms of the angles of link 1, and of link 2 relative to it: a brisk walk
+_RELATIVE_MOTION = 10  # stream of random numbers, apart from those of the link
+_RIG_STD_M, _RIG_STD_DEG = 0.002, 0.5  # that a rig file states of the mounting
+
+
+class Relative(NamedTuple):
+    """Link 2 relative to link 1 at N instants."""
+
+    rotation: Floats  # (N, 3, 3) R
+    angle_rad: Floats  # (N,) of a hinge since the start
+    rate_rad_s: Floats  # (N, 3) in sensor 1's axes
+    rate_derivative_rad_s2: Floats  # (N, 3) of these components
+
+
+class ChainRun(LinkRun):
+    """A run of the simulated chain. Pure, as `LinkRun`; sensor 1 is the link's, sensor 2 sits on link 2."""
+
+    def __init__(
+        self,
+        joint: str = "hinge",
+        seed: int = 0,
+        duration_s: float | None = DURATION_S,
+        rate_hz: float = 100.0,
+        errors: str = "calibrated",
+        *,
+        accel_range_g: int = 8,
+        gyro_range_deg_s: int = 1000,
+        oversampling: int = 1,
+        noise_of: Rig | None = None,
+    ) -> None:
+        """`joint` is "ball" or "hinge"; the other arguments are those of `LinkRun`. Raises LinkposeError as it does."""
+        if joint not in CHAIN_JOINTS:
+            raise LinkposeError(f"there is no joint {joint!r}: take {' or '.join(CHAIN_JOINTS)}")
+        super().__init__(
+            1, seed, duration_s, rate_hz, errors, J2S_M, accel_range_g=accel_range_g, gyro_range_deg_s=gyro_range_deg_s,
+            oversampling=oversampling, imu2=True, noise_of=noise_of, swing_rad=_SWING1_RAD,
+        )  # fmt: skip
+        self.joint = joint
+        self._turned = HandMotion(np.random.default_rng([seed, _RELATIVE_MOTION]), 1.0, duration_s)
+        self._turned.amplitude_rad = _SWING2_RAD
+        self._first_angles = self._turned.angles(np.zeros(1))[0]
+        self._axes = np.stack([_AXIS1 / np.linalg.norm(_AXIS1), *np.eye(3)[[0, 2]]])
+        self._mount = np.eye(3)
+        for axis, angle in _STRAP:
+            self._mount = self._mount @ about(np.eye(3)[axis], np.array([angle]))[0]
+        self._r1, self._r2 = np.array(R1_M), self._mount.T @ _R2_ALIGNED_M
+
+    @property
+    def description(self) -> str:
+        return f"sim://chain?joint={self.joint}&seed={self.seed}&errors={self.errors}"
+
+    @property
+    def rig(self) -> Rig:
+        """What is known without a calibration of the chain: the fixed joint, and which joint the chain has."""
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=Chain(self.joint))
+
+    @property
+    def calibrated_rig(self) -> Rig:
+        """The rig file with the mounting of both sensors."""
+        axis1 = self._axes[0]
+        chain = Chain(self.joint, to_vector(self._r1), _RIG_STD_M, to_vector(self._r2), _RIG_STD_M)
+        if self.joint == "hinge":
+            axes = to_vector(axis1), _RIG_STD_DEG, to_vector(self._mount.T @ axis1), _RIG_STD_DEG
+            chain = Chain(*(chain.joint, chain.r1_m, chain.r1_std_m, chain.r2_m, chain.r2_std_m), *axes)
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=chain)
+
+    def relative(self, time_s: Floats) -> Relative:
+        """Link 2 relative to link 1 at any instants (N,), s.
+
+        R = Π exp([a_k×] θ_k) R_mount over the joint's axes a_k: one of a hinge, three of a ball joint.
+        """
+        angles = self._turned.angles(time_s)
+        angles[0] -= self._first_angles
+        rotation = np.broadcast_to(np.eye(3), (len(time_s), 3, 3))
+        rate, derivative = np.zeros((len(time_s), 3)), np.zeros((len(time_s), 3))
+        for k in range(1 if self.joint == "hinge" else 3):
+            axis = rotation @ self._axes[k]
+            turning = angles[1, k][:, None] * axis
+            derivative = derivative + angles[2, k][:, None] * axis + np.cross(rate, turning)
+            rate = rate + turning
+            rotation = rotation @ about(self._axes[k], angles[0, k])
+        return Relative(rotation @ self._mount, angles[0, 0], rate, derivative)
+
+    def second_link(self, time_s: Floats) -> Kinematics:
+        """Kinematics of link 2 in sensor 2's axes; its yaw is not given."""
+        first, relative = self._motion.at(time_s), self.relative(time_s)
+        rate = first.rate_rad_s + relative.rate_rad_s
+        derivative = first.rate_derivative_rad_s2 + relative.rate_derivative_rad_s2
+        derivative = derivative + np.cross(first.rate_rad_s, relative.rate_rad_s)
+        turned = (_back(relative.rotation, vectors) for vectors in (first.tilt, rate, derivative))
+        return Kinematics(np.full(len(time_s), np.nan), *turned)
+
+    def _second(self, time_s: Floats) -> tuple[Floats, Floats]:
+        knee = self._motion.at(time_s).acceleration(self._d - self._r1)
+        link = self.second_link(time_s)
+        accel = _back(self.relative(time_s).rotation, knee) + link.acceleration(self._r2)
+        return STANDARD_GRAVITY * link.tilt + accel, link.rate_rad_s
+
+    def truth_columns(self, time_s: Floats) -> Mapping[str, Floats]:
+        """Sensor 1 as a link's; R as a quaternion, the angle of a hinge, and the heights of both sensors."""
+        link, relative = self.at(time_s), self.relative(time_s)
+        columns = dict(super().truth_columns(time_s))
+        columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternions(relative.rotation).T, strict=True))
+        if self.joint == "hinge":
+            columns["angle_deg"] = (np.degrees(relative.angle_rad) + 180.0) % 360.0 - 180.0
+        below = link.tilt @ (self._d - self._r1) + self.second_link(time_s).tilt @ self._r2
+        return columns | {"height1_m": link.height_m, "height2_m": below}
+
+
+def about(axis: Floats, angle_rad: Floats) -> Floats:
+    """Rotation matrices (N, 3, 3) about a unit axis (3,), by Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    sine, cosine = np.sin(angle_rad)[:, None, None], np.cos(angle_rad)[:, None, None]
+    return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
+
+
+def quaternions(rotation: Floats) -> Floats:
+    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3); the scalar comes first and is not negative.
+
+    The largest of the four numbers follows from the diagonal, the others from it (S. W. Shepperd, 1978).
+    """
+    r = np.moveaxis(rotation, 0, 2)
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    xx, yy, zz = (1 + 2 * r[i, i] - trace for i in range(3))
+    rows = np.array([[1 + trace, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]])
+    q = rows[np.argmax([1 + trace, xx, yy, zz], axis=0), :, np.arange(len(rotation))]
+    q *= np.where(q[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(q)
+
+
+def _back(rotation: Floats, vectors: Floats) -> Floats:
+    """Rᵀ v for N rotations (N, 3, 3) and vectors (N, 3)."""
+    return np.asarray(np.einsum("nji,nj->ni", rotation, vectors))

@@ -1,0 +1,276 @@
+"""What the board reports of itself, its sensors and its mice reaches the user; resets while the session resumes."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from scripted_board import ScriptedBoard, install
+
+from linkpose.board import Board
+from linkpose.device import session as session_module
+from linkpose.device.session import Session
+from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.sensors.devices import mouse_speed_limit
+from linkpose.sensors.rig import Mouse, Rig
+from linkpose.wire.messages import (
+    Ack,
+    Command,
+    Configure,
+    DeviceState,
+    Hello,
+    HelloMouse,
+    Message,
+    MouseLacks,
+    Nak,
+    NakReason,
+    Pong,
+    ResetCause,
+    SelfTestResult,
+    Start,
+)
+
+FAST = "sim://mice?speed=0"
+OK, STARTING, ABSENT = DeviceState.OK, DeviceState.STARTING, DeviceState.ABSENT
+
+
+@pytest.fixture
+def board(monkeypatch: pytest.MonkeyPatch) -> Iterator[ScriptedBoard]:
+    yield install(monkeypatch)
+
+
+def mouse(state: DeviceState, lacks: int = 0) -> HelloMouse:
+    known = state == OK
+    return HelloMouse(state, 0 if known else 0xFF, 0x60 * known, 8 * known, 200 * known, lacks)
+
+
+def hellos(*states: tuple[DeviceState, ...]) -> Callable[[Hello], Hello]:
+    """HELLOs whose mice have these states, one HELLO after the other; the last states stay."""
+    left = list(states)
+    return lambda hello: hello._replace(mice=tuple(map(mouse, left.pop(0) if len(left) > 1 else left[0])))
+
+
+# ---- mice ----
+
+
+@pytest.mark.parametrize(
+    ("states", "wanted", "waits"),
+    [
+        ([(OK, OK, OK)], 3, False),
+        ([(STARTING, OK, OK), (STARTING, OK, OK), (OK, OK, OK)], 0, True),
+        ([(OK, ABSENT, ABSENT), (OK, OK, ABSENT)], 2, True),
+    ],
+    ids=["all there", "being set up", "found later"],
+)
+def test_mice_that_are_being_set_up_are_waited_for(
+    board: ScriptedBoard, states: list[tuple[DeviceState, ...]], wanted: int, waits: bool
+) -> None:
+    board.hello = hellos(*states)
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        session.wait_for_mice(wanted)
+        assert [m.state for m in session.hello.mice] == list(states[-1])
+    assert said == ["Waiting for the mice, which are being set up or have not been found yet"] * waits
+
+
+def test_a_mouse_that_never_comes_does_not_hold_up_the_recording(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_module, "MICE_TIMEOUT_S", 0.02)
+    board.hello = hellos((STARTING, OK, ABSENT))
+    with Board(
+        FAST, notify=lambda _: None, rig=Rig(mouse=(Mouse(0.1, 0.0), Mouse(-0.1, 0.1), Mouse(-0.1, -0.1)))
+    ) as connected:
+        block = next(connected.stream(0.1))
+    assert block.mice_counts.shape[1] == 3  # a column for each mouse of the rig
+
+
+def test_what_a_mouse_refused_is_reported(board: ScriptedBoard, linkpose: Callable) -> None:
+    mice = tuple(mouse(OK, int(lack)) for lack in MouseLacks)
+    board.hello = lambda hello: hello._replace(mice=mice[1:])
+    said = linkpose("info", "--port", FAST).err
+    for port, words in enumerate(("ENABLE", "200 reports/s", "runs at 8 counts/mm", "its resolution is assumed"), 1):
+        assert re.search(f"The mouse at port {port} .*{words}", said)
+    board.hello = lambda hello: hello._replace(mice=mice[:1])
+    assert "The mouse at port 1 refuses remote mode: it is read in stream mode" in linkpose("info", "--port", FAST).err
+
+
+def test_the_speed_limit_of_mice_by_their_counts() -> None:
+    assert mouse_speed_limit(8000, 100) == pytest.approx(3.19, abs=0.01)  # firmware/README.md: 3.2 m/s
+    assert mouse_speed_limit(1000 / 0.0254, 100) == pytest.approx(0.65, abs=0.01)
+    assert mouse_speed_limit(1000 / 0.0254, 100, poll_s=0.026) == pytest.approx(0.65 / 3, abs=0.01)
+    assert mouse_speed_limit(8000, 200) == mouse_speed_limit(8000, 100)  # polled at every second tick
+
+
+@pytest.mark.parametrize(("poll_us", "limit"), [(6000, "1.28"), (20_000, "0.64")])
+def test_a_mouse_that_overflows_early_is_reported_from_its_calibration(
+    board: ScriptedBoard, poll_us: int, limit: str
+) -> None:
+    board.status = lambda status: status._replace(mice=tuple(mouse._replace(poll_us=poll_us) for mouse in status.mice))
+    said: list[str] = []
+    rig = Rig(mouse=(Mouse(0.1, 0.0), Mouse(-0.1, 0.0, counts_per_m=20_000.0)))
+    with Board(FAST, notify=said.append, rig=rig) as connected:
+        for _ in connected.stream(2.5):
+            pass
+    warned = [line for line in said if "overflow" in line]
+    assert len(warned) == (poll_us > 7500)
+    assert all(f"Mouse 2 counts 20000 per metre: above {limit} m/s" in line for line in warned)
+
+
+# ---- the board ----
+
+
+@pytest.mark.parametrize(("millivolts", "warned"), [(4300, True), (4500, False), (0, False)])
+def test_a_low_supply_is_reported_once(board: ScriptedBoard, millivolts: int, warned: bool) -> None:
+    board.status = lambda status: status._replace(vcc_mv=millivolts)
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        for _ in session.stream(3.5):
+            pass
+    assert session.status is not None and session.status.vcc_mv == millivolts
+    assert [line for line in said if "supply" in line] == [
+        "The supply of the board is 4.3 V (±10 %), below 4.5 V: mice or sensors may fail. Use a shorter USB cable or "
+        "another port, or supply the mice separately"
+    ] * warned
+
+
+def test_where_the_firmware_hung_is_reported(board: ScriptedBoard, linkpose: Callable) -> None:
+    board.resets, board.cause, board.hung_at = [50], int(ResetCause.HUNG | ResetCause.WATCHDOG), 0x1234
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        for _ in session.stream(1.5):
+            pass
+    assert said[0] == ("the board was reset (the firmware hung at program counter 0x1234); going on, the gap is marked")
+    assert "the firmware hung at program counter 0x1234" in linkpose("info", "--port", FAST).out
+
+
+@pytest.mark.parametrize(
+    ("url", "prefixes"),
+    [("sim://link?speed=0", [""]), ("sim://link?speed=0&imu2=1", ["", "imu2_"])],
+    ids=["one", "two"],
+)
+def test_info_tests_every_inertial_sensor(linkpose: Callable, url: str, prefixes: list[str]) -> None:
+    report = json.loads(linkpose("info", "--port", url, "--self-test", "--json").out)
+    assert [name for name in report if name.endswith("self_test")] == [f"{prefix}self_test" for prefix in prefixes]
+    for prefix in prefixes:
+        assert report[f"{prefix}self_test"] == "passed"
+        assert len(report[f"{prefix}self_test_deviation_percent"]) == 6
+
+
+def test_a_board_without_inertial_sensor_has_no_self_test(board: ScriptedBoard, refused: Callable) -> None:
+    gone = {"id": 0, "family": 0, "state": ABSENT}
+    board.hello = lambda hello: hello._replace(devices=(hello.devices[0]._replace(**gone), *hello.devices[1:]))
+    board._self_test = lambda device: [session_module.Nak(Command.SELF_TEST, 10)]
+    assert "refused SELF_TEST: sensor absent" in refused("info", "--port", "sim://link", "--self-test")
+
+
+@pytest.mark.parametrize(
+    ("messages", "reported"),
+    [
+        ([Pong(7, 0), Pong(8, 0)], True),
+        ([Ack(Command.STOP)], True),
+        ([Nak(Command.CONFIGURE, NakReason.STREAMING)], True),
+        ([Ack(Command.START), SelfTestResult(*[0] * 20)], False),
+    ],
+    ids=["PONG", "STOP", "CONFIGURE", "own"],
+)
+def test_another_program_at_the_same_socket_is_reported_once(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, messages: list[Message], reported: bool
+) -> None:
+    """Nothing locks a socket:// port. Answers that this program has not asked for show the other one."""
+    monkeypatch.setattr(session_module.random, "getrandbits", lambda bits: 1 << (bits - 1))
+    board.inserted = [(50 + at, message) for at, message in enumerate(messages)]
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        assert sum(map(len, session.stream(1.0))) == 100
+    assert not board.inserted
+    assert (
+        said
+        == [f"another program also sends commands to the board at {FAST}; close it, or the data will have gaps"]
+        * reported
+    )
+
+
+# ---- resets while the session resumes ----
+
+
+WANTED = {"sample_rate_hz": 50, "accel_range_g": 16}
+
+
+def stream_through(board: ScriptedBoard, duration_s: float = 6.0) -> tuple[list[str], Board, list]:
+    said: list[str] = []
+    with Board("sim://link?speed=0", settings=WANTED, notify=said.append) as connected:
+        blocks = list(connected.stream(duration_s))
+    return said, connected, blocks
+
+
+def check_resumed(connected: Board, blocks: list) -> None:
+    """One gap, and values scaled by the settings in force: gravity stays gravity."""
+    gaps = connected.health.gaps
+    assert [gap.cause for gap in gaps] == ["reset"]
+    assert connected.settings.sample_rate_hz == 50
+    accel = np.concatenate([block.accel_m_s2 for block in blocks])
+    flags = np.concatenate([block.flags for block in blocks])
+    assert np.count_nonzero(flags & GAP_BEFORE) == 1
+    assert len(accel) + connected.health.lost == 300
+    assert np.linalg.norm(accel, axis=1).mean() == pytest.approx(9.8, abs=1.0)
+
+
+def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reset after 20 samples; each of the next resets comes between CONFIGURE and START, more often than is tried."""
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
+    board.resets, left = [20], 5
+
+    def again(message: object) -> bool:
+        nonlocal left
+        if not board.resets and left and isinstance(message, Start):
+            left -= 1
+            return True
+        return False
+
+    board.resets_at = again
+    said, connected, blocks = stream_through(board)
+    check_resumed(connected, blocks)
+    assert left == 0
+    assert any("was reset" in line for line in said)
+
+
+@pytest.mark.parametrize("times", [2, 5])
+def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, times: int
+) -> None:
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
+    board.resets, left = [20], times
+
+    def lost(message: object) -> bool:
+        nonlocal left
+        if not board.resets and left and isinstance(message, Configure):
+            left -= 1
+            return True
+        return False
+
+    board.lost = lost
+    said, connected, blocks = stream_through(board)
+    check_resumed(connected, blocks)
+    assert left == 0
+    assert any("waiting for the board, Ctrl-C ends" in line for line in said) == (times > 3)
+    assert board.opened == (2 if times > 3 else 1)
+
+
+def test_a_board_whose_samples_come_late_is_heard_to_the_end(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An emulated board on a loaded machine lags by 30 % and pauses near the end: it has not ended before its last."""
+    monkeypatch.setattr(session_module, "LATE_S", 0.05)
+    board.rate, board.pauses_at = 0.7, 250
+    samples = idle = 0
+    with Board("sim://link?speed=0", settings=WANTED, notify=print) as connected:
+        for block in connected.stream(6.0, yield_idle=True):
+            samples, idle = samples + len(block), 0 if len(block) else idle + 1
+            if idle == 3:
+                board.pauses_at = -1
+    assert board.pauses_at == -1
+    assert (samples, connected.health.lost) == (300, 0)

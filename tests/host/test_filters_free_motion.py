@@ -1,0 +1,57 @@
+"""tilt-inertial on free motion made by code: faults of real recordings that must not lean the tilt."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from free_motion import motion
+
+from linkpose.filters.inertial.state import MA, MG
+from linkpose.filters.tilt_inertial import TiltInertialFilter
+from linkpose.sensors.rig import Rig
+
+
+def still(t: float) -> np.ndarray:
+    return np.zeros(3)
+
+
+@pytest.mark.parametrize("rest_s", [1.0, 20.0])
+def test_a_launch_after_a_rest_does_not_lean_the_tilt(rest_s):
+    """0.7 s at 1.2 m/s out and back, as a robot arm starts. The velocity must not be mistaken for a tilt or a bias."""
+
+    def launch(time_s):
+        accel = np.zeros((len(time_s), 3))
+        for begin, sign in ((0.0, 1), (0.7, -1), (0.8, -1), (1.5, 1)):
+            accel[(time_s >= rest_s + begin) & (time_s < rest_s + begin + 0.1), 0] = 12.0 * sign
+        return accel
+
+    made = motion(rest_s + 10.0, still, launch)
+    block = made.block()
+    block = replace(block, gyro_rad_s=block.gyro_rad_s + np.radians([5.0, -4.0, 3.0]))
+    error = made.tilt_error_deg(TiltInertialFilter(Rig()).process(block)[:, 2:4])
+    assert error[100:].max() < 1.0
+
+
+def test_an_accelerometer_whose_scale_is_off_is_no_reason_to_restart():
+    """An MPU-6050 may read 9.4 m/s² at rest: outside the errors that the filter estimates, but no tilt."""
+    made = motion(20.0, lambda t: np.array([0.5 * np.sin(t) * (t > 5), 0.0, 0.0]), lambda t: np.zeros((len(t), 3)))
+    block = made.block()
+    f = TiltInertialFilter(Rig())
+    error = made.tilt_error_deg(f.process(replace(block, accel_m_s2=0.96 * block.accel_m_s2))[:, 2:4])
+    assert f.restarts == 0
+    assert error[100:].max() < 1.0
+
+
+def test_shaking_does_not_shrink_the_accelerometers_matrix():
+    """The velocity is in both the measurement 0 = v + e and the integrated force: M_a = 1 would explain both."""
+
+    def shaken(time_s):
+        return 15.0 * np.column_stack([np.sin(7 * time_s), np.sin(8 * time_s), np.sin(9 * time_s)])
+
+    made = motion(100.0, lambda t: np.array([2 * np.sin(3 * t), 2 * np.cos(4 * t), np.sin(5 * t)]), shaken)
+    f = TiltInertialFilter(Rig())
+    error = made.tilt_error_deg(f.process(made.block())[:, 2:4])
+    assert np.abs(f.state.nominal[MA:MG]).max() < 0.001
+    assert np.sqrt(np.mean(error[3000:] ** 2)) < 0.5

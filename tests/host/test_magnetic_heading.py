@@ -1,0 +1,164 @@
+"""estimate --mag: the magnetometer bounds the drift of yaw, follows no disturbance, and needs its calibration."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import linkpose as lp
+from linkpose.cli.estimate import command
+from linkpose.errors import CannotRun, NoMagnetometer, UncalibratedMagnetometer
+from linkpose.filters.magnetic_heading import MagneticHeading
+from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.rig import Mag, Rig
+from linkpose.simulation import mag as mag_model
+from linkpose.simulation.link import LinkRun
+from linkpose.simulation.motion import HandMotion
+
+HZ, MINUTES = 10, 10
+CALIBRATED = mag_model.calibration("calibrated")
+
+
+class Drifting:
+    """An inertial filter's roll, pitch and yaw with their σ; the yaw drifts by a rate that walks."""
+
+    name, rejected = "inertial", 0
+    columns = tuple(f"inertial_{name}_deg" for name in ("roll", "pitch", "yaw", "roll_std", "pitch_std", "yaw_std"))
+
+    def __init__(self, tilt, yaw_rad, drift_deg, std_deg) -> None:
+        roll, pitch = np.arctan2(tilt[:, 1], tilt[:, 2]), np.arcsin(-tilt[:, 0])
+        tilt_std = np.full(len(tilt), 0.05)
+        self.rows = np.column_stack([*np.degrees([roll, pitch, yaw_rad]), tilt_std, tilt_std, std_deg])
+        self.rows[:, 2] += drift_deg
+        self._at = 0
+
+    def process(self, block):
+        self._at += len(block)
+        return self.rows[self._at - len(block) : self._at].copy()
+
+
+def run(seed: int, disturbance: str | None, *, hard_iron_uT=0.5, drift_deg_s=0.01, minutes=MINUTES):
+    """A hand-moved sensor: the filter that drifts, its measurements, and the error of its yaw (°)."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(int(60 * minutes * HZ)) / HZ
+    moving = HandMotion(rng, 1.0, None).at(t)
+    walk = np.cumsum(rng.standard_normal(len(t))) * drift_deg_s / math.sqrt(len(t))
+    rate = drift_deg_s * rng.standard_normal() + walk
+    drift = np.cumsum(rate) / HZ
+    field = mag_model.field(moving) + hard_iron_uT * rng.uniform(-1, 1, 3) + 0.2 * rng.standard_normal((len(t), 3))
+    if disturbance:
+        field = field + mag_model.disturbance(disturbance, moving, t)
+    gravity = 9.80665 * moving.tilt
+    inner = Drifting(moving.tilt, moving.yaw_rad, drift, 0.1 + 1.2 * drift_deg_s * t)
+    return inner, Measurements.from_imu(t, gravity, moving.rate_rad_s, mag_uT=field), drift
+
+
+def held(inner, block, drift, mag=CALIBRATED):
+    """Error of the held yaw (°), its σ (°), the estimates, and the wrapper."""
+    own = inner.rows[:, 2] - drift
+    f = MagneticHeading(inner, mag)
+    out = f.process(block)
+    return (out[:, 2] - own + 180) % 360 - 180, out[:, 5], out, f
+
+
+def rms(error) -> float:
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("disturbance", [None, *mag_model.DISTURBANCES])
+def test_ten_minutes_are_never_worse_than_without(seed, disturbance):
+    inner, block, drift = run(seed, disturbance)
+    error, std, out, f = held(inner, block, drift)
+    least = 1.0  # °, what a calibration to 1 % leaves
+    assert rms(error) <= max(1.02 * rms(drift), least)
+    without = np.mean(np.abs(drift) < 2 * inner.rows[:, 5])
+    assert np.mean(np.abs(error) < 2 * std) > min(0.9, without - 0.15)
+    assert np.all(std <= inner.rows[:, 5] + 1e-9)
+    if disturbance is None:
+        assert abs(error[-1]) < 1.5 and f.found.rejected_s < 5 and np.nanmedian(out[:, -1]) < 1.5
+    else:
+        assert f.found.largest_disturbance_uT > 8 and f.found.rejected_s > 15
+
+
+def test_the_drift_is_bounded():
+    without, with_mag = [], []
+    for seed in range(5):
+        inner, block, drift = run(seed, None)
+        error, *_ = held(inner, block, drift)
+        without.append(rms(drift[len(drift) // 2 :]))
+        with_mag.append(rms(error[len(drift) // 2 :]))
+    assert np.mean(with_mag) < 0.4 * np.mean(without)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_calibration_that_does_not_fit_does_no_harm(seed):
+    """20 µT of hard iron that the rig file does not state."""
+    inner, block, drift = run(seed, None, hard_iron_uT=20.0)
+    error, *_ = held(inner, block, drift)
+    assert rms(error) < 1.05 * rms(drift) + 0.2
+
+
+def test_a_disturbance_that_grows_slowly_moves_the_heading_little():
+    """Sideways by 0.2 µT a minute, up to 4 µT: strength and dip stay, and 4 µT would be 8°."""
+    inner, block, drift = run(1, None)
+    moving_out = np.minimum(block.time_s / 60 * 0.4, 4.0)
+    level = np.column_stack([np.zeros(len(block)), moving_out, np.zeros(len(block))])
+    error, std, _, _ = held(inner, replace(block, mag_uT=block.mag_uT + level), drift)
+    assert np.abs(error).max() < 8.0 and np.mean(np.abs(error) < 3 * std) > 0.9
+
+
+def test_north_and_disturbance_are_reported():
+    inner, block, drift = run(0, "desk", minutes=1)
+    _, _, out, f = held(inner, block, drift)
+    assert f.columns[-1] == "inertial_mag_disturbance_uT"
+    assert abs(f.found.north_deg) < 2.5  # the simulated north is the n frame's X axis
+    assert np.nanmedian(out[40 * HZ :, -1]) == pytest.approx(np.linalg.norm(mag_model._DESK_UT), abs=2.0)
+    assert np.isnan(out[: HZ - 1, -1]).all()
+
+
+@pytest.mark.parametrize("size", [1, 7, 333])
+def test_blocks_of_any_length_give_the_same_to_the_bit(size):
+    whole = held(*run(2, "iron", minutes=0.7))[2]
+    inner, block, _ = run(2, "iron", minutes=0.7)
+    f = MagneticHeading(inner, CALIBRATED)
+    parts = [f.process(block[at : at + size]) for at in range(0, len(block), size)]
+    assert np.array_equal(np.concatenate(parts), whole, equal_nan=True)
+
+
+def test_what_it_refuses():
+    block = LinkRun(1, 0, 2.0, mag=True, errors="datasheet").measurements()
+    rig = Rig().with_j2s((-0.09, -0.04, 1.65))
+    with pytest.raises(UncalibratedMagnetometer):
+        lp.estimate(block, ["joint-inertial"], rig=rig, mag=True)
+    with pytest.raises(NoMagnetometer):
+        lp.estimate(LinkRun(1, 0, 2.0).measurements(), ["joint-inertial"], rig=rig, mag=True)
+    calibrated = replace(rig, mag=Mag((1.0, 2.0, 3.0)))
+    with pytest.raises(CannotRun, match="none of the filters"):
+        lp.estimate(block, ["tilt"], rig=calibrated, mag=True)
+
+
+def test_the_command(tmp_path: Path, linkpose) -> None:
+    recording, estimates = tmp_path / "r.csv", tmp_path / "e.csv"
+    typed = ["simulate", "link", "--mag-disturbance", "iron", "--duration", 30, "-o", recording, "--truth"]
+    assert linkpose(*typed, tmp_path / "t.csv").status == 0
+    done = CliRunner().invoke(
+        command, [str(recording), "--mag", "--filter", "joint-inertial", "-o", str(estimates)], catch_exceptions=False
+    )
+    assert "The magnetometer held the heading for" in done.stderr and "µT at most" in done.stderr
+    header = next(line for line in estimates.read_text().splitlines() if not line.startswith("#"))
+    assert "joint_inertial_mag_disturbance_uT" in header
+    closing = json.loads(estimates.read_text().splitlines()[-1].removeprefix("# "))
+    assert closing["mag"]["rejected_s"] > 3 and closing["mag"]["largest_disturbance_uT"] > 10
+    assert -180 <= closing["mag"]["magnetic_north_deg"] <= 180
+    uncalibrated = tmp_path / "u.csv"
+    linkpose("simulate", "link", "--mag", "--errors", "datasheet", "--duration", 2, "-o", uncalibrated, "--truth",
+             tmp_path / "u_t.csv")  # fmt: skip
+    refused = linkpose("estimate", uncalibrated, "--mag", "--filter", "joint-inertial")
+    assert refused.status == 1 and "linkpose calibrate mag" in refused.err and "Traceback" not in refused.err
