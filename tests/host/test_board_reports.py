@@ -241,7 +241,7 @@ def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monke
 def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
     board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The ACK of CONFIGURE is lost five times, and three times are tried: the board is waited for as after a cut cable."""
+    """The ACK of CONFIGURE is lost five times, and three are tried: the board is waited for as after a cut cable."""
     monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
     board.resets, left = [20], 5
 
