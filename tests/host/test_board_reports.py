@@ -16,7 +16,22 @@ from linkpose.device.session import Session
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.devices import mouse_speed_limit
 from linkpose.sensors.rig import Mouse, Rig
-from linkpose.wire.messages import Command, Configure, DeviceState, Hello, HelloMouse, MouseLacks, ResetCause, Start
+from linkpose.wire.messages import (
+    Ack,
+    Command,
+    Configure,
+    DeviceState,
+    Hello,
+    HelloMouse,
+    Message,
+    MouseLacks,
+    Nak,
+    NakReason,
+    Pong,
+    ResetCause,
+    SelfTestResult,
+    Start,
+)
 
 FAST = "sim://mice?speed=0"
 OK, STARTING, ABSENT = DeviceState.OK, DeviceState.STARTING, DeviceState.ABSENT
@@ -150,6 +165,33 @@ def test_a_board_without_inertial_sensor_has_no_self_test(board: ScriptedBoard, 
     board.hello = lambda hello: hello._replace(devices=(hello.devices[0]._replace(**gone), *hello.devices[1:]))
     board._self_test = lambda device: [session_module.Nak(Command.SELF_TEST, 10)]
     assert "refused SELF_TEST: sensor absent" in refused("info", "--port", "sim://link", "--self-test")
+
+
+@pytest.mark.parametrize(
+    ("messages", "reported"),
+    [
+        ([Pong(7, 0), Pong(8, 0)], True),
+        ([Ack(Command.STOP)], True),
+        ([Nak(Command.CONFIGURE, NakReason.STREAMING)], True),
+        ([Ack(Command.START), SelfTestResult(*[0] * 20)], False),
+    ],
+    ids=["PONG", "STOP", "CONFIGURE", "own"],
+)
+def test_another_program_at_the_same_socket_is_reported_once(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, messages: list[Message], reported: bool
+) -> None:
+    """Nothing locks a socket:// port. Answers that this program has not asked for show the other one."""
+    monkeypatch.setattr(session_module.random, "getrandbits", lambda bits: 1 << (bits - 1))
+    board.inserted = [(50 + at, message) for at, message in enumerate(messages)]
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        assert sum(map(len, session.stream(1.0))) == 100
+    assert not board.inserted
+    assert (
+        said
+        == [f"another program also sends commands to the board at {FAST}; close it, or the data will have gaps"]
+        * reported
+    )
 
 
 # ---- resets while the session resumes ----

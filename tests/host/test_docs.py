@@ -7,13 +7,19 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
+
+from linkpose.cli import group
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "host" / "docs"
 _BLOCK = re.compile(r"^```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
+
+PROGRAMS = "programs.md"  # has steps in Python too
 
 # Commands that need a board with a bootloader, and the test that runs them.
 HARDWARE = {
@@ -29,7 +35,7 @@ def commands(page: Path) -> list[str]:
 
 
 def pages_with_commands() -> list[str]:
-    return [page.name for page in sorted(DOCS.glob("*.md")) if commands(page)]
+    return [page.name for page in sorted(DOCS.glob("*.md")) if commands(page) and page.name != PROGRAMS]
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
@@ -58,6 +64,23 @@ def test_the_commands_of_a_page_run(name: str, tmp_path: Path) -> None:
             text=True,
         )
         assert done.returncode == 0, f"{name}: {command}\n{done.stderr}"
+
+
+def test_the_steps_to_other_programs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands and Python of the page, in its order; in one process, which imports the libraries once."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LINKPOSE_PORT", "sim://link?seed=1")
+    text = (DOCS / PROGRAMS).read_text(encoding="utf-8")
+    steps = re.findall(r"^( *)```(console|python)\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
+    assert {language for _, language, _ in steps} == {"console", "python"}
+    for indent, language, body in steps:
+        if language == "python":
+            exec(compile(textwrap.dedent(body), PROGRAMS, "exec"), {})
+            continue
+        for line in body.splitlines():
+            program, *arguments = shlex.split(line.removeprefix(f"{indent}$ "))
+            done = CliRunner().invoke(group, arguments)
+            assert program == "linkpose" and done.exit_code == 0, f"{line}\n{done.output}"
 
 
 def test_every_cited_key_is_in_the_references() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import random
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -61,6 +62,7 @@ MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 STILL_SAMPLES = 10  # with the same time stamp
 JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
+OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
@@ -112,7 +114,8 @@ class Session:
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
-        self._token = 0
+        self._token = random.getrandbits(32)  # another program's differ
+        self._intruder_reported = False
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
@@ -156,7 +159,7 @@ class Session:
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
-        heard = bytearray()
+        heard, refused = bytearray(), 0
         deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
         while time.perf_counter() < deadline:
             if time.perf_counter() >= ask_at:
@@ -170,12 +173,16 @@ class Session:
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
                     raise _other_protocol(message)
+                refused += isinstance(message, Nak)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+        reason = _why_no_hello(bytes(heard), connection.decoder.corrupt)
+        if refused:
+            reason = "the board refuses every command, also the request for its version; its firmware is damaged"
+        raise NoFirmware(self.port, bytes(heard), reason)
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
         """Waits for sensors that are being set up and returns the latest HELLO."""
@@ -293,6 +300,16 @@ class Session:
         sent = self._pings.pop(pong.token, None)
         if sent is not None:
             self._clock.pong(pong.t_us, sent, time_s)
+        elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
+            self._report_intruder()
+
+    def _report_intruder(self) -> None:
+        """An answer came that this program has not asked for: a port such as socket:// serves several programs."""
+        if not self._intruder_reported:
+            self._intruder_reported = True
+            self.notify(
+                f"another program also sends commands to the board at {self.port}; close it, or the data will have gaps"
+            )
 
     def _tie_clocks(self) -> None:
         """A few round trips before the first sample."""
@@ -457,6 +474,8 @@ class Session:
         together with its HELLO is older than that."""
         if isinstance(message, Pong):
             self._hear_pong(message, arrival.time_s)
+        elif isinstance(message, Ack | Nak) and message.command in (Command.STOP, Command.CONFIGURE):
+            self._report_intruder()  # the board answers in order: START was the last command of this program
         elif isinstance(message, Status):
             self.status = message
             self._check_supply(message)
