@@ -3,7 +3,7 @@
 Numba's own pipeline serves any Python function. It runs 28 passes over each function, prepares machine code for each,
 and optimises each callee again in every caller. Cold, that took two thirds of the time until the first estimate
 appeared. These two pipelines keep the passes that such functions need. `Inner` functions stay unoptimised LLVM code;
-`Outer` links all that it calls and optimises it once.
+`Outer` links all that it calls and optimises it once. Numba's answers to questions that recur are remembered.
 
 Not supported here: closures, comprehensions, generators, `with`, exceptions with computed messages. Array expressions
 work, but are not fused.
@@ -13,35 +13,141 @@ Source: numba's developer manual, "Customizing the compiler" (pipelines), and nu
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import gc
-from collections.abc import Callable
+import operator
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from numba.core import typed_passes, untyped_passes
+from numba.core import base, ir, lowering, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
-from numba.core.compiler_machinery import PassManager
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.ir_utils import build_definitions
+from numba.core.ssa import reconstruct_ssa
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Prune(untyped_passes.DeadBranchPrune):  # type: ignore[misc]
+    """Drops the branches that an argument which is None excludes."""
+
+    _name = "lean_dead_branch_prune"
+
+    def run_pass(self, state: Any) -> bool:
+        return types.none in state.args and super().run_pass(state)
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _AssignOnce(untyped_passes.ReconstructSSA):  # type: ignore[misc]
+    """Gives each assignment a variable of its own. Lifetimes, which numba's pass finds too, serve generators."""
+
+    _name = "lean_reconstruct_ssa"
+
+    def run_pass(self, state: Any) -> bool:
+        state.func_ir = reconstruct_ssa(state.func_ir)
+        self._patch_locals(state)
+        state.func_ir._definitions = build_definitions(state.func_ir.blocks)
+        return True
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _StripPhis(typed_passes.PreLowerStripPhis):  # type: ignore[misc]
+    """Replaces phi nodes by assignments."""
+
+    _name = "lean_strip_phis"
+
+    def run_pass(self, state: Any) -> bool:
+        state.func_ir = self._strip_phi_nodes(state.func_ir)
+        state.func_ir._definitions = build_definitions(state.func_ir.blocks)
+        return True
+
+
+@register_pass(mutates_CFG=False, analysis_only=False)
+class _Release(typed_passes.IRLegalization):  # type: ignore[misc]
+    """Marks where a variable ends, which only reference counts need."""
+
+    _name = "lean_release"
+
+    def run_pass(self, state: Any) -> bool:
+        return bool(state.flags.nrt) and super().run_pass(state)
+
+
+class _Lower(lowering.Lower):  # type: ignore[misc]
+    """Writes LLVM code."""
+
+    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
+        """Only powers have code of their own for constant operands: numba would look for it three times."""
+        if op not in (operator.pow, operator.ipow):
+            expr.static_lhs = expr.static_rhs = ir.UNDEFINED
+        return super().lower_binop(resty, expr, op)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Lowering(typed_passes.NativeLowering):  # type: ignore[misc]
+    """The step to LLVM code."""
+
+    _name = "lean_native_lowering"
+
+    @property
+    def lowering_class(self) -> type[lowering.Lower]:
+        return _Lower
+
 
 _PASSES = (
     untyped_passes.TranslateByteCode,
     untyped_passes.FixupArgs,
     untyped_passes.IRProcessing,
-    untyped_passes.DeadBranchPrune,  # of arguments that are None
+    _Prune,
     untyped_passes.GenericRewrites,  # constant indices of tuples
-    untyped_passes.ReconstructSSA,
+    _AssignOnce,
     typed_passes.NopythonTypeInference,
-    typed_passes.PreLowerStripPhis,
-    typed_passes.IRLegalization,
-    typed_passes.AnnotateTypes,
-    typed_passes.NativeLowering,
+    _StripPhis,
+    _Release,
+    _Lowering,
     typed_passes.NoPythonBackend,
 )
 # LLVM's level. Level 3 unrolls the loops over 34 states: twice the time to compile, and no faster.
 _OPTIMISATION = 2
+_SCALARS = (types.Float, types.Integer, types.Boolean)
+
+_functions: Any = types.Function  # the class of numba's built-in functions, such as operators
+_resolve = _functions.get_call_type
+_known_calls: dict[tuple[Any, ...], Any] = {}  # (function, types of its arguments) -> signature
+
+
+def _remembered_call_type(function: Any, context: Any, args: tuple[Any, ...], kws: Any) -> Any:
+    """The signature of a built-in function, such as an operator, for these types of numbers.
+
+    Numba tries a dozen templates for each operation, although the types of numbers decide.
+    """
+    if kws or not all(isinstance(each, _SCALARS) for each in args):
+        return _resolve(function, context, args, kws)
+    key = function, args
+    found = _known_calls.get(key)
+    if found is None:
+        found = _known_calls[key] = _resolve(function, context, args, kws)
+    return found
+
+
+_has_loc = functools.cache(base._has_loc)  # whether a function of numba has a parameter: inspecting it takes 0.1 ms
+
+
+@contextlib.contextmanager
+def _remembering() -> Iterator[None]:
+    """Within this context, numba remembers what depends on nothing that changes. Numba's lock admits one thread."""
+    inspected = base._has_loc
+    _functions.get_call_type, base._has_loc = _remembered_call_type, _has_loc
+    try:
+        yield
+    finally:
+        _functions.get_call_type, base._has_loc = _resolve, inspected
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code that is optimised once, as a whole, when the outermost function is complete."""
+
+    _linking_libraries: list[Any]
 
     def _optimize_functions(self, module: Any) -> None:
         """Nothing to do for one function alone."""
@@ -51,14 +157,23 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
         manager, builder = self._codegen._module_pass_manager(opt=_OPTIMISATION)
         manager.run(self._final_module, builder)
 
+    def finalize(self) -> None:
+        """Link all that is called, directly or not, and optimise it."""
+        called: dict[Any, None] = dict.fromkeys(self._linking_libraries)
+        for library in (waiting := list(called)):
+            if isinstance(library, _PartLibrary):
+                new = [each for each in dict.fromkeys(library._linking_libraries) if each not in called]
+                called |= dict.fromkeys(new)
+                waiting += new
+        self._linking_libraries = list(called)
+        super().finalize()
+
 
 class _PartLibrary(_Library):
-    """LLVM code that only serves to be linked into its callers."""
+    """LLVM code that only serves to be linked into its outermost caller."""
 
     def finalize(self) -> None:
-        """Link what this function calls."""
-        for library in dict.fromkeys(self._linking_libraries):
-            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        """Nothing to link yet."""
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
@@ -83,7 +198,8 @@ class Outer(CompilerBase):  # type: ignore[misc]
         searches = gc.isenabled()
         gc.disable()
         try:
-            return super().compile_extra(func)
+            with _remembering():
+                return super().compile_extra(func)
         finally:
             if searches:
                 gc.enable()
