@@ -221,7 +221,7 @@ def check_resumed(connected: Board, blocks: list) -> None:
 
 def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reset after 20 samples; each of the next resets comes between CONFIGURE and START, more often than is tried."""
-    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
     board.resets, left = [20], 5
 
     def again(message: object) -> bool:
@@ -238,12 +238,12 @@ def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monke
     assert any("was reset" in line for line in said)
 
 
-@pytest.mark.parametrize("times", [2, 5])
 def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
-    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, times: int
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
-    board.resets, left = [20], times
+    """The ACK of CONFIGURE is lost five times, and three are tried: the board is waited for as after a cut cable."""
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
+    board.resets, left = [20], 5
 
     def lost(message: object) -> bool:
         nonlocal left
@@ -256,8 +256,8 @@ def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
     said, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
     assert left == 0
-    assert any("waiting for the board, Ctrl-C ends" in line for line in said) == (times > 3)
-    assert board.opened == (2 if times > 3 else 1)
+    assert any("waiting for the board, Ctrl-C ends" in line for line in said)
+    assert board.opened == 2
 
 
 def test_a_board_whose_samples_come_late_is_heard_to_the_end(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
@@ -90,3 +91,30 @@ def test_every_cited_key_is_in_the_references() -> None:
     cited = {key for source in sources for key in papers.findall(source.read_text(encoding="utf-8"))}
     assert cited <= known
     assert {"Link", "Thesis", "Mice"} <= known
+
+
+def messages_of_the_program() -> list[str]:
+    """Every text in the sources, with … for what is filled in."""
+    texts = []
+    for path in (ROOT / "host/linkpose").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.JoinedStr):
+                texts.append(
+                    "".join(str(part.value) if isinstance(part, ast.Constant) else "…" for part in node.values)
+                )
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                texts.append(node.value)
+    return texts
+
+
+def test_every_message_in_the_troubleshooting_page_is_the_program_s():
+    """The first cells of the tables of messages quote them; numbers and names are filled in."""
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "host/docs/troubleshooting.md").read_text(), re.MULTILINE)
+    texts = "\n".join(messages_of_the_program())
+    quoted = [quote for row in rows for quote in re.findall(r"`([^`]+)`", row)]
+    pieces = [
+        piece.strip() for quote in quoted for piece in re.split(r"…|\d[\d.]*( V| s\b)?|\(.*?\)|;", quote) if piece
+    ]
+    missing = [piece for piece in pieces if " " in piece and piece not in texts]
+    assert len(pieces) > 30
+    assert not missing

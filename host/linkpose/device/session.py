@@ -62,10 +62,26 @@ MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 STILL_SAMPLES = 10  # with the same time stamp
 JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
+WAIT_STEP_S = 0.05
 OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
+
+
+class _TimeLimit:
+    """A time to wait, of which a suspended program uses up no more than one step."""
+
+    def __init__(self, seconds: float) -> None:
+        self._left_s = seconds
+        self._looked_s = time.perf_counter()
+
+    def step(self) -> float:
+        """How long to wait next (s); 0 when the time is over."""
+        now = time.perf_counter()
+        self._left_s -= min(now - self._looked_s, WAIT_STEP_S)
+        self._looked_s = now
+        return min(max(self._left_s, 0.0), WAIT_STEP_S)
 
 
 class NotResumed(Disconnected):
@@ -160,13 +176,13 @@ class Session:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
         heard, refused = bytearray(), 0
-        deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
-        while time.perf_counter() < deadline:
+        limit, ask_at = _TimeLimit(HANDSHAKE_TIMEOUT_S), 0.0
+        while step_s := limit.step():
             if time.perf_counter() >= ask_at:
                 connection.send(Stop())
                 connection.send(GetInfo())
                 ask_at = time.perf_counter() + ASK_INTERVAL_S
-            arrival = connection.receive(0.05)
+            arrival = connection.receive(step_s)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
@@ -284,9 +300,9 @@ class Session:
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
-        deadline = time.perf_counter() + timeout_s
-        while (left := deadline - time.perf_counter()) > 0:
-            arrival = self._connection.receive(left)
+        limit = _TimeLimit(timeout_s)
+        while step_s := limit.step():
+            arrival = self._connection.receive(step_s)
             if arrival is not None:
                 yield arrival
 
