@@ -62,13 +62,16 @@ def test_j2s_is_found_from_nothing():
 @pytest.mark.parametrize("test", [1, 2, 3])
 @pytest.mark.parametrize("errors", ["calibrated", "datasheet"])
 def test_its_standard_deviation_is_true(test, errors):
-    """Normalised estimation error squared of the height, mean over the runs; nobody says which sensors these are."""
+    """Normalised estimation error squared of the height, mean over the runs; nobody says which sensors these are.
+
+    The simulated calibrated gyro has no error of its scale, for which σ allows.
+    """
     nees = []
     for seed in range(5):
         block, truth = recorded(test, seed, errors)
         estimate = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)).process(block)
         nees.append(np.mean(((estimate[:, 0] - truth.height_m) / estimate[:, 1]) ** 2))
-    assert 0.5 <= np.mean(nees) <= 2
+    assert 0.25 <= np.mean(nees) <= 1.5
 
 
 @pytest.mark.parametrize(("errors", "most_deg"), [("calibrated", 1.0), ("datasheet", 2.0)])
