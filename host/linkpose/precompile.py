@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import cast
 
 from linkpose import compiling, filters
+from linkpose.sensors.devices import Sensors
 
 # The name of what writes estimates as text: every run needs it, whatever its filters.
 TEXT = "text"
@@ -28,7 +29,8 @@ class Precompilation:
         """Starts to compile those of `names` that are not compiled yet, in two processes.
 
         One compiles the inertial filters, which share their steps and take longest. The other compiles the rest: first
-        the last, which takes least, so that a first estimate appears soon; the writer of text after it.
+        the last, which takes least, so that a first estimate appears soon; the writer of text after it. Filters that
+        need a second inertial sensor come next: who has connected two wants to see them.
         """
         self._names = list(names)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter
@@ -36,6 +38,7 @@ class Precompilation:
         if not compiling.can_keep_code():
             return
         order = list(reversed(self._names))
+        order[1:] = sorted(order[1:], key=lambda name: not _needs_second_sensor(name))
         missing = [name for name in [*order[:1], TEXT, *order[1:]] if not compiling.is_compiled(name)]
         inertial = [name for name in missing if name.endswith("-inertial")]
         for group in (inertial, [name for name in missing if name not in inertial]):
@@ -87,6 +90,11 @@ class Precompilation:
             if process.poll() is None:
                 process.terminate()
                 process.wait()
+
+
+def _needs_second_sensor(name: str) -> bool:
+    able = filters.capabilities(name)
+    return able is not None and bool(able.sensors & Sensors.IMU2)
 
 
 def prepare(names: Sequence[str], report: Callable[[str], object]) -> None:

@@ -15,7 +15,7 @@ at the sensor's time less one delay for each set (the lag of the gyros behind it
 `within_2sigma` is the share of these errors below twice the reported standard deviation, `unknown` the share of samples
 without an estimate.
 
-`chosen_on` marks the pairs on which constants of the filter were chosen; starts that are not marked were held out.
+`chosen_on` marks the pairs on which constants of the filter were chosen; other starts were held out.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from typing import NamedTuple
 import numpy as np
 import qmt
 from _report import RECORDINGS
-from real_data import ENCODER_DELAY_S, Pair, matrices, read_encoder, read_robot
+from real_data import ENCODER_DELAY_S, OMC_LATE_S, Pair, matrices, read_encoder, read_robot
 from vqf import VQF
 
 import linkpose as lp
@@ -44,10 +44,10 @@ from linkpose.sensors.measurements import Floats
 
 SKIPPED_S = 5.0
 DIODEM_JOINTS = {(1, 2): "ball", (2, 3): "hinge", (3, 4): "hinge", (4, 5): "hinge"}
-DIODEM_DELAY_S = -0.015  # the cameras are the later ones: lag of the gyros of all five segments
 LATER_STARTS_S = (0.0, 10.0, 20.0, 30.0)
 CHOSEN_STARTS_S = (0.0, 20.0)
 LONGEST_CHOSEN_S = 400.0  # of mpu6050_encoder
+MOST_ALIGNED = 2000  # samples, evenly spaced, that the alignment is fitted to
 Rotations = Floats  # (N, 3, 3), from sensor 2's axes into sensor 1's
 
 
@@ -77,10 +77,10 @@ def diodem(folder: Path) -> Iterator[Case]:
                 for kind in ("acc", "gyr", "mag")
             )
             first, second = (np.column_stack([seen[f"seg{k}_quat_{c}"] for c in "wxyz"]) for k in (a, b))
-            truth, known = _interpolated(seen_s, qmt.qmult(qmt.qinv(first), second), time_s - DIODEM_DELAY_S)
+            truth, known = _interpolated(seen_s, qmt.qmult(qmt.qinv(first), second), time_s + OMC_LATE_S)
             for start_s in LATER_STARTS_S:
-                cut = slice(int(np.searchsorted(time_s, start_s)), None)
-                pair = Pair(time_s[cut] - time_s[cut][0], accel[cut], gyro[cut])
+                pair = _from(Pair(time_s, accel, gyro), start_s)
+                cut = slice(len(time_s) - len(pair.time_s), None)
                 name = f"diodem {path.stem[:6]} {a}-{b} from {start_s:.0f} s"
                 chosen = path.stem.startswith("trial1") and start_s in CHOSEN_STARTS_S
                 yield Case("diodem_chain", name, pair, mag[cut], truth[cut], joint, chosen, known[cut])
@@ -101,15 +101,24 @@ def _interpolated(seen_s: Floats, quaternion: Floats, time_s: Floats) -> tuple[R
 
 
 def robot(folder: Path) -> Iterator[Case]:
-    """Two links of a robot arm (radius, carpus), encoder reference."""
+    """Two links of a robot arm (radius, carpus), encoder reference, from several starts."""
     for path in sorted(folder.glob("*_radius_imu.csv")):
         read = [read_robot(path), read_robot(path.with_name(path.name.replace("_radius", "_carpus")))]
         n = min(len(each[0]) for each in read)
         accel, gyro = (np.stack([each[i][:n] for each in read], axis=1) for i in (1, 2))
         truth = np.einsum("nji,njk->nik", read[0][3][:n], read[1][3][:n])
-        name = "robot " + path.stem.removesuffix("_radius_imu")
-        pair = Pair(read[0][0][:n], accel, gyro)
-        yield Case("openaxes_robot", name, pair, None, truth, "hinge", "circle-100" in name, np.ones(n, bool))
+        for start_s in LATER_STARTS_S:
+            pair = _from(Pair(read[0][0][:n], accel, gyro), start_s)
+            name = f"robot {path.stem.removesuffix('_radius_imu')} from {start_s:.0f} s"
+            chosen = "circle-100" in name and start_s in CHOSEN_STARTS_S
+            known = np.ones(len(pair.time_s), bool)
+            yield Case("openaxes_robot", name, pair, None, truth[-len(known) :], "hinge", chosen, known)
+
+
+def _from(pair: Pair, start_s: float) -> Pair:
+    """The readings from a time on, with that time as zero."""
+    first = int(np.searchsorted(pair.time_s, start_s))
+    return Pair(pair.time_s[first:] - pair.time_s[first], *(values[first:] for values in pair[1:]))
 
 
 def encoder(folder: Path) -> Iterator[Case]:
@@ -217,7 +226,8 @@ def errors_deg(found: Rotations, truth: Rotations, use: Floats) -> Floats:
 
     A and B follow in turn, each as the best rotation for the other (Kabsch), from both of which the fit descends.
     """
-    mine, true = found[use], truth[use]
+    thin = np.flatnonzero(use)[:: max(1, use.sum() // MOST_ALIGNED)]
+    mine, true = found[thin], truth[thin]
     best = math.inf, np.eye(3), np.eye(3)
     for start in _starts():
         after = start

@@ -31,6 +31,7 @@ class ScriptedBoard(SimulatedBoard):
         self.resets_at: Callable[[Message | OtherProtocol], bool] = lambda message: False
         self.cause = int(ResetCause.POWER_ON)
         self.hung_at = 0xFFFF
+        self.inserted: list[tuple[int, Message]] = []  # messages that come with a tick
         self.pauses_at = -1  # the tick at which it sends nothing until the test changes this
         self.rate = 1.0  # of the board's clock against the host's
         self.opened = 0
@@ -50,7 +51,8 @@ class ScriptedBoard(SimulatedBoard):
 
     @property
     def _pauses(self) -> bool:
-        return self._samples is not None and self._tick == self.pauses_at
+        """Also until the host has checked the stream's settings: time at full speed would run away from a slow host."""
+        return self._samples is not None and (self._checked_at is None or self._tick == self.pauses_at)
 
     @property
     def next_tick_us(self) -> int | None:
@@ -60,6 +62,8 @@ class ScriptedBoard(SimulatedBoard):
         if self._pauses:
             return b""
         data = super().advance(now_us)
+        while self.inserted and self._samples is not None and self._tick >= self.inserted[0][0]:
+            data += encode(self.inserted.pop(0)[1])
         if self.resets and self._checked_at is not None and self._tick >= self._checked_at + self.resets[0]:
             self.resets.pop(0)
             data += self.reset()

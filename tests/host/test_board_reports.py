@@ -16,7 +16,22 @@ from linkpose.device.session import Session
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.devices import mouse_speed_limit
 from linkpose.sensors.rig import Mouse, Rig
-from linkpose.wire.messages import Command, Configure, DeviceState, Hello, HelloMouse, MouseLacks, ResetCause, Start
+from linkpose.wire.messages import (
+    Ack,
+    Command,
+    Configure,
+    DeviceState,
+    Hello,
+    HelloMouse,
+    Message,
+    MouseLacks,
+    Nak,
+    NakReason,
+    Pong,
+    ResetCause,
+    SelfTestResult,
+    Start,
+)
 
 FAST = "sim://mice?speed=0"
 OK, STARTING, ABSENT = DeviceState.OK, DeviceState.STARTING, DeviceState.ABSENT
@@ -152,6 +167,33 @@ def test_a_board_without_inertial_sensor_has_no_self_test(board: ScriptedBoard, 
     assert "refused SELF_TEST: sensor absent" in refused("info", "--port", "sim://link", "--self-test")
 
 
+@pytest.mark.parametrize(
+    ("messages", "reported"),
+    [
+        ([Pong(7, 0), Pong(8, 0)], True),
+        ([Ack(Command.STOP)], True),
+        ([Nak(Command.CONFIGURE, NakReason.STREAMING)], True),
+        ([Ack(Command.START), SelfTestResult(*[0] * 20)], False),
+    ],
+    ids=["PONG", "STOP", "CONFIGURE", "own"],
+)
+def test_another_program_at_the_same_socket_is_reported_once(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, messages: list[Message], reported: bool
+) -> None:
+    """Nothing locks a socket:// port. Answers that this program has not asked for show the other one."""
+    monkeypatch.setattr(session_module.random, "getrandbits", lambda bits: 1 << (bits - 1))
+    board.inserted = [(50 + at, message) for at, message in enumerate(messages)]
+    said: list[str] = []
+    with Session(FAST, said.append) as session:
+        assert sum(map(len, session.stream(1.0))) == 100
+    assert not board.inserted
+    assert (
+        said
+        == [f"another program also sends commands to the board at {FAST}; close it, or the data will have gaps"]
+        * reported
+    )
+
+
 # ---- resets while the session resumes ----
 
 
@@ -179,7 +221,7 @@ def check_resumed(connected: Board, blocks: list) -> None:
 
 def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reset after 20 samples; each of the next resets comes between CONFIGURE and START, more often than is tried."""
-    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
     board.resets, left = [20], 5
 
     def again(message: object) -> bool:
@@ -196,12 +238,12 @@ def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monke
     assert any("was reset" in line for line in said)
 
 
-@pytest.mark.parametrize("times", [2, 5])
 def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
-    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch, times: int
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.05)
-    board.resets, left = [20], times
+    """The ACK of CONFIGURE is lost five times, and three are tried: the board is waited for as after a cut cable."""
+    monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
+    board.resets, left = [20], 5
 
     def lost(message: object) -> bool:
         nonlocal left
@@ -214,8 +256,8 @@ def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
     said, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
     assert left == 0
-    assert any("waiting for the board, Ctrl-C ends" in line for line in said) == (times > 3)
-    assert board.opened == (2 if times > 3 else 1)
+    assert any("waiting for the board, Ctrl-C ends" in line for line in said)
+    assert board.opened == 2
 
 
 def test_a_board_whose_samples_come_late_is_heard_to_the_end(

@@ -65,7 +65,7 @@ def test_filters_and_ports_are_completed(monkeypatch: pytest.MonkeyPatch) -> Non
     for option, typed, expected in (
         ("--filter", "joint", ["joint-inertial", "joint"]),
         ("--port", "/dev/ttyA", ["/dev/ttyACM0"]),
-        ("--port", "sim", ["sim://link", "sim://mice"]),
+        ("--port", "sim", ["sim://link", "sim://chain", "sim://mice"]),
     ):
         for name in having(option) - {"localize"}:
             command = ALL[name]

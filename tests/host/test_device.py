@@ -26,7 +26,7 @@ from linkpose.sensors.mpu6050 import self_test_deviation
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.board import DEFAULTS, SimulatedBoard
 from linkpose.wire.frames import StreamDecoder, encode
-from linkpose.wire.messages import Ack, Command, Configure, Hello, Ping, Sample
+from linkpose.wire.messages import Ack, Command, Configure, Hello, Nak, NakReason, Ping, Sample
 
 
 @pytest.fixture
@@ -60,10 +60,11 @@ def framed(payload: bytes) -> bytes:
         (b"Temperature: 23.4 C\r\n", "another firmware answers: 'Temperature: 23.4 C"),
         (random.Random(3).randbytes(60), "only noise was received"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
+        (encode(Nak(Command.GET_INFO, NakReason.UNKNOWN_COMMAND)), "the board refuses every command"),
         (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
         (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
-    ids=["silence", "text", "noise", "wrong baud", "older board", "newer board"],
+    ids=["silence", "text", "noise", "wrong baud", "refusals", "older board", "newer board"],
 )
 @pytest.mark.parametrize("command", ["record", "info", "estimate --live"])
 def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, sentence, command):
@@ -315,6 +316,25 @@ def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
         said = refused("info", "--port", tmp_path / "port")
         pull.join()
     assert "is gone" in said and "check the cable" in said
+
+
+def test_a_board_that_returns_silent_is_waited_for_to_the_end(impatient, monkeypatch, tmp_path, linkpose):
+    silent = threading.Event()
+    with PtyBoard(tmp_path / "port", spoil=lambda data: b"" if silent.is_set() else data) as board:
+
+        def come_back_silent() -> None:
+            board.streams.wait()
+            board.pull()
+            silent.set()
+            board.plug()
+
+        back = threading.Thread(target=come_back_silent)
+        back.start()
+        result = linkpose("record", tmp_path / "r.csv", "--port", tmp_path / "port", "--duration", 3)
+        back.join()
+    assert result.status == 0
+    assert result.err.count("the board is silent") == 1 and "; still waiting" in result.err
+    assert read_table(tmp_path / "r.csv", "recording").closing["gaps"][0]["cause"] == "cable"
 
 
 def test_an_ack_of_start_that_is_lost_costs_no_sample(tmp_path):

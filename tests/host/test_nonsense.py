@@ -40,7 +40,7 @@ def remarks(tmp_path: Path, change: Callable[[dict[str, np.ndarray]], object]) -
     change(table)
     path = tmp_path / "r.csv"
     rows = "\n".join(",".join(f"{value:.9g}" for value in row) for row in np.column_stack(list(table.values())))
-    path.write_text(f'{HEAD}{",".join(NAMES)}\n{rows}\n# {{"samples": {N}}}\n')
+    path.write_text(f'{HEAD}{",".join(table)}\n{rows}\n# {{"samples": {N}}}\n')
     recording = load_recording(path)
     return "\n".join(recording.remarks)
 
@@ -73,8 +73,9 @@ def test_a_plausible_recording_has_no_remark(tmp_path: Path) -> None:
         (scale(10.0, "time"), "multiply time_s by 0.1"),
         (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
         (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
+        (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
     ],
-    ids=["twice", "half", "mm/s²", "zero", "°/s", "time", "mmHg", "hPa"],
+    ids=["twice", "half", "mm/s²", "zero", "°/s", "time", "mmHg", "hPa", "thousands"],
 )
 def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str) -> None:
     assert sentence in remarks(tmp_path, change)

@@ -200,7 +200,7 @@ def test_a_live_board_with_mice_is_estimated_as_its_recording_is(linkpose, tmp_p
     [
         ("sim://mice?test=1", "has no option test; it has seed, mice, path, errors, fault, drift_ppm and speed"),
         ("sim://mice?mice=0", "0 mice cannot be"),
-        ("sim://rat", "type sim://link or sim://mice"),
+        ("sim://rat", "type sim://link, sim://chain, sim://mice"),
     ],
 )
 def test_a_wrong_address_is_refused(refused, port, reason):

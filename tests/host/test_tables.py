@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import decimal
 import io
+import itertools
 import json
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +83,42 @@ def one_cell_a_line(text: str) -> str:
     return out.getvalue()
 
 
+def libreoffice(text: str, separator: str) -> str:
+    """LibreOffice takes a text after a comma of the metadata for a quoted cell, and drops its quotes."""
+    lines = text.splitlines()
+    cells, at = [""], 0
+    while at < len(lines[1]):
+        word = at + (lines[1][at] == " ")
+        end = lines[1].find('",', word + 1) if lines[1][word] == '"' else -1
+        cell = lines[1][word + 1 : end] if end >= 0 else lines[1][word:].split(",")[0]
+        at = end + 2 if end >= 0 else word + len(cell) + 1
+        cells.append(cell)
+    out = io.StringIO()
+    writer = csv.writer(out, delimiter=separator, lineterminator="\n")
+    writer.writerows([[lines[0]], cells[1:], *(line.split(",") for line in lines[2:])])
+    return out.getvalue()
+
+
+def gnumeric(text: str, separator: str) -> str:
+    """Gnumeric's ssconvert takes the separator of the metadata for that of the file: lines in one cell, and padded."""
+    out = io.StringIO()
+    width = text.splitlines()[1].count(":")
+    writer = csv.writer(out, delimiter=separator, lineterminator="\n", quoting=csv.QUOTE_MINIMAL)
+    for line in text.splitlines():
+        cells = ["# ", "software", "kind"] if line.startswith("# {") else [line]
+        writer.writerow(cells + [""] * (width - len(cells)))
+    return out.getvalue().replace("# linkpose recording 1", '"# linkpose recording 1"')
+
+
+def with_all_digits(text: str) -> str:
+    """Numbers with 20 digits of their binary values, as Gnumeric writes some: 0.31492800000000000001."""
+    lines = text.splitlines()
+    for i, line in enumerate(lines[3:-1], 3):
+        numbers = [f"{decimal.Decimal(float(cell)):.20g}" if "." in cell else cell for cell in line.split(",")]
+        lines[i] = ",".join(numbers)
+    return "\n".join(lines) + "\n"
+
+
 def pandas(text: str, *, index: bool) -> str:
     import pandas as pd
 
@@ -110,8 +150,13 @@ PROGRAMS = {
     "Excel, Macintosh": lambda text: spreadsheet(text, ",", end="\r").encode(),
     "Excel, sep=": lambda text: b"sep=;\r\n" + spreadsheet(text, ";").encode(),
     "LibreOffice": lambda text: spreadsheet(text, ",", end="\n", quoting=1).encode(),
+    "LibreOffice, texts without quotes": lambda text: libreoffice(text, ",").encode(),
+    "LibreOffice, texts without quotes, semicolons": lambda text: libreoffice(text, ";").encode(),
     "LibreOffice, decimal commas between commas": lambda text: spreadsheet(text, ",", comma=True).encode(),
     "Gnumeric": lambda text: spreadsheet(text, "\t", end="\n").encode(),
+    "Gnumeric, padded lines in one cell": lambda text: gnumeric(text, ",").encode(),
+    "Gnumeric, padded lines in one cell, semicolons": lambda text: gnumeric(text, ";").encode(),
+    "Gnumeric, all digits": lambda text: with_all_digits(text).encode(),
     "other order": lambda text: shuffled(text).encode(),
     "pandas": lambda text: pandas(text, index=False).encode(),
     "pandas with an index": lambda text: pandas(text, index=True).encode(),
@@ -134,8 +179,35 @@ def test_a_saved_recording_reads_back(tmp_path_factory, program, rows):
     assert set(other.columns) == set(own.columns)
     for name, values in own.columns.items():
         assert np.array_equal(other.columns[name], values, equal_nan=True), name
-    if not program.startswith(("pandas", "R ")):
+    if "padded" in program:
+        assert other.kind == "recording" and "damaged the metadata" in other.remarks[0]
+    elif not program.startswith(("pandas", "R ")):
         assert (other.metadata, other.closing, other.remarks) == (own.metadata, own.closing, ())
+
+
+@pytest.mark.skipif(shutil.which("ssconvert") is None, reason="needs Gnumeric's ssconvert")
+@pytest.mark.parametrize("kind", ["csv", "xlsx"])
+def test_gnumeric_itself(tmp_path, kind):
+    """Saved as a workbook and exported again, or exported at once."""
+    path = tmp_path / "run.csv"
+    path.write_text(written([(1_234_567, -1, 9_800_000, 100, 7, 0, 100_000, 3), (1, 0, 2, 3, 4, 5, None, None)] * 9))
+    own, names = read_table(path), [path, tmp_path / f"saved.{kind}", tmp_path / "again.csv"]
+    for source, target in itertools.pairwise(names):
+        subprocess.run(["ssconvert", source, target], check=True, capture_output=True)
+    other = read_table(names[2])
+    assert all(np.allclose(other.columns[n], own.columns[n], rtol=1e-15, equal_nan=True) for n in own.columns)
+    assert other.kind == "recording" and "damaged the metadata" in other.remarks[0]
+
+
+DATES = {"25.01.2026", "01. Mai", "1-May", "May-26", "2026-05-01", "5/1/2026", "1.5.26", "00:00:01"}
+
+
+@pytest.mark.parametrize("cell", sorted(DATES))
+def test_a_number_that_became_a_date_is_named(tmp_path, cell):
+    """Excel in German takes 1.5 for the first of May."""
+    (tmp_path / "run.csv").write_text(f"time_s;height_m\n0;1\n1;{cell}\n")
+    with pytest.raises(FileFormatError, match=r"line 3: .* is a date or a time of day: .*English numbers"):
+        read_table(tmp_path / "run.csv")
 
 
 def test_a_recording_without_metadata_is_used_and_named(tmp_path):

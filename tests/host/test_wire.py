@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from linkpose.wire import frames, messages
+from linkpose.wire.capture import decode_capture
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
 from linkpose.wire.messages import Hello, Ping, Pong, Sample
 
@@ -110,6 +111,22 @@ def test_pieces_of_any_size_give_the_same_messages(cuts):
         at += cut
     got += decoder.feed(stream[at:])
     assert got == sent and decoder.corrupt.total == 0
+
+
+@given(
+    st.lists(st.one_of(st.binary(max_size=200), st.text("\x01\x40\xff", min_size=120, max_size=300).map(str.encode))),
+    st.integers(1, 150),
+)
+def test_causes_are_the_same_in_pieces_as_a_whole_and_in_a_capture(garbage, size):
+    """A frame that is too long is that, however much of it has arrived."""
+    stream = b"".join(encode(sample(i)) + part for i, part in enumerate(garbage))
+    whole, pieces = StreamDecoder(), StreamDecoder()
+    messages = whole.feed(stream)
+    assert [m for at in range(0, len(stream), size) for m in pieces.feed(stream[at : at + size])] == messages
+    assert pieces.corrupt == whole.corrupt
+    captured = decode_capture(stream)
+    assert captured.corrupt == whole.corrupt
+    assert len(captured.samples) + len(captured.others) == len(messages)
 
 
 @given(st.binary(max_size=2000))

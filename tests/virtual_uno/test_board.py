@@ -546,7 +546,7 @@ def test_a_reset_within_a_frame_does_not_cost_hello(board: MakeBoard) -> None:
     """A frame is 1.5 ms long: the resets cut it near its beginning, in its middle and near its end."""
     link = board()
     link.start()
-    for cut_ms in (0.2, 0.7, 1.2):
+    for cut_ms in (0.2, 0.5, 0.8):
         link.run_ms(5)
         while not (begun := link.uno.take_received()):
             link.uno.run_ms(0.05)

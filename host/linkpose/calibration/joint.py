@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from linkpose.calibration.joint_constraint import (
     pieces,
     stretches,
 )
+from linkpose.calibration.normal_equations import Sums, correlation
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats
@@ -143,15 +144,6 @@ class JointCalibration:
 def weak_std_m(length_m: float) -> float:
     """σ (m) from which on a direction of a J2S of this length counts as not observable."""
     return min(max(_WEAK_SHARE * length_m, _LEAST_WEAK_M), _MOST_WEAK_M)
-
-
-class _Sums(NamedTuple):
-    """Normal equations at some unknowns, gravity's directions eliminated, in blocks."""
-
-    normals: Floats  # (B, UNKNOWNS, UNKNOWNS)
-    gradients: Floats  # (B, UNKNOWNS), downhill
-    residual: Floats  # (M, 3) m/s²
-    equations: float  # their number, weighted
 
 
 def with_calibration(rig: Rig, found: JointCalibration, with_imu: bool) -> Rig:
@@ -281,7 +273,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
         sums = _normal_equations([equations(p, unknowns) for part in parts for p in pieces(part, longest_s)], scale)
         normal, prior = sums.normals.sum(axis=0), _prior(spread)
         first = number < _FREE_PASSES
-        worth = 1.0 if first else _correlation(sums, normal + worth * np.diag(prior))
+        worth = 1.0 if first else correlation(sums, normal + worth * np.diag(prior))
         # The readings' density: without it, a fit could reduce its residuals by shrinking the readings.
         volume = np.zeros(UNKNOWNS)
         volume[_ACCEL_SCALES] = sums.equations / (1 - unknowns[_ACCEL_SCALES])
@@ -296,7 +288,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
     return unknowns, covariance, float(np.sqrt(np.mean(sums.residual**2)))
 
 
-def _normal_equations(parts: Sequence[Equations], scale: float) -> _Sums:
+def _normal_equations(parts: Sequence[Equations], scale: float) -> Sums:
     """Sums over the pieces, `scale` (m/s²) being the usual residual.
 
     Eliminating γ removes the means of a piece, and leaves one equation for the length of the mean.
@@ -318,7 +310,7 @@ def _normal_equations(parts: Sequence[Equations], scale: float) -> _Sums:
         row, known = mean / length @ mean_jacobian, 1 / (_GRAVITY_STD_M_S2**2 + 1 / weight.sum())
         block_normals.append(known * np.outer(row, row))
         gradients.append(known * (STANDARD_GRAVITY - length) * row)
-    return _Sums(np.array(block_normals), np.array(gradients), np.concatenate(residuals), number)
+    return Sums(np.array(block_normals), np.array(gradients), np.concatenate(residuals), number)
 
 
 def _mean_gravity(gravity: Floats, scale: float) -> tuple[Floats, Floats, Floats]:
@@ -350,15 +342,3 @@ def _spreads(unknowns: Floats, covariance: Floats, spread: Floats) -> Floats:
         squares = float((unknowns[members] ** 2).sum())
         found.append(min((_USUAL_WEIGHT * _USUAL_STD**2 + squares) / (_USUAL_WEIGHT + informed), largest**2))
     return np.array(found)
-
-
-def _correlation(sums: _Sums, information: Floats) -> float:
-    """Variance of the blocks' gradients over the variance with independent residuals; 1 or more.
-
-    Σ sᵀ N⁻¹ s over the blocks' gradients s, over its expectation: a block's normal matrix less its share in the fit.
-    """
-    inverse = np.linalg.inv(information)
-    measured = np.einsum("bp,pq,bq->", sums.gradients, inverse, sums.gradients)
-    shares = inverse @ sums.normals
-    expected = np.einsum("bpp->", shares) - np.einsum("bpq,bqp->", shares, shares)
-    return max(1.0, float(measured / expected))

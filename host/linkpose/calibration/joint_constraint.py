@@ -20,7 +20,7 @@ Source: the constraint is (9) of [Link]; the weights are the "method functions" 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,7 @@ _SPIKE_MEDIANS = 10.0  # a normal distribution exceeds 5 medians of |x| in one o
 _SPREAD_SAMPLES = 32  # over which the median is taken, and over the same before and after
 _OF_GYRO = [*range(GYRO_BIAS, ACCEL_BIAS), *range(GYRO_MATRIX, UNKNOWNS)]
 _SATURATED = int(SampleFlags.ACCEL_SATURATED | SampleFlags.GYRO_SATURATED)
+_SATURATED_2 = int(SampleFlags.ACCEL2_SATURATED | SampleFlags.GYRO2_SATURATED)
 
 
 class Stretch(NamedTuple):
@@ -63,14 +64,43 @@ class Equations(NamedTuple):
 
 def stretches(block: Measurements, imu: Imu) -> list[Stretch]:
     """The unbroken stretches of a recording's usable samples, with the rig's calibration applied."""
-    force = (block.accel_m_s2 - np.array(imu.accel_offset_m_s2)) / np.array(imu.accel_scale)
-    rate = block.gyro_rad_s - np.array(imu.gyro_bias_rad_s)
-    usable = np.isfinite(force).all(axis=1) & np.isfinite(rate).all(axis=1) & (block.flags & _SATURATED == 0)
+    readings = _readings(block.accel_m_s2, block.gyro_rad_s, imu)
+    usable = _usable(*readings) & (block.flags & _SATURATED == 0)
+    return [stretch for (stretch,) in _unbroken(block.time_s, usable, [readings])]
+
+
+def paired_stretches(block: Measurements, imu: Imu) -> list[tuple[Stretch, Stretch]]:
+    """As `stretches`, of both inertial sensors at the samples that both can use; the calibration is the first one's."""
+    first = _readings(block.accel_m_s2, block.gyro_rad_s, imu)
+    second = block.accel2_m_s2, block.gyro2_rad_s
+    usable = _usable(*first) & _usable(*second) & (block.flags & (_SATURATED | _SATURATED_2) == 0)
+    return [(one, two) for one, two in _unbroken(block.time_s, usable, [first, second])]
+
+
+def _readings(accel: Floats, gyro: Floats, imu: Imu) -> tuple[Floats, Floats]:
+    """Force and rate with the rig's calibration applied."""
+    return (accel - np.array(imu.accel_offset_m_s2)) / np.array(imu.accel_scale), gyro - np.array(imu.gyro_bias_rad_s)
+
+
+def _usable(force: Floats, rate: Floats) -> NDArray[np.bool_]:
+    """(N,) Which samples have finite readings without a spike."""
+    usable = np.asarray(np.isfinite(force).all(axis=1) & np.isfinite(rate).all(axis=1))
     usable[usable] = ~(_spikes(force[usable], _SPIKE_M_S2) | _spikes(rate[usable], _SPIKE_RAD_S))
-    time_s, force, rate = block.time_s[usable], force[usable], rate[usable]
+    return usable
+
+
+def _unbroken(
+    time_s: Floats, usable: NDArray[np.bool_], readings: Sequence[tuple[Floats, Floats]]
+) -> list[tuple[Stretch, ...]]:
+    """The usable samples of each sensor, cut where one follows another too late."""
+    time_s = time_s[usable]
     steps = np.diff(time_s)
     breaks = np.flatnonzero((steps > LONGEST_STEP_S) | (steps <= 0)) + 1
-    return [Stretch(time_s[r], force[r], rate[r]) for r in np.split(np.arange(len(time_s)), breaks)]
+    kept = [(force[usable], rate[usable]) for force, rate in readings]
+    return [
+        tuple(Stretch(time_s[rows], force[rows], rate[rows]) for force, rate in kept)
+        for rows in np.split(np.arange(len(time_s)), breaks)
+    ]
 
 
 def pieces(stretch: Stretch, longest_s: float) -> Iterator[Stretch]:
@@ -96,7 +126,7 @@ def equations(piece: Stretch, unknowns: Floats) -> Equations:
     of_gyro = np.eye(3) - unknowns[GYRO_MATRIX:].reshape(3, 3)
     of_accel = np.eye(3) - unknowns[ACCEL_MATRIX:GYRO_MATRIX].reshape(3, 3)
     rate = gyro @ of_gyro.T
-    turned = _attitudes(piece.time_s, rate)
+    turned = attitudes(piece.time_s, rate)
     force = np.einsum("nij,nj->ni", turned, accel @ of_accel.T)
     velocity = np.einsum("nij,nj->ni", turned, np.cross(rate, d))
     by_gyro = np.concatenate([np.broadcast_to(-of_gyro, (len(rate), 3, 3)), _by_matrix(gyro)], axis=2)
@@ -105,8 +135,8 @@ def equations(piece: Stretch, unknowns: Floats) -> Equations:
     of_force, of_velocity = (np.zeros((len(rate), 3, UNKNOWNS)) for _ in range(2))
     of_force[:, :, ACCEL_BIAS:GYRO_MATRIX] = turned @ by_accel
     of_force[:, :, _OF_GYRO] = _cross_columns(angle, force)
-    of_velocity[:, :, J2S:GYRO_BIAS] = turned @ _cross_matrix(rate)
-    of_velocity[:, :, _OF_GYRO] = _cross_columns(angle, velocity) - turned @ _cross_matrix(d[None]) @ by_gyro
+    of_velocity[:, :, J2S:GYRO_BIAS] = turned @ cross_matrices(rate)
+    of_velocity[:, :, _OF_GYRO] = _cross_columns(angle, velocity) - turned @ cross_matrices(d[None]) @ by_gyro
     rows, weight, slope, apart_s = _weights(piece.time_s)
     return Equations(
         np.einsum("mk,mki->mi", weight, force[rows]) + np.einsum("mk,mki->mi", slope, velocity[rows]),
@@ -171,7 +201,7 @@ def _weights(time_s: Floats) -> tuple[NDArray[np.int64], Floats, Floats, float]:
     return rows, weight, slope, apart
 
 
-def _attitudes(time_s: Floats, rate: Floats) -> Floats:
+def attitudes(time_s: Floats, rate: Floats) -> Floats:
     """C (N, 3, 3) from the sensor's axes to those at the first sample, by the mean rate (rad/s) over each step."""
     step = np.diff(time_s)[:, None]
     turn = 0.5 * step * (rate[1:] + rate[:-1])
@@ -214,10 +244,10 @@ def _by_matrix(reading: Floats) -> Floats:
 
 def _cross_columns(left: Floats, right: Floats) -> Floats:
     """(N, 3, K): each column of `left` (N, 3, K) × `right` (N, 3)."""
-    return -_cross_matrix(right) @ left
+    return -cross_matrices(right) @ left
 
 
-def _cross_matrix(v: Floats) -> Floats:
+def cross_matrices(v: Floats) -> Floats:
     """[v×], (N, 3, 3)."""
     zero = np.zeros(len(v))
     x, y, z = v.T

@@ -20,7 +20,15 @@ if TYPE_CHECKING:
     from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
 
-RANGE_STD_M = 0.1
+# The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
+# value for streams, laser scans, and logs of fewer than 100 measurements.
+NOISES = {
+    "range_std": ("range", 0.1), "range_growth": ("growth", 0.02), "bearing_std": ("bearing", 0.05),
+    "speed_std": ("speed", 0.1), "turn_std": ("turn", 0.1), "velocity_std": ("velocity", 0.1),
+    "acceleration_std": ("acceleration", 1.0),
+}  # fmt: skip
+FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
+LANDMARK_ERROR_TIME_S = 0.5
 # With fewer beacons a bias cannot be told from a place. On three public recordings of radio ranges (tests/bench) both
 # constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
 BEACONS_FOR_CONSTANTS = 3
@@ -135,33 +143,29 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     metavar="P|off",
     help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
 )
-@click.option("--range-std", type=POSITIVE, default=RANGE_STD_M, show_default=True, help="σ of a range (m).")
+@click.option("--range-std", type=POSITIVE, help=f"σ of a range (m). {FROM_LOG} 0.1.")
 @click.option(
     "--range-growth",
     type=options.FiniteRange(min=0),
-    default=0.02,
-    show_default=True,
-    help="Growth k of the range's standard deviation with --noise affine (m/m).",
+    help=f"Growth k of the range's standard deviation with --noise affine (m/m). {FROM_LOG} 0.02.",
 )
 @click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
-@click.option("--bearing-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a bearing (rad).")
+@click.option("--bearing-std", type=POSITIVE, help=f"σ of a bearing (rad). {FROM_LOG} 0.05.")
 @click.option("--depth-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a depth (m).")
 @click.option("--attitude-std", type=POSITIVE, default=0.01, show_default=True, help="σ of a yaw reading (rad).")
-@click.option(
-    "--speed-std", type=POSITIVE, default=0.1, show_default=True, help="σ of one odometry sample's speed (m/s)."
-)
-@click.option(
-    "--turn-std", type=POSITIVE, default=0.1, show_default=True, help="σ of one odometry sample's turn rate (rad/s)."
-)
-@click.option(
-    "--velocity-std", type=POSITIVE, default=0.1, show_default=True, help="σ of one velocity sample on each axis (m/s)."
-)
+@click.option("--speed-std", type=POSITIVE, help=f"σ of one odometry sample's speed (m/s). {FROM_LOG} 0.1.")
+@click.option("--turn-std", type=POSITIVE, help=f"σ of one odometry sample's turn rate (rad/s). {FROM_LOG} 0.1.")
+@click.option("--velocity-std", type=POSITIVE, help=f"σ of one velocity sample on each axis (m/s). {FROM_LOG} 0.1.")
 @click.option(
     "--acceleration-std",
     type=POSITIVE,
-    default=1.0,
-    show_default=True,
-    help="σ of the acceleration on each axis of a log without odometry (m/s²).",
+    help=f"σ of the acceleration on each axis of a log without odometry (m/s²). {FROM_LOG} 1.",
+)
+@click.option(
+    "--error-time",
+    type=options.FiniteRange(min=0),
+    help="Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
+    f"count less. {FROM_LOG} 0, and 0.5 for landmarks.",
 )
 @click.option(
     "--motion-correlation",
@@ -262,6 +266,7 @@ def command(
     default: Method = "scan-match" if has_scans else "ekf"
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
     settings["estimate"] = _estimated(settings["estimate"], events)
+    free = _free_noises(settings)
     chosen = {name: _settings(settings, name, read.start) for name in names}
     if not carmen:  # its units are defined, and poses a millisecond apart give any turn rate
         check_units(events, beacons, str(log))
@@ -276,6 +281,8 @@ def command(
             err=True,
         )
     Console(quiet=False, verbose=False).compile(names)
+    if beacons and not has_scans:
+        chosen = _tuned(events, chosen, beacons, free, quiet=json_lines)
     tracks: dict[str, Track] = {
         method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
     }
@@ -301,6 +308,7 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
         raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth")
     if settings["estimate"] == ("none",):
         settings["estimate"] = ()
+    _free_noises(settings)
     method = cast("Method", name)
     header = False
     for names, row in localize_stream(sys.stdin, method, _settings(settings, method, None), beacons):
@@ -326,6 +334,31 @@ def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
         return ()
     click.echo("scale error and bias of the ranges are estimated, too (--estimate none: not)", err=True)
     return ("scale", "bias")
+
+
+def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
+    """The noises that the user did not state, which get their values for logs that do not determine them."""
+    free = [name for option, (name, _) in NOISES.items() if given[option] is None]
+    for option, (_, value) in NOISES.items():
+        given[option] = value if given[option] is None else given[option]
+    if given["noise"] != "affine" and "growth" in free:
+        free.remove("growth")
+    return (*free, "yaw", *(("error_time",) if given["error_time"] is None else ()))
+
+
+def _tuned(
+    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], quiet: bool
+) -> dict[Method, Settings]:
+    """The settings of all filters with the free noises estimated from the log, and a line that reports them."""
+    from linkpose.localization.tuning import described, tune
+
+    first = next(iter(chosen.values()))
+    tuned = tune(events, first, beacons, free)
+    if tuned is first:
+        return chosen
+    if not quiet:
+        click.echo(f"noises estimated from the log: {described(tuned, events)}", err=True)
+    return dict.fromkeys(chosen, tuned)
 
 
 def _has_no_odometry(events: Log) -> bool:
@@ -377,6 +410,7 @@ def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float
         start=start,
         start_std=given["start_std"],
         acceleration_std_m_s2=given["acceleration_std"],
+        error_time_s=given["error_time"],
         smooth=given["smooth"],
         particles=given["particles"],
         seed=given["seed"],

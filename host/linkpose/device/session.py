@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import random
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -61,9 +62,26 @@ MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 STILL_SAMPLES = 10  # with the same time stamp
 JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
+WAIT_STEP_S = 0.05
+OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
+
+
+class _TimeLimit:
+    """A time to wait, of which a suspended program uses up no more than one step."""
+
+    def __init__(self, seconds: float) -> None:
+        self._left_s = seconds
+        self._looked_s = time.perf_counter()
+
+    def step(self) -> float:
+        """How long to wait next (s); 0 when the time is over."""
+        now = time.perf_counter()
+        self._left_s -= min(now - self._looked_s, WAIT_STEP_S)
+        self._looked_s = now
+        return min(max(self._left_s, 0.0), WAIT_STEP_S)
 
 
 class NotResumed(Disconnected):
@@ -112,7 +130,8 @@ class Session:
         self._clock = DeviceClock()
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
-        self._token = 0
+        self._token = random.getrandbits(32)  # another program's differ
+        self._intruder_reported = False
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
@@ -156,26 +175,30 @@ class Session:
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
-        heard = bytearray()
-        deadline, ask_at = time.perf_counter() + HANDSHAKE_TIMEOUT_S, 0.0
-        while time.perf_counter() < deadline:
+        heard, refused = bytearray(), 0
+        limit, ask_at = _TimeLimit(HANDSHAKE_TIMEOUT_S), 0.0
+        while step_s := limit.step():
             if time.perf_counter() >= ask_at:
                 connection.send(Stop())
                 connection.send(GetInfo())
                 ask_at = time.perf_counter() + ASK_INTERVAL_S
-            arrival = connection.receive(0.05)
+            arrival = connection.receive(step_s)
             if arrival is None:
                 continue
             heard += arrival.data[: 512 - len(heard)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
                     raise _other_protocol(message)
+                refused += isinstance(message, Nak)
                 if isinstance(message, Hello) and not message.streaming:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        raise NoFirmware(self.port, bytes(heard), _why_no_hello(bytes(heard), connection.decoder.corrupt))
+        reason = _why_no_hello(bytes(heard), connection.decoder.corrupt)
+        if refused:
+            reason = "the board refuses every command, also the request for its version; its firmware is damaged"
+        raise NoFirmware(self.port, bytes(heard), reason)
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
         """Waits for sensors that are being set up and returns the latest HELLO."""
@@ -277,9 +300,9 @@ class Session:
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
-        deadline = time.perf_counter() + timeout_s
-        while (left := deadline - time.perf_counter()) > 0:
-            arrival = self._connection.receive(left)
+        limit = _TimeLimit(timeout_s)
+        while step_s := limit.step():
+            arrival = self._connection.receive(step_s)
             if arrival is not None:
                 yield arrival
 
@@ -293,6 +316,16 @@ class Session:
         sent = self._pings.pop(pong.token, None)
         if sent is not None:
             self._clock.pong(pong.t_us, sent, time_s)
+        elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
+            self._report_intruder()
+
+    def _report_intruder(self) -> None:
+        """An answer came that this program has not asked for: a port such as socket:// serves several programs."""
+        if not self._intruder_reported:
+            self._intruder_reported = True
+            self.notify(
+                f"another program also sends commands to the board at {self.port}; close it, or the data will have gaps"
+            )
 
     def _tie_clocks(self) -> None:
         """A few round trips before the first sample."""
@@ -457,6 +490,8 @@ class Session:
         together with its HELLO is older than that."""
         if isinstance(message, Pong):
             self._hear_pong(message, arrival.time_s)
+        elif isinstance(message, Ack | Nak) and message.command in (Command.STOP, Command.CONFIGURE):
+            self._report_intruder()  # the board answers in order: START was the last command of this program
         elif isinstance(message, Status):
             self.status = message
             self._check_supply(message)

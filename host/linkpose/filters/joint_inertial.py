@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from linkpose.filters._imu import ImuCalibration, ImuSamples
+from linkpose.filters._records import record_of
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
@@ -36,7 +37,6 @@ from linkpose.filters.inertial.state import (
     X,
     Y,
     fresh_state,
-    record_of,
 )  # fmt: skip
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Imu, Rig

@@ -17,6 +17,7 @@ from linkpose.localization.gate import chi_square_quantile
 FEWEST = 20  # innovations of a sensor below which there is no verdict
 # The stated noise is called too small or too large beyond this factor. The median of 100 innovations scatters by 15 %.
 FACTOR = 1.3
+LEAST_FACTOR = 0.01  # a sensor is not a hundred times better than stated: it is silent, or the filter's only source
 NAMES = {
     "range": "range", "bearing_range": "range and bearing", "depth": "depth", "attitude": "attitude", "pose": "pose",
     "scan": "laser scan",
@@ -43,8 +44,10 @@ class Verdict:
             return f"{name} noise: only {self.count} measurements, no verdict"
         if self.noise_factor > FACTOR:
             return f"{name} noise is set {self.noise_factor:.1f} times too small"
+        if self.noise_factor < LEAST_FACTOR:
+            return f"{name} noise: the measurements equal their predictions, no verdict"
         if self.noise_factor < 1.0 / FACTOR:
-            return f"{name} noise is set {1.0 / max(self.noise_factor, 1e-3):.1f} times too large"
+            return f"{name} noise is set {1.0 / self.noise_factor:.1f} times too large"
         return f"{name} noise fits (factor {self.noise_factor:.2f})"
 
 

@@ -148,7 +148,10 @@ class KalmanFilter:
             self.grid.blocked,
             self.grid.geometry,
         )
-        if self.name == "ekf":
+        # Readings of states are linear: at one instant both filters' corrections are equal, and the extended one also
+        # works for a heading whose sigma points spread around the circle.
+        is_linear = interval_s == 0.0 and measurement.model == models.DIRECT
+        if self.name == "ekf" or is_linear:
             sound = ekf_step(*arguments)
         else:
             sound = ukf_step(*arguments, self.transform.alpha, self.transform.beta, self.transform.kappa)
@@ -156,6 +159,12 @@ class KalmanFilter:
             raise NotPositiveDefinite("covariance", f"the filter {self.name}")
         self.d2 = d2
         return np.asarray(d2 <= threshold)
+
+    def predict_linearised(self, interval_s: float, control: Floats, hold_s: Floats) -> None:
+        """Moves on as `step` does, by the model's Jacobians, whatever the filter."""
+        name, self.name = self.name, "ekf"
+        self.step(interval_s, control, hold_s)
+        self.name = name
 
     def copy(self) -> KalmanFilter:
         """A filter with the same state that goes on by itself."""
@@ -166,13 +175,12 @@ class KalmanFilter:
         """Where x, y and heading are in the state."""
         return np.array([self.motion.states.index(name) for name in ("x_m", "y_m", "heading_rad")])
 
-    def place(self, pose: Floats, std: Floats) -> None:
-        """Sets x, y, heading to `pose` (3,) with standard deviations `std` (3,), uncorrelated with the other states."""
-        at = self.pose_indices
-        self.state[at] = pose
+    def place(self, at: NDArray[np.intp], values: Floats, covariance: Floats) -> None:
+        """Sets the states `at` (p,) to `values` with `covariance` (p, p), uncorrelated with the other states."""
+        self.state[at] = values
         self.covariance[at, :] = 0.0
         self.covariance[:, at] = 0.0
-        self.covariance[at, at] = std**2
+        self.covariance[np.ix_(at, at)] = covariance
 
     def _angles_of(self, measurement: Measurement) -> Bools:
         """Which of the states, and after them of the measurement's rows, are angles."""

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError, MissingBeacons, MissingMap, MissingStart, NeedsScans, NothingToEstimate
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
-from linkpose.localization.grid import GridMap, no_map
+from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
 from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
 from linkpose.localization.noise import check_correlation
+from linkpose.localization.relocation import Relocator
 from linkpose.localization.settings import Pose, Settings
 from linkpose.localization.smoother import History
 from linkpose.localization.tables import Beacons
@@ -41,6 +42,10 @@ Method = Literal["scan-match", "ekf", "ukf", "mcl"]
 # When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
+
+# An unscented filter predicts longer intervals (s) by linearisation: the headings of its sigma points spread around the
+# circle then, and have no mean. Sensors of the thesis measure at least every 0.2 s.
+LONGEST_UKF_S = 0.5
 
 
 class Row(NamedTuple):
@@ -100,8 +105,21 @@ def batches(log: Log) -> Iterator[tuple[int, int]]:
 def warm_up(names: Iterable[Method]) -> None:
     """Compiles the filters, or loads them compiled."""
     at_one_place: Log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(0.1, "pose", (0.0, 0.0, 0.0))]
+    angles = np.linspace(-np.pi, np.pi, 37)
+    in_a_round_room: Log = [*at_one_place, Scan(0.2, np.ones(37), angles, (0.0, 0.0, 0.0), 5.0)]
     for name in names:
-        localize(at_one_place, name, Settings())
+        if name in ("mcl", "scan-match"):
+            localize(in_a_round_room, name, Settings(), _round_room())
+        else:
+            localize(at_one_place, name, Settings())
+
+
+def _round_room() -> GridMap:
+    """A map of 4 m by 4 m, free within 1 m of its middle, the origin."""
+    cell_m, cells = 0.1, 40
+    middle_m = (np.arange(cells) + 0.5) * cell_m - 2.0
+    blocked = np.hypot(middle_m[:, None], middle_m) > 1.0
+    return GridMap(np.where(blocked, OCCUPIED, FREE).astype(np.uint8), np.array([cell_m, -2.0, -2.0, 0.0]))
 
 
 class Localizer:
@@ -143,6 +161,9 @@ class Localizer:
         self.applied = self.rejected = self.widened = self.relocated = 0
         self.rejected_ranges: set[tuple[float, str]] = set()
         self.consistency = Consistency()
+        self.relocator = Relocator(motion, self.sensors) if beacons else None
+        self.is_replaced = False  # by the last measurement
+        self.rivalry: Floats | None = None  # what a better pose adds to the covariance until it replaces this one
         self.known = start is not None
         self.history = History() if settings.smooth else None
         self.laser: ScanTracker | None = None
@@ -162,8 +183,14 @@ class Localizer:
             measurement = self.sensors.measurement(events)
         if self.laser:
             self.laser.predict(self.filter, interval, self.control, self.hold)
+        if self.relocator:
+            self.relocator.move(self.filter, interval, self.control)
+        self.is_replaced = False
         if self.history is not None:
             self.history.predict(self.filter, interval, self.control, self.hold)
+            interval = 0.0
+        if self.filter.name == "ukf" and interval > LONGEST_UKF_S and self.laser is None:
+            self.filter.predict_linearised(interval, self.control, self.hold)
             interval = 0.0
         passed = self.filter.step(interval, self.control, self.hold, measurement if self.known else None)
         self.now = event.time_s
@@ -171,10 +198,14 @@ class Localizer:
             self._match(self.laser, event)
         elif measurement is not None and self.known:
             self._count(events, passed)
-        if isinstance(event, Event):
-            self._steer(event, hold_s)
+            self._relocate(events)
+        for one in events:
+            if isinstance(one, Event) and one.kind in NAMED:
+                self.sensors.note(one)
+            elif isinstance(one, Event):
+                self.steer(one, hold_s)
         if self.history is not None:
-            self.history.correct(self.filter, self.known)
+            self.history.correct(self.filter, self.known, self.is_replaced)
         return self._row()
 
     def track(self, rows: Sequence[Row]) -> Track:
@@ -202,6 +233,8 @@ class Localizer:
 
     def _row(self) -> Row:
         state, covariance = self.filter.state.copy(), self.filter.covariance.copy()
+        if self.rivalry is not None:
+            covariance += self.rivalry
         if not self.known:
             state[:], covariance[:] = np.nan, np.nan
         return self.finished(self.now, state, covariance)
@@ -216,7 +249,7 @@ class Localizer:
             self.laser.add_map_error(self.filter, covariance)
         return Row(time_s, state, covariance)
 
-    def _steer(self, event: Event, hold_s: float | None) -> None:
+    def steer(self, event: Event, hold_s: float | None) -> None:
         """A control holds from its own time on."""
         if event.kind == self.control_kind:
             self.control[: len(event.values)] = event.values
@@ -238,14 +271,38 @@ class Localizer:
             self.consistency.add("scan", 3, result.fit.d2)
         self.filter, self.known = result.filter, result.known
 
+    def _relocate(self, events: Sequence[Event | Scan]) -> None:
+        """Replaces the pose by a fit of the latest measurements, when they contradict the pose and agree on another."""
+        if self.relocator is None or events[0].kind not in NAMED:
+            return
+        self.rivalry = None
+        settling = self.relocator.settling_s is not None
+        found = self.relocator.see(self.filter, [event for event in events if isinstance(event, Event)])
+        if found is None:
+            return
+        if found.is_certain:
+            self.filter.place(found.at, found.values, found.covariance)
+            self.relocated += not settling
+            self.is_replaced = True
+            self.lately_rejected.clear()
+        else:
+            off = np.zeros(len(self.filter.state))
+            off[found.at] = found.values - self.filter.state[found.at]
+            off[self.filter.motion.is_angle] = 0.0
+            self.rivalry = np.outer(off, off)
+
     def _count(self, events: Sequence[Event | Scan], passed: NDArray[np.bool_]) -> None:
         kind, good = events[0].kind, int(passed.sum())
         self.applied += good
         self.rejected += len(passed) - good
         block = {"bearing_range": 2, "pose": 3}.get(kind, 1)
         for i, d2 in enumerate(self.filter.d2):
-            self.consistency.add(kind, block, float(d2))
             event = events[min(i, len(events) - 1)]
+            if not self.sensors.is_independent(event):
+                continue
+            if isinstance(event, Event) and event.beacon:  # as if its variance had not been raised
+                d2 *= self.sensors.repetition(event)
+            self.consistency.add(kind, block, float(d2))
             if isinstance(event, Event) and event.beacon:
                 self.consistency.add(f"{kind}:{event.beacon}", block, float(d2))
         if kind == "range":

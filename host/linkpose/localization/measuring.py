@@ -12,13 +12,12 @@ from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD
 from linkpose.localization.events import Event, Scan
 from linkpose.localization.kalman import Measurement, Motion
-from linkpose.localization.settings import CONSTANTS, Settings
+from linkpose.localization.linalg import Floats
+from linkpose.localization.settings import CONSTANTS, ERROR_TIME_S, Settings
 from linkpose.localization.tables import Beacons
 
-# Sightings of one landmark within this time (s) share their error: the lag-one correlation of the ranges in the public
-# log MRCLAM 7 is 0.5 to 0.95. There 0.5 s takes the error from 0.17 to 0.15 m, and smoothed from 0.14 to 0.11 m; 2 s
-# gives 0.155 and 0.10 m. A sighting counts as 1/MOST_REPEATS of an independent one at the least.
-REPEATS_S, MOST_REPEATS = 0.5, 50.0
+# A sighting that repeats the error of the one before counts as 1/MOST_REPEATS of an independent one at the least.
+MOST_REPEATS = 500.0
 
 
 def constant_states(estimate: Sequence[str], beacons: Sequence[str]) -> tuple[str, ...]:
@@ -45,6 +44,7 @@ class Sensors:
         self.height = self.states.index("z_m") if "z_m" in self.states else -1
         self.last_range: dict[str, float] = {}
         self.last_sighting_s: dict[str, float] = {}
+        self.last_independent_s: dict[str, float] = {}
         self._columns = {
             beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
         }
@@ -57,6 +57,15 @@ class Sensors:
                 return self.states.index(name)
         return -1
 
+    def constants(self, beacon: str, state: Floats) -> tuple[float, float]:
+        """Scale error and bias (m) of a beacon's range in this state; 0 where they are not estimated."""
+        scale, bias = self._columns[beacon]
+        return float(state[scale]) if scale >= 0 else 0.0, float(state[bias]) if bias >= 0 else 0.0
+
+    def range_std(self, range_m: float) -> float:
+        """Standard deviation (m) of one range."""
+        return float(np.sqrt(self.settings.ranges.variances(np.array([range_m]), range_m)[0]))
+
     def measurement(self, events: Sequence[Event | Scan]) -> Measurement | None:
         """The measurement of events of one kind and instant; None for what is no measurement."""
         event, settings = events[0], self.settings
@@ -68,7 +77,7 @@ class Sensors:
             distance = np.array(event.values[:1])
             variance = settings.ranges.variances(distance, self._mean_range(event))[0]
             table = np.array([[*self.beacons[event.beacon][:2], *self._columns[event.beacon]]])
-            covariance = np.diag([variance, settings.bearing_std_rad**2]) * self._repetition(event)
+            covariance = np.diag([variance, settings.bearing_std_rad**2]) * self.repetition(event)
             return Measurement(models.LANDMARK, np.array(event.values), covariance, table, 2, (False, True))
         if event.kind == "depth":
             return _direct(event.values, (settings.depth_std_m,), ((2, -1.0),), (False,))
@@ -78,11 +87,30 @@ class Sensors:
             return self._pose(event)
         return None
 
-    def _repetition(self, event: Event) -> float:
-        """Factor on the covariance of a sighting that repeats the error of the one before it."""
-        interval = event.time_s - self.last_sighting_s.get(event.beacon, -np.inf)
+    def _error_time_s(self, kind: str) -> float:
+        given = self.settings.error_time_s
+        return ERROR_TIME_S[kind] if given is None else given
+
+    def repetition(self, event: Event, last_s: float | None = None) -> float:
+        """Factor on the covariance of a sighting that repeats the error of the one at `last_s` of the same beacon, by
+        default the last one noted: n sightings within the time that an error persists carry the information of one.
+        """
+        before = self.last_sighting_s.get(event.beacon, -np.inf) if last_s is None else last_s
+        return min(max(1.0, self._error_time_s(event.kind) / max(event.time_s - before, 1e-3)), MOST_REPEATS)
+
+    def is_independent(self, event: Event | Scan) -> bool:
+        """Whether a sighting is so long after the last independent one of its beacon that its error is another."""
+        if not isinstance(event, Event) or not event.beacon:
+            return True
+        apart = event.time_s - self.last_independent_s.get(event.beacon, -np.inf)
+        if apart < self._error_time_s(event.kind):
+            return False
+        self.last_independent_s[event.beacon] = event.time_s
+        return True
+
+    def note(self, event: Event) -> None:
+        """Remembers a sighting, which the next one of the same beacon may repeat."""
         self.last_sighting_s[event.beacon] = event.time_s
-        return min(max(1.0, REPEATS_S / max(interval, 1e-3)), MOST_REPEATS)
 
     def _pose(self, event: Event) -> Measurement:
         far, turned = self.settings.start_std
@@ -107,7 +135,9 @@ class Sensors:
         table = np.array(rows, dtype=np.float64)
         ranges = np.array([event.values[0] for event in events])
         means = [self._mean_range(event) for event in events]
-        return Measurement(models.BEACON_RANGE, ranges, self.settings.ranges.covariance(ranges, means[-1]), table)
+        covariance = self.settings.ranges.covariance(ranges, means[-1])
+        repeats = np.sqrt([self.repetition(event) for event in events])
+        return Measurement(models.BEACON_RANGE, ranges, covariance * np.outer(repeats, repeats), table)
 
     def _mean_range(self, event: Event) -> float:
         """r̄ of (14) for sensors that do not measure at one instant: the mean of each beacon's last range."""

@@ -122,7 +122,7 @@ class ScanTracker:
         candidates = list(others)
         for pose in self.matcher.search(points, CANDIDATES) if found is None else found:
             candidate = run.copy()
-            candidate.place(pose, CANDIDATE_STD)
+            candidate.place(candidate.pose_indices, pose, np.diag(CANDIDATE_STD**2))
             self.matcher.correct(candidate, points)
             candidates.append(candidate)
         self.contest = Contest(

@@ -25,6 +25,7 @@ class _Step:
     predicted_covariance: Floats
     state: Floats
     covariance: Floats
+    is_new_start: bool = False  # the pose was found anew here, so that it says nothing about the steps before
 
 
 @dataclass(slots=True)
@@ -45,9 +46,10 @@ class History:
         state, covariance = run.state.copy(), run.covariance.copy()
         self.steps.append(_Step(slopes, state, covariance, state, covariance))
 
-    def correct(self, run: KalmanFilter, known: bool) -> None:
+    def correct(self, run: KalmanFilter, known: bool, relocated: bool = False) -> None:
         """Keeps the filter after a correction; a pose that is not known yet is kept as NaN."""
         step = self.steps[-1]
+        step.is_new_start = relocated
         step.state, step.covariance = run.state.copy(), run.covariance.copy()
         if not known:
             step.state[:] = np.nan
@@ -57,13 +59,15 @@ class History:
         out = [(step.state, step.covariance) for step in self.steps]
         for i in range(len(self.steps) - 2, -1, -1):
             now, after = self.steps[i], self.steps[i + 1]
-            if np.isnan(now.state).any() or np.isnan(out[i + 1][0]).any():
+            if after.is_new_start or np.isnan(now.state).any() or np.isnan(out[i + 1][0]).any():
                 continue
             later, later_covariance = out[i + 1]
             gain = np.linalg.lstsq(after.predicted_covariance, after.slopes @ now.covariance, rcond=1e-12)[0].T
             shift = later - after.predicted
             shift[is_angle] = [wrap_angle(float(value)) for value in shift[is_angle]]
             covariance = now.covariance + gain @ (later_covariance - after.predicted_covariance) @ gain.T
+            if (np.diagonal(covariance) < 0.0).any():  # rounding, where the next step adds next to nothing
+                covariance = now.covariance
             state = now.state + gain @ shift
             state[is_angle] = [wrap_angle(float(value)) for value in state[is_angle]]
             out[i] = state, 0.5 * (covariance + covariance.T)

@@ -25,6 +25,14 @@ _SEPARATORS = ("\t", ";", ",", " ")  # in order of preference: decimal commas oc
 _PADDING = ',;\t "'
 _MISSING = frozenset({"", "nan", "na", "n/a", "#n/a", "<na>", "null", "none"})
 _DECIMAL_COMMA = re.compile(r"\s*[+-]?\d*,\d*(e[+-]?\d+)?\s*", re.IGNORECASE)
+# What spreadsheets make of numbers such as 1.5 and 1-5, with names of months in any language, and times of day.
+_DATE = re.compile(
+    r"\d{1,4}[-./] ?(\d{1,2}|[^\W\d_]{3,12})\.?([-./ ]\d{2,4})?\.?"  # 25.01.2026, 01. Mai, 1-May, 2026-05-01
+    r"|[^\W\d_]{3,9}\.?[- ]\d{2,4}"  # May-26
+    r"|\d+:\d\d(:\d\d([.,]\d+)?)?"  # 00:00:01,5
+)
+# A piece of JSON after a comma begins so only where LibreOffice has taken the quotes of a text for those of a cell.
+_WITHOUT_QUOTES = re.compile(r"(?!(true|false|null)\b)[^\W\d_]", re.IGNORECASE)
 _INDEX_NAME = re.compile(r"Unnamed: \d+(_level_\d+)?")  # what pandas names a header cell that is empty
 _LONGEST_EXCERPT = 60
 
@@ -84,14 +92,20 @@ class Cells:
                 values[i] = float(text.replace(",", ".") if has_decimal_comma else text)
             except ValueError:
                 if text.strip().lower() not in _MISSING:
-                    raise FileFormatError(
-                        self.path,
-                        f"{self.path}, line {self.lines[i]}: {text.strip()[:30]!r} is not a number; "
-                        "correct or remove that row",
-                        self.lines[i],
-                    ) from None
+                    raise self._no_number(text.strip(), self.lines[i]) from None
                 values[i] = np.nan
         return values
+
+    def _no_number(self, cell: str, line: int) -> FileFormatError:
+        where = f"{self.path}, line {line}: {cell[:30]!r}"
+        if _DATE.fullmatch(cell):
+            return FileFormatError(
+                self.path,
+                f"{where} is a date or a time of day: a spreadsheet has converted a number; "
+                "import the table again with English numbers",
+                line,
+            )
+        return FileFormatError(self.path, f"{where} is not a number; correct or remove that row", line)
 
     def _find_decimal_mark(self, mark: DecimalMark) -> None:
         """Adds to `mark` what these rows show; raises FileFormatError when numbers can be read in two ways."""
@@ -158,9 +172,10 @@ def split_cells(path: Path, data: bytes, before: Sequence[str] = (), first_line:
     separator = _separator(table[0][1])
     comments = [_comment(i, line, separator) for i, line in numbered if _is_comment(line)]
     numbers, rows = _parse(path, table, separator)
-    if len(rows[0]) == 1 and len(table[0][1]) > 2 and (inner := _separator(rows[0][0])) in rows[0][0]:
-        separator = inner  # a spreadsheet kept each line as one quoted cell
-        numbers, rows = _parse(path, [(i, row[0]) for i, row in zip(numbers, rows, strict=True)], separator)
+    inner = _separator(rows[0][0]) if rows[0] else separator
+    if inner in "".join(rows[0][:1]) and not any(cell.strip() for row in rows for cell in row[1:]):
+        separator = inner  # a spreadsheet kept each line as one quoted cell, and may have padded it
+        numbers, rows = _parse(path, [(i, row[0]) for i, row in zip(numbers, rows, strict=True) if row], separator)
     names, body = _match(path, rows, numbers, separator)
     head = [comment for comment in comments if comment.line < numbers[0]]
     tail = [comment for comment in comments if comment.line > numbers[-1]]
@@ -192,7 +207,13 @@ def _comment(number: int, line: str, separator: str) -> Comment:
         cells.pop()
     cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
     cells = [cell.lower() if cell.strip() in ("TRUE", "FALSE") else cell for cell in cells]
-    return Comment(",".join(cells).lstrip()[1:].strip(), number, False)
+    as_is = Comment(",".join(cells).lstrip()[1:].strip(), number, False)
+    if as_is.as_object() is None and cells[1:]:
+        quoted = [f'"{cell}"' if _WITHOUT_QUOTES.match(cell) else cell for cell in cells[1:]]
+        repaired = Comment(",".join([cells[0], *quoted]).lstrip()[1:].strip(), number, False)
+        if repaired.as_object() is not None:
+            return repaired
+    return as_is
 
 
 def _separator(line: str) -> str:

@@ -28,6 +28,7 @@ _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
 _MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
+_HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _LONGEST_STEP_S = 0.5
 
@@ -44,6 +45,8 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
         _rate(measurements.gyro_rad_s) or _turning(measurements),
         _time(_median(np.diff(measurements.time_s)), rate_hz),
         _pressure(_median(measurements.pressure_Pa)),
+        _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
+        _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
     ]
     return [f"{path}: {suspicion}" for suspicion in found if suspicion]
 
@@ -137,6 +140,16 @@ def _pressure(median_pa: float) -> str:
             "4 km of altitude, multiply it by 100"
         )
     return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS)
+
+
+def _temperature(name: str, median_deg_c: float) -> str:
+    """A remark where 24.900 °C became 24900: a spreadsheet with decimal commas takes the point for a thousands mark."""
+    if not abs(median_deg_c) > _HOTTEST_DEG_C:
+        return ""
+    return (
+        f"{name} is {median_deg_c:.6g} (median), which no sensor measures: has a spreadsheet taken the decimal point "
+        "for a separator of thousands? Import the table again with English numbers"
+    )
 
 
 def _median(values: Floats) -> float:

@@ -88,9 +88,9 @@ class Chain:
 
     joint: str = "ball"  # or "hinge"
     r1_m: Vector | None = None  # None: unknown; the chain filter estimates it
-    r1_std_m: float = 0.005  # standard deviation, each axis (m); measured with a ruler
+    r1_std_m: float | Vector = 0.005  # standard deviation (m), one for all axes or one for each; measured with a ruler
     r2_m: Vector | None = None
-    r2_std_m: float = 0.005
+    r2_std_m: float | Vector = 0.005
     axis1: Vector | None = None  # of any length; None: unknown
     axis1_std_deg: float = 3.0  # standard deviation about each axis across it
     axis2: Vector | None = None

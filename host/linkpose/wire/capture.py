@@ -176,6 +176,9 @@ def read_capture(file: BinaryIO) -> Iterator[Capture]:
             part = _decode_part(data[:end], before, decoder)
             before += len(part.samples)
             yield part
+    if len(rest) > MAX_FRAME:  # no beginning of a frame: a stream has counted it
+        decoder.feed(rest)
+        yield _decode_part(b"", before, decoder)
 
 
 def decode_capture(data: bytes) -> Capture:

@@ -272,7 +272,10 @@ class StreamDecoder:
             try:
                 payload = cobs_decode(piece)
             except DecodeError:
-                self.corrupt.cobs += 1
+                if len(piece) > MAX_FRAME:  # as when it arrives in pieces
+                    self.corrupt.length += 1
+                else:
+                    self.corrupt.cobs += 1
                 continue
             # Nearly all frames are SAMPLEs, so they are tried first.
             if len(piece) >= _SHORTEST_SAMPLE and payload[0] == _SAMPLE_TYPE:

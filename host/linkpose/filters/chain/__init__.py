@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.filters._imu import ImuSamples
+from linkpose.filters._records import record_of
 from linkpose.filters.chain.process import process
-from linkpose.filters.chain.state import ESTIMATE, ChainParameters, Floats, fresh_bank, fresh_states, record_of
+from linkpose.filters.chain.state import ESTIMATE, ChainParameters, Floats, fresh_bank, fresh_states
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -67,7 +68,7 @@ class ChainFilter:
     @property
     def hypotheses(self) -> int:
         """How many relative headings are still possible."""
-        return int(np.count_nonzero(self._states.alive))
+        return int(np.count_nonzero(self._states["alive"]))
 
     @property
     def state(self) -> Any:

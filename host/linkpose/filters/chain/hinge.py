@@ -15,30 +15,42 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
 from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
+from linkpose.filters.chain.stops import wrapped
 from linkpose.filters.chain.update import clear_row, expected_square, update
 
 # The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
 _SIDE = (1.0, 0.77, 0.61)
-# Square of the axis's horizontal part below which it gives no heading: the axis itself is uncertain by as much.
-_VERTICAL = 0.01
+# Square of the axis's horizontal part over its variance below which it gives no heading (errors in variables).
+_CLEAR_AXIS = 9.0
+_HEADING_FREE = 0.01  # share of the horizontal part of the smaller rate in the relative rate, both squared
 _POWER_STEPS = 30  # of the power iteration: a second eigenvalue of 0.25 the first is down by 1e-18
 
 
 @inner
-def follow_axis(s: Record, size: int, hinge: int, gyro: Floats, h: float, q: Record) -> None:
-    """Accumulate the relative rate in sensor 1's axes until it gives the axis."""
-    rate, m, spread = s.a, s.c, s.relative_spread
+def follow_axis(s: Record, size: int, hinge: int, spread: int, gyro: Floats, h: float, q: Record) -> None:
+    """Accumulate the relative rate in sensor 1's axes until it gives the axis.
+
+    While the relative heading is unknown (`spread` 0), only rates that do not depend on it count: one of them vertical.
+    """
+    rate, m, moments = s.a, s.c, s.relative_spread
     for i in range(3):
         rate[i] = gyro[1, i] - s.gyro_bias[1, i]
     rotate(s.rotation[1], rate, s.b)
     rotate_back(s.rotation[0], s.b, m)
+    across = s.b[0] ** 2 + s.b[1] ** 2
     for i in range(3):
-        rate[i] = m[i] - gyro[0, i] + s.gyro_bias[0, i]
+        rate[i] = gyro[0, i] - s.gyro_bias[0, i]
+    rotate(s.rotation[0], rate, s.b)
+    across = min(across, s.b[0] ** 2 + s.b[1] ** 2)
+    for i in range(3):
+        rate[i] = m[i] - rate[i]
+    if not spread and across > _HEADING_FREE * square(rate):
+        return
     for i in range(3):
         for j in range(3):
-            spread[i, j] += h * rate[i] * rate[j] - h / q.axis_memory_s * spread[i, j]
-    total = spread[0, 0] + spread[1, 1] + spread[2, 2]
-    if total > q.axis_rotation and _principal_axis(spread, s.axis[0], s.b) > q.axis_share * total:
+            moments[i, j] += h * rate[i] * rate[j] - h / q.axis_memory_s * moments[i, j]
+    total = moments[0, 0] + moments[1, 1] + moments[2, 2]
+    if total > q.axis_rotation and _principal_axis(moments, s.axis[0], s.b) > q.axis_share * total:
         _begin_axes(s, size, hinge, q)
 
 
@@ -77,13 +89,27 @@ def _begin_axes(s: Record, size: int, hinge: int, q: Record) -> None:
 
 
 @inner
+def _horizontal_variance(s: Record, size: int, hinge: int) -> float:
+    """Variance of the horizontal part of R_2 j_2 (in `b`) by the errors of tilt and axis: of X and Y together."""
+    z, total = s.b[2], 1e-12
+    for row in range(2):
+        clear_row(s)
+        s.row[OF_SENSOR + 1 - row] = z if row == 0 else -z  # δ(R j) = δθ × R j
+        for c in range(3):
+            s.row[hinge + AXES + 3 + c] = s.rotation[1, row, c]
+        total += max(expected_square(s, size), 0.0)
+    return total
+
+
+@inner
 def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
     """Apply the constraint, `h` (s) after the last time. Returns its log likelihood."""
     rotate(s.rotation[0], s.axis[0], s.a)
     rotate(s.rotation[1], s.axis[1], s.b)
     variance = q.play_correlation * max(s.play_square, q.least_play_rad**2)
-    across = s.a[0] ** 2 + s.a[1] ** 2
-    heading_share = min(max(across / _VERTICAL - 1, 0.0), 1.0)
+    uncertain = _horizontal_variance(s, size, hinge)
+    across = s.b[0] ** 2 + s.b[1] ** 2
+    heading_share = min(max(across / (_CLEAR_AXIS * uncertain) - 1, 0.0), 1.0)
     likelihood = found = expected = 0.0
     for row in range(3):
         clear_row(s)
@@ -107,24 +133,27 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
 
 @inner
 def hinge_angle(s: Record) -> float:
-    """Angle (rad, ±π) about j_2 since the first sample: the twist of R_0ᵀ R_1ᵀ R_2."""
+    """Angle (rad, ±π) about j_2 since the first sample: the twist of S_2ᵀ S_1 R_1ᵀ R_2."""
     between(s.attitude[0], s.attitude[1], s.relative)
-    q, r, axis = s.start, s.relative, s.axis[1]
+    between(s.start[0], s.start[1], s.first)
+    q, r, axis = s.first, s.relative, s.axis[1]
     w = q[0] * r[0] + q[1] * r[1] + q[2] * r[2] + q[3] * r[3]
     x = q[0] * r[1] - q[1] * r[0] - (q[2] * r[3] - q[3] * r[2])
     y = q[0] * r[2] - q[2] * r[0] - (q[3] * r[1] - q[1] * r[3])
     z = q[0] * r[3] - q[3] * r[0] - (q[1] * r[2] - q[2] * r[1])
-    angle = 2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w)
-    return float(angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi)))
+    return wrapped(2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w))
 
 
 @inner
 def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
-    """σ of that angle (rad): of the rotations now and at the start about the axis."""
-    to_matrix(s.start, s.m)
-    rotate(s.m, s.axis[1], s.a)  # the axis in sensor 1's axes
-    rotate(s.rotation[0], s.a, s.b)
+    """σ of that angle (rad): of the rotations now and at the start about the axis; H of the angle in `row`."""
+    to_matrix(s.start[1], s.m)
+    rotate(s.m, s.axis[1], s.b)  # the axis in n at the first sample
+    to_matrix(s.start[0], s.m)
+    rotate_back(s.m, s.b, s.a)
+    rotate(s.rotation[0], s.a, s.c)  # and now
     clear_row(s)
     for i in range(3):
-        s.row[i], s.row[OF_SENSOR + i], s.row[hinge + START + i] = -s.b[i], s.b[i], -s.a[i]
+        s.row[i], s.row[OF_SENSOR + i] = -s.c[i], s.c[i]
+        s.row[hinge + START + i], s.row[hinge + START + 3 + i] = s.b[i], -s.b[i]
     return math.sqrt(max(expected_square(s, size), 0.0))

@@ -68,8 +68,11 @@ def _side_variance(s: Record, k: int, gyro: Floats, r: Floats, at: int, noise: F
 
 
 @inner
-def update_joint(s: Record, size: int, gyro: Floats, h: float, q: Record, noise: Floats) -> float:
-    """Apply the constraint, `h` (s) after the last time. Returns its log likelihood."""
+def update_joint(s: Record, size: int, first: int, gyro: Floats, h: float, q: Record, noise: Floats) -> float:
+    """Apply the constraint, `h` (s) after the last time. Returns its log likelihood.
+
+    `first` is the first row: 2, the vertical one, while the relative heading is unknown.
+    """
     own = q.velocity_floor_m_s**2
     reach = 0.0
     for k in range(2):
@@ -77,7 +80,7 @@ def update_joint(s: Record, size: int, gyro: Floats, h: float, q: Record, noise:
         reach += square(s.a) * square(s.lever[k])
     variance = own + s.residual_share * reach
     likelihood = found = expected = 0.0
-    for row in range(3):
+    for row in range(first, 3):
         clear_row(s)
         value = 0.0
         for k in range(2):
@@ -85,7 +88,8 @@ def update_joint(s: Record, size: int, gyro: Floats, h: float, q: Record, noise:
         found += value * value
         expected += expected_square(s, size)
         likelihood += update(s, size, -value, variance, q.huber)[0]
-    _follow_residual(s, found, expected, own, variance, reach, h, q)
+    if first == 0:
+        _follow_residual(s, found, expected, own, variance, reach, h, q)
     return likelihood
 
 

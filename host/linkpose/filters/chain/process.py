@@ -19,8 +19,9 @@ from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_s
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
-from linkpose.filters.chain.rotation import between, rotate, rotate_back, to_matrix, turn
-from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
+from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
+from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, R, Record, V
+from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop, wrapped
 from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
 from linkpose.filters.frozen import is_frozen
 from linkpose.wire.messages import SampleFlags
@@ -36,11 +37,12 @@ _CLIPPED = int(
 # they do not show a frozen sensor.
 _RESTING_RAD_S = 0.05
 _LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
+_UNKNOWN_HEADING = math.pi / math.sqrt(3.0)  # σ of a heading that is uniform all around (rad)
 
 
 @inner
-def _align(s: Record, k: int, accel: Floats, heading: float, std: float, heading_std: float, q: Record) -> None:
-    """Attitude of sensor k from one reading of the accelerometer, and a heading (rad); velocity 0."""
+def _align(s: Record, k: int, accel: Floats, std: float, heading_std: float, q: Record) -> None:
+    """Attitude of sensor k from one reading of the accelerometer, heading and velocity 0."""
     p, o = s.covariance, OF_SENSOR * k
     x, y, z = accel[k, 0] - s.accel_bias[k, 0], accel[k, 1] - s.accel_bias[k, 1], accel[k, 2] - s.accel_bias[k, 2]
     norm = math.sqrt(x * x + y * y + z * z) + 1e-9
@@ -50,7 +52,7 @@ def _align(s: Record, k: int, accel: Floats, heading: float, std: float, heading
         attitude[0], attitude[1], attitude[2], attitude[3] = w, y / norm, -x / norm, 0.0
     else:
         attitude[0], attitude[1], attitude[2], attitude[3] = 0.0, 1.0, 0.0, 0.0
-    turn(attitude, 0.0, 0.0, heading, 1.0)
+    turn(attitude, 0.0, 0.0, 0.0, 1.0)  # which normalises
     to_matrix(attitude, s.rotation[k])
     for i in range(6):
         s.velocity[k, i % 3] = 0.0
@@ -63,26 +65,104 @@ def _align(s: Record, k: int, accel: Floats, heading: float, std: float, heading
 
 
 @inner
-def _begin(bank: Record, states: Record, accel: Floats, q: Record) -> None:
-    """All hypotheses at the first sample, or anew after a gap: mounting and sensor errors stay as the best has them."""
+def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record) -> None:
+    """One filter at the first sample, or anew after a gap: mounting and sensor errors stay as the best has them."""
     count = states.shape[0]
     best = states[bank.best]
     for i in range(count):
         s = states[i]
         if bank.begun:
             _copy_constants(best, s, bank.length)
+            s.has_axis *= bank.spread  # an axis in sensor 1's axes came with the heading
         for k in range(2):
             force = math.sqrt(accel[k, 0] ** 2 + accel[k, 1] ** 2 + accel[k, 2] ** 2)
-            std = q.tilt_rad + abs(force / GRAVITY - 1)
-            spacing = 2 * math.pi / count
-            _align(s, k, accel, spacing * i * k, std, 0.4 * spacing * k, q)
-            s.speed_square[k], s.accel_square[k] = 0.25, 1.0
+            rate = math.sqrt(gyro[k, 0] ** 2 + gyro[k, 1] ** 2 + gyro[k, 2] ** 2)
+            std = q.tilt_rad + abs(force / GRAVITY - 1) + q.tilt_moving_s * rate
+            _align(s, k, accel, std, 0.8 * math.pi / count * k, q)
+            s.speed_square[k], s.accel_square[k], s.shared_square[k] = 0.25, 1.0, 0.0
+            s.up_spread[k] = 0.0
+            for j in range(3):
+                s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
         s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
         s.play_square = q.first_play_rad**2
-        s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = 1, 0.0, 0.0, math.pi, math.pi
+        clear_stops(s)
+        s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = int(i == 0), 0.0, 0.0, math.pi, math.pi
         if bank.hinge >= 0 and not bank.begun:
             _begin_start(s, bank.length, bank.hinge)
-    bank.begun = 1
+    bank.begun, bank.spread, bank.best = 1, 0, 0
+    if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
+        _spread(bank, states, gyro, q)
+
+
+@inner
+def _spread(bank: Record, states: Record, gyro: Floats, q: Record) -> None:
+    """From now on the heading can be found: copies of the one filter, with headings of sensor 2 all around."""
+    count = states.shape[0]
+    for i in range(count - 1, -1, -1):
+        if i > 0:
+            states[i] = states[0]
+        _turn_link(states[i], bank, 2 * math.pi * i / count, gyro, q)
+    bank.spread = 1
+
+
+@inner
+def _turn_link(s: Record, bank: Record, heading: float, gyro: Floats, q: Record) -> None:
+    """Turn link 2 by `heading` (rad); its velocity is forgotten and follows from the joint."""
+    p, size, hinge, m = s.covariance, bank.length, bank.hinge, s.m
+    turn(s.attitude[1], 0.0, 0.0, heading, 1.0)
+    to_matrix(s.attitude[1], s.rotation[1])
+    _about(s.rotation[0, 2], heading, m)
+    if hinge >= 0:
+        rotate(m, s.axis[0], s.a)
+        for i in range(3):
+            s.axis[0, i] = s.a[i]
+        _turn_block(p, size, hinge + AXES, m, s.a, s.b)
+        turn(s.start[1], 0.0, 0.0, heading, 1.0)
+    s.a[0], s.a[1], s.a[2] = 0.0, 0.0, 1.0
+    _about(s.a, heading, m)
+    _turn_block(p, size, OF_SENSOR, m, s.a, s.b)
+    if hinge >= 0:
+        _turn_block(p, size, hinge + START + 3, m, s.a, s.b)
+    for k in range(2):
+        for i in range(3):
+            s.a[i] = gyro[k, i] - s.gyro_bias[k, i]
+        cross(s.a, s.lever[k], s.b)
+        rotate(s.rotation[k], s.b, s.c)
+        for i in range(3):  # v_2 = v_1 − R_1 (ω_1 × r_1) + R_2 (ω_2 × r_2)
+            s.velocity[1, i] = s.velocity[0, i] - s.c[i] if k == 0 else s.velocity[1, i] + s.c[i]
+    for i in range(3):
+        row = OF_SENSOR + V + i
+        for j in range(size):
+            p[row, j] = p[j, row] = 0.0
+        p[row, row] = q.speed_m_s**2
+
+
+@inner
+def _about(axis: Floats, angle: float, m: Floats) -> None:
+    """The matrix (3, 3) that turns by an angle (rad) about a unit axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = (1 - c) * axis[i] * axis[j]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        m[i, i] += c
+        m[i, j] -= s * axis[k]
+        m[i, k] += s * axis[j]
+
+
+@inner
+def _turn_block(p: Floats, size: int, at: int, m: Floats, column: Floats, turned: Floats) -> None:
+    """Covariance with the three errors from `at` on in turned axes."""
+    for side in range(2):
+        for j in range(size):
+            for i in range(3):
+                column[i] = p[at + i, j] if side == 0 else p[j, at + i]
+            rotate(m, column, turned)
+            for i in range(3):
+                if side == 0:
+                    p[at + i, j] = turned[i]
+                else:
+                    p[j, at + i] = turned[i]
 
 
 @inner
@@ -94,8 +174,9 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
             s.lever[k, i], s.axis[k, i] = best.lever[k, i], best.axis[k, i]
     for i in range(3):
         s.lever0[i] = best.lever0[i]
-    for i in range(4):
-        s.start[i] = best.start[i]
+    for k in range(2):
+        for i in range(4):
+            s.start[k, i] = best.start[k, i]
     s.has_axis = best.has_axis
     for i in range(size):
         for j in range(size):
@@ -104,25 +185,18 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
 
 @inner
 def _begin_start(s: Record, size: int, hinge: int) -> None:
-    """R_0 is the relative rotation now, with its error: δφ_0 = R_1ᵀ (δθ_2 − δθ_1)."""
+    """S_k is the attitude now, with its error."""
     p = s.covariance
-    between(s.attitude[0], s.attitude[1], s.start)
-    for j in range(size):
+    for k in range(2):
+        for i in range(4):
+            s.start[k, i] = s.attitude[k, i]
         for i in range(3):
-            s.a[i] = p[OF_SENSOR + i, j] - p[i, j]
-        rotate_back(s.rotation[0], s.a, s.b)
+            for j in range(size):
+                p[hinge + START + 3 * k + i, j] = p[OF_SENSOR * k + i, j]
+    for k in range(2):
         for i in range(3):
-            p[hinge + START + i, j] = s.b[i]
-    for j in range(size):
-        if hinge <= j < hinge + 3:
-            for i in range(3):
-                s.a[i] = p[hinge + START + j - hinge, OF_SENSOR + i] - p[hinge + START + j - hinge, i]
-            rotate_back(s.rotation[0], s.a, s.b)
-            for i in range(3):
-                p[hinge + START + i, j] = s.b[i]
-        else:
-            for i in range(3):
-                p[j, hinge + START + i] = p[hinge + START + i, j]
+            for j in range(size):
+                p[j, hinge + START + 3 * k + i] = p[j, OF_SENSOR * k + i]
 
 
 @inner
@@ -130,7 +204,7 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
     """All measurements of one update, `h` (s) after the last."""
     size, hinge, base = bank.length, bank.hinge, bank.fixed
     propagate_covariance(s, size, q)
-    likelihood = s.heading_share * update_joint(s, size, gyro, h, q, noise)
+    likelihood = s.heading_share * update_joint(s, size, 0 if bank.spread else 2, gyro, h, q, noise)
     apply_correction(s, size, hinge, base)
     if base >= 0:
         likelihood += update_fixed_joint(s, size, base, gyro, q, noise)
@@ -144,8 +218,12 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
             likelihood += update_axis(s, size, hinge, h, q)
             apply_correction(s, size, hinge, base)
         else:
-            follow_axis(s, size, hinge, gyro, h, q)
+            follow_axis(s, size, hinge, bank.spread, gyro, h, q)
         s.angle_std = hinge_angle_std(s, size, hinge)
+        if s.has_axis > 0.0:
+            update_stop(s, size, hinge_angle(s), q)
+            apply_correction(s, size, hinge, base)
+        s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
@@ -197,11 +275,12 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
             weight = math.exp(s.odds)
             weights += weight
             variance += weight * (s.rotation_std**2 + s.apart**2)
-    out.rotation_std = min(math.sqrt(variance / weights), math.pi)
+    out.rotation_std = min(math.sqrt(variance / weights), math.pi) if bank.spread else _UNKNOWN_HEADING
     between(best.attitude[0], best.attitude[1], best.relative)
     sign = 1.0 if best.relative[0] >= 0 else -1.0
     for i in range(4):
-        out.q[i] = sign * best.relative[i] if out.rotation_std < q.unknown_rad else math.nan
+        known = out.rotation_std < q.unknown_rad or best.has_axis > 0.0
+        out.q[i] = sign * best.relative[i] if known else math.nan
     if hinge >= 0:
         _report_angle(best, states, out)
     if base >= 0:
@@ -239,14 +318,12 @@ def _report_angle(best: Record, states: Record, out: Record) -> None:
         s = states[i]
         if s.alive and s.has_axis > 0.0:
             weight = math.exp(s.odds)
-            turned = hinge_angle(s) - first
-            turned -= 2 * math.pi * math.floor((turned + math.pi) / (2 * math.pi))
+            turned = wrapped(hinge_angle(s) - first)
             weights += weight
             mean += weight * turned
             square += weight * (turned * turned + s.angle_std**2)
     mean /= weights
-    angle = first + mean
-    out.angle = angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi))
+    out.angle = wrapped(first + mean)
     out.angle_std = min(math.sqrt(max(square / weights - mean * mean, 0.0)), math.pi)
 
 
@@ -295,7 +372,7 @@ def process(
         h = time_s - bank.time
         if not bank.begun or h > q.longest_gap_s:
             bank.restarts += bank.begun
-            _begin(bank, states, accel, q)
+            _begin(bank, states, gyro, accel, q)
             _remember(bank, time_s, gyro, accel, True)
             bank.since_update = 0.0
         elif h > 0.0:
@@ -337,6 +414,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
     if due:
         bank.since_update = 0.0
         _select(bank, states, q)
+        if not bank.spread and states[0].heading_share > 0.0:
+            _spread(bank, states, gyro, q)
 
 
 @inner

@@ -78,6 +78,17 @@ def _follow_speed(s: Record, k: int, accel_square: float, h: float, q: Record) -
     square = max(s.swing[k, 0] ** 2 + s.swing[k, 1] ** 2 + s.swing[k, 2] ** 2 - own, 0.0) / 3
     keep = min(h / q.speed_memory_s, 1.0)
     s.speed_square[k] += keep * (square - s.speed_square[k])
+    keep_up = min(h / q.swing_memory_s, 1.0)
+    off = changing = 0.0
+    for i in range(3):
+        s.swing_mean[k, i] += keep_up * (s.swing[k, i] - s.swing_mean[k, i])
+        changing += (s.swing[k, i] - s.swing_mean[k, i]) ** 2
+        apart = s.rotation[k, 2, i] - s.up[k, i]
+        s.up[k, i] += keep_up * apart
+        s.up_swing[k, i] += h * apart - min(h / q.swing_s, 1.0) * s.up_swing[k, i]
+        off += s.up_swing[k, i] ** 2
+    s.up_spread[k] += keep * (off - s.up_spread[k])
+    s.shared_square[k] += keep * (changing / 3 - s.shared_square[k])
     s.accel_square[k] += keep * (accel_square / 3 - s.accel_square[k])
 
 
@@ -115,8 +126,10 @@ def _transpose(p: Floats, size: int) -> None:
 def propagate_covariance(s: Record, size: int, q: Record) -> None:
     """P over the span since the last update: F P Fᵀ + Q."""
     p, span = s.covariance, s.span
-    speed_square = min(s.speed_square[0], s.speed_square[1])
-    s.heading_share = min(max(speed_square / q.heading_speed_m_s**2 - 1, 0.0), 1.0)
+    s.heading_share = 1.0
+    for k in range(2):
+        apparent = q.heading_speed_m_s**2 + (q.heading_scale * GRAVITY) ** 2 * s.up_spread[k]
+        s.heading_share = min(s.heading_share, max(s.shared_square[k] / apparent - 1, 0.0))
     for _ in range(2):  # P Fᵀ is the transpose of F Pᵀ
         for k in range(2):
             _advance_rows(p, size, OF_SENSOR * k, s.turned[k], s.impulse[k], s.heading_share)

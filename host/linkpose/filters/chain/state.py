@@ -2,9 +2,9 @@
 
 Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
 sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
-centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and R_0, the relative
-rotation at the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
-joint to sensor 1. Errors of rotations are in n (of R_0: in sensor 1's axes): R = exp([δθ×]) R̂.
+centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and S_k, the R_k at
+the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
+joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters._records import zeros
 from linkpose.filters.frozen import MEMORY, fresh_memory
 from linkpose.sensors.rig import Chain, Rig, Vector
 
@@ -26,7 +27,7 @@ TH, V, BG, BA, R = 0, 3, 6, 9, 12
 OF_SENSOR = 15
 BALL_SIZE = 2 * OF_SENSOR
 # Errors of the parts that only some chains have, relative to their first index.
-START, AXES, HINGE_SIZE = 0, 3, 9
+START, AXES, HINGE_SIZE = 0, 6, 12
 MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
 # Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
 # openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
@@ -47,7 +48,7 @@ class ChainParameters(NamedTuple):
     # at which the force turns in the sensor's axes. [O]; doubled, ball joints of [D] lose a third of their accuracy.
     accel_scale: float = 0.02
     accel_scale_s: float = 0.5  # over which that rate is averaged (s)
-    accel_walk_m_s2_sqrts: float = 0.02  # of the accelerometer bias. [O, E]; halved, σ is too small on a slow robot.
+    accel_walk_m_s2_sqrts: float = 0.001  # of the accelerometer bias: [MPU-6050]'s 35 mg over 65 K, 10 K in 10 min
     accel_misfit: float = 0.02  # share of the linear acceleration that is noise, correlated over 0.05 s
     gyro_walk_rad_s_sqrts: float = 3e-4  # 1 °/s in the hour in which a sensor warms up
     lever_walk_m_sqrts: float = 1e-4  # lets an error of the model leave r_k again
@@ -79,6 +80,10 @@ class ChainParameters(NamedTuple):
     # The heading follows from accelerations that both sensors measure. Slower motion of either (rms velocity gained in
     # 1 s) is what errors of an accelerometer look like (0.1 m/s²), and gives no heading. [E]: at 0, σ is too small.
     heading_speed_m_s: float = 0.1
+    # Scale and cross-axis errors of the accelerometer (data sheet: 3 %, 2 %) while gravity turns in the sensor's axes
+    # look like motion, too.
+    heading_scale: float = 0.02
+    swing_memory_s: float = 4.0  # over which the mean direction of gravity in the sensor's axes is taken
     shared_motion: float = 2.0  # both sensors measure the same motion: variance × 2
     swing_s: float = 1.0  # over which acceleration is integrated to measure that σ (s)
     speed_memory_s: float = 2.0  # over which the result is averaged (s)
@@ -97,6 +102,7 @@ class ChainParameters(NamedTuple):
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
     # Prior standard deviations.
     tilt_rad: float = 0.1
+    tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
     speed_m_s: float = 0.3
     gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a rest of 0.3 s finds any larger one
     accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
@@ -113,7 +119,7 @@ STATE = np.dtype(
         ("accel_bias", "f8", (2, 3)),
         ("lever", "f8", (2, 3)),  # r_k
         ("axis", "f8", (2, 3)),  # j_k
-        ("start", *_Q),  # R_0
+        ("start", "f8", (2, 4)),  # quaternions of S_k
         ("lever0", *_V3),  # r_0
         ("covariance", "f8", (MAX_SIZE, MAX_SIZE)),
         ("correction", "f8", MAX_SIZE),  # of the errors, by the updates since the last `apply_correction`
@@ -127,8 +133,13 @@ STATE = np.dtype(
         ("velocity_variance", "f8", 2),
         ("force_rate_square", "f8", 2),  # mean ‖ω × f‖²
         # Memory of the measurement models.
-        ("swing", "f8", (2, 3)),
+        ("swing", "f8", (2, 3)),  # velocity gained in 1 s,
+        ("swing_mean", "f8", (2, 3)),  # and its mean, which an error of the tilt adds
         ("heading_share", "f8"),  # of the horizontal force that tells the heading, 0 to 1
+        ("shared_square", "f8", 2),  # mean square of the velocity gained in 1 s, from zero
+        ("up", "f8", (2, 3)),  # mean of Z of n in either sensor's axes,
+        ("up_swing", "f8", (2, 3)),  # and its distance from that mean, integrated like the velocity (s),
+        ("up_spread", "f8", 2),  # and its mean square
         ("speed_square", "f8", 2),
         ("accel_square", "f8", 2),
         ("excess_square", "f8"),  # mean square residual of the joint beyond its floor (m²/s²)
@@ -139,6 +150,18 @@ STATE = np.dtype(
         ("play_square", "f8"),
         ("relative_spread", "f8", (3, 3)),  # ∫ ω_rel ω_relᵀ dt
         ("has_axis", "f8"),
+        # Turning points of a hinge: angle without wraps, side (0, 1) of the next one, farthest angle on that side and
+        # its σ, the last one of each side.
+        ("turn_angle", "f8"),
+        ("turn_side", "i8"),
+        ("turn_farthest", "f8"),
+        ("turn_std", "f8"),
+        ("turn_last", "f8", 2),
+        # End stops by side: repeats, first angle, its σ, whether it is used.
+        ("stop_count", "i8", 2),
+        ("stop_angle", "f8", 2),
+        ("stop_std", "f8", 2),
+        ("stop_used", "i8", 2),
         # Hypothesis.
         ("alive", "i8"),
         ("log_likelihood", "f8"),
@@ -152,6 +175,7 @@ STATE = np.dtype(
         ("c", *_V3),
         ("m", "f8", (3, 3)),
         ("relative", *_Q),
+        ("first", *_Q),
     ],
     align=True,
 )
@@ -160,6 +184,7 @@ STATE = np.dtype(
 BANK = np.dtype(
     [
         ("begun", "i8"),
+        ("spread", "i8"),  # whether the headings have been spread over the hypotheses
         ("length", "i8"),  # of the error state
         ("hinge", "i8"),  # first index of a hinge's errors, or −1
         ("fixed", "i8"),  # first index of the error of r_0, or −1
@@ -195,15 +220,9 @@ ESTIMATE = np.dtype(
 )
 
 
-def record_of(parameters: NamedTuple) -> Any:
-    """Parameters as a record, which compiled code reads by name."""
-    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
-    return np.array([tuple(parameters)], dtype=dtype).view(np.recarray)
-
-
 def fresh_bank(rig: Rig) -> Any:
     """The shared record of a chain that begins."""
-    banks = np.zeros(1, BANK).view(np.recarray)
+    banks = zeros(1, BANK)
     bank: Any = banks[0]
     bank.last_readings[:] = fresh_memory()
     bank.length, bank.hinge, bank.fixed = BALL_SIZE, -1, -1
@@ -216,7 +235,7 @@ def fresh_bank(rig: Rig) -> Any:
 
 def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
     """The hypotheses before the first sample: mounting and sensor errors as the rig states them."""
-    states = np.zeros(HYPOTHESES, STATE).view(np.recarray)
+    states = zeros(HYPOTHESES, STATE)
     chain = rig.chain
     gyro_std = _known(rig.imu.gyro_bias_std_rad_s, parameters.gyro_bias_rad_s)
     accel_std = _known(rig.imu.accel_offset_std_m_s2, parameters.accel_bias_m_s2)
@@ -228,7 +247,7 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
             state.lever[k] = (0.0, 0.0, 0.0) if lever is None else lever
             variance[first + BG : first + BA] = (gyro_std if k == 0 else parameters.gyro_bias_rad_s) ** 2
             variance[first + BA : first + R] = (accel_std if k == 0 else parameters.accel_bias_m_s2) ** 2
-            variance[first + R : first + OF_SENSOR] = (parameters.lever_m if lever is None else std) ** 2
+            variance[first + R : first + OF_SENSOR] = np.square(parameters.lever_m if lever is None else std)
         if bank.fixed >= 0:
             state.lever0 = rig.joint.j2s_m
             variance[bank.fixed : bank.fixed + 3] = np.square(rig.joint.j2s_std_m)

@@ -10,7 +10,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import to_matrix, turn
-from linkpose.filters.chain.state import AXES, BA, BG, OF_SENSOR, R, Record, V
+from linkpose.filters.chain.state import AXES, BA, BG, OF_SENSOR, START, R, Record, V
 
 
 @inner
@@ -81,8 +81,9 @@ def apply_correction(s: Record, size: int, hinge: int, base: int) -> None:
             s.accel_bias[k, i] += x[o + BA + i]
             s.lever[k, i] += x[o + R + i]
     if hinge >= 0:
-        turn(s.start, x[hinge], x[hinge + 1], x[hinge + 2], 1.0)
         for k in range(2):
+            o = hinge + START + 3 * k
+            turn(s.start[k], x[o], x[o + 1], x[o + 2], 1.0)
             axis, norm = s.axis[k], 1e-30
             for i in range(3):
                 axis[i] += x[hinge + AXES + 3 * k + i]

@@ -1,0 +1,553 @@
+"""Mounting of two sensors on two links (r_1, r_2, the axis of a hinge) from a recording of the links in motion.
+
+r_k is the vector from the centre of the joint between the links to sensor k, in the sensor's axes. Seen from either
+sensor, the specific force at the joint's centre is the same vector:
+
+    γ_1(t) = R γ_2(t),    γ_k = ∫ w C_k f_k dt + ∫ ẇ C_k (ω_k × r_k) dt
+
+with the weights w and the integrated rotations C_k of `joint_constraint`, and the rotation R from sensor 2's axes into
+sensor 1's at the start of a piece of the recording. Each piece has its own R, which is eliminated, so a drift of the
+heading between the two sensors has no effect. Least squares estimates r_1 and r_2 together with the errors of both
+sensors, with Huber's weights; residuals are correlated, and the covariance is widened as in `joint`.
+
+A hinge keeps its axis in the same direction in both links. The axes j_1 and j_2 that do so best, over all pieces, and
+the angle that they leave (the play) show the kind of the joint.
+
+Sources: the constraint is (5) of M. Kok, K. Eckhoff, I. Weygers, T. Seel, "Observability of the relative motion from
+inertial data in kinematic chains", Control Engineering Practice 125, 2022, in the weak form of `joint_constraint`;
+T. Seel, J. Raisch, T. Schauer, "IMU-based joint angle measurement for gait analysis", Sensors 14(4), 2014, 3.3, for the
+point on a hinge's axis; F. Olsson et al., "Robust plug-and-play joint axis estimation using inertial sensors", Sensors
+20(12), 2020, for what motion an axis needs.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from linkpose.calibration.joint_constraint import (
+    ACCEL_BIAS,
+    ACCEL_MATRIX,
+    GYRO_BIAS,
+    GYRO_MATRIX,
+    J2S,
+    LONGEST_STEP_S,
+    UNKNOWNS,
+    Equations,
+    Stretch,
+    attitudes,
+    cross_matrices,
+    equations,
+    paired_stretches,
+    pieces,
+)
+from linkpose.calibration.normal_equations import Sums, correlation
+from linkpose.calibration.rests import find_rests
+from linkpose.errors import LinkposeError
+from linkpose.recording.reader import Recording
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Chain, Rig, Vector, to_vector
+
+Kind = Literal["ball", "hinge"]
+
+_SHORT_PIECES_S, _PIECE_S = (1.0, 1.0, 3.0, 3.0), 8.0  # as in `joint`: short ones before the gyro biases are known
+_MOST_PASSES, _SETTLED_M = 10, 1e-4
+_MOST_PIECES = 75  # 10 minutes of a longer recording
+_FREE_PASSES = 2  # before the residuals are small enough to measure their correlation
+_HUBER_SIGMAS = 3.0
+_BLOCK_S = 1.0
+# Prior standard deviations: r_k of people and robots (m); data sheet of [MPU-6050]: ±20 °/s, ±50 mg, 3 %, 2 %.
+LEVER_STD_M = 0.5
+_PRIOR_STD = {J2S: LEVER_STD_M, GYRO_BIAS: 0.35, ACCEL_BIAS: 0.3, ACCEL_MATRIX: 0.017, GYRO_MATRIX: 0.017}
+_ACCEL_ERROR_M_S2 = 0.1  # slow, by scale and cross-axis errors: as in the filter `chain`
+# A gyro bias from rests: its drift until the motion, and the largest rate that is not a slow turn (rad/s).
+_REST_STD_RAD_S, _MOST_REST_RAD_S = 0.003, 0.1
+_ACCEL_SCALES = np.concatenate([first + ACCEL_MATRIX + np.arange(0, 9, 4) for first in (0, UNKNOWNS)])
+_LEVERS = [*range(J2S, GYRO_BIAS), *range(UNKNOWNS + J2S, UNKNOWNS + GYRO_BIAS)]
+_TURN_STD_RAD = 1.0  # of a piece's rotation about a direction that its forces do not show
+_MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
+_NO_JOINT_M_S2 = 3.0
+LARGE_RESIDUAL_M_S2 = 0.5
+# Share of the residual that may follow the motion and shift r_k. On diodem_chain, whose residuals are 0.01 to 0.07
+# m/s², results from four starting times differ by as much as 0.2 predicts. Doubled, σ of a clear direction doubles.
+_COHERENT_SHARE = 0.2
+WEAK_M = 0.03  # σ of r_k along a direction from which on it counts as not observable
+
+# Kind of the joint, by the rms rotation about the best axis and the rms angle that this axis leaves (its play).
+LEAST_TURN_DEG = 5.0  # smaller motion shows nothing
+_HINGE_RATIO = 0.15  # of play to rotation: the hinges of diodem_chain have up to 0.08, with soft parts
+_BALL_RATIO = 0.3  # from which on it is no play of a hinge
+_PLAY_STD_RAD, _PLAY_CORRELATION_S = 0.05, 0.5  # assumed of a hinge while its axis is fitted
+_AXIS_STEP_S = 0.1  # between two instants of that fit
+_AXIS_PRIOR_STD_RAD = 1.0  # of each component of an axis: no knowledge
+_AXIS_STARTS, _SEEL_STEPS, _HINGE_STEPS = 12, 10, 10
+WEAK_AXIS_DEG = 15.0  # σ of an axis from which on it counts as not observable
+_LEAST_AXIS_STD_DEG = 0.7  # axes of a gyro: the data sheet allows 2 % between two of them
+_SIDE = np.array([1.0, 0.77, 0.61])  # the sense of an axis is arbitrary: j_2 lies on this side, as in the filter
+
+
+class Motion(NamedTuple):
+    """The relative motion of the links, as a hinge explains it."""
+
+    axes: Floats  # (2, 3) j_1 and j_2
+    covariance: Floats  # (6, 6) of both, rad²
+    turn_deg: float  # rms rotation about the axis
+    play_deg: float  # rms angle between R_1 j_1 and R_2 j_2
+
+    @property
+    def std_deg(self) -> Floats:
+        """(2,) σ of each axis in the direction across it that is known least."""
+        blocks = (self.covariance[:3, :3], self.covariance[3:, 3:])
+        return np.array([max(np.degrees(np.sqrt(np.linalg.eigvalsh(b)[-1])), _LEAST_AXIS_STD_DEG) for b in blocks])
+
+
+@dataclass(frozen=True, slots=True)
+class ChainCalibration:
+    """Mounting of both sensors, and the kind of the joint between them."""
+
+    joint: Kind | None  # None: the motion does not show it
+    motion: Motion  # of a hinge that explains it best
+    levers_m: Floats  # (2, 3) r_1 and r_2
+    covariance_m2: Floats  # (6, 6) of both
+    residual_m_s2: float  # rms, by axis, of the force at the joint's centre that the two sensors do not agree on
+    samples: int  # in motion
+
+    @property
+    def std_m(self) -> Floats:
+        """(2, 3) σ of each component of r_1 and r_2."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_m2)).reshape(2, 3))
+
+    @property
+    def axes(self) -> Floats | None:
+        """(2, 3) the axis of a hinge in either sensor's axes; None where there is none, or none observable."""
+        shown = self.joint == "hinge" and self.motion.std_deg.max() < WEAK_AXIS_DEG
+        return self.motion.axes if shown else None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The object that `calibrate chain --json` prints."""
+        found: dict[str, Any] = {"joint": self.joint}
+        found |= {"turn_deg": self.motion.turn_deg, "play_deg": self.motion.play_deg}
+        for k in range(2):
+            found |= {
+                f"r{k + 1}_m": self.levers_m[k].tolist(),
+                f"r{k + 1}_std_m": self.std_m[k].tolist(),
+                f"r{k + 1}_observable": (self.std_m[k] <= WEAK_M).tolist(),
+            }
+        for k in range(2 * (self.joint == "hinge")):
+            found[f"axis{k + 1}"] = self.axes[k].tolist() if self.axes is not None else None
+            found[f"axis{k + 1}_std_deg"] = float(self.motion.std_deg[k])
+        return found | {"residual_m_s2": self.residual_m_s2, "samples": self.samples}
+
+
+class _Piece(NamedTuple):
+    """A piece of the recording as both sensors measured it."""
+
+    first: Stretch
+    second: Stretch
+
+
+class _Turned(NamedTuple):
+    """The equations of a piece at some unknowns, its rotation R eliminated."""
+
+    rotation: Floats  # (3, 3) R
+    residual: Floats  # (M, 3) γ_1 − R γ_2
+    jacobian: Floats  # (M, 3, 2 UNKNOWNS)
+    information: Floats  # (3, 3) of the error of R, 1/rad², with independent residuals
+    apart_s: float
+
+
+def with_calibration(rig: Rig, found: ChainCalibration) -> Rig:
+    """The rig with the mounting; a kind that the motion does not show, and everything else, stay as they were."""
+    kind = found.joint or rig.chain.joint
+    (r1, r2), (std1, std2) = found.levers_m, map(_std_of, found.std_m)
+    chain = Chain(kind, to_vector(r1, 5), std1, to_vector(r2, 5), std2)
+    if kind == "hinge" and found.axes is not None:
+        (axis1, axis2), (std1_deg, std2_deg) = found.axes, np.round(found.motion.std_deg, 3).tolist()
+        chain = replace(chain, axis1=to_vector(axis1, 5), axis1_std_deg=std1_deg)
+        chain = replace(chain, axis2=to_vector(axis2, 5), axis2_std_deg=std2_deg)
+    return replace(rig, chain=chain)
+
+
+def _std_of(std_m: Floats) -> float | Vector:
+    """As a rig file states it: one for all axes, or one for each where r_k is not observable along all."""
+    std_m = np.maximum(np.round(std_m, 5), 1e-5)
+    return float(std_m.max()) if std_m.max() <= WEAK_M else to_vector(std_m)
+
+
+def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | None = None) -> ChainCalibration:
+    """Mounting and kind of the joint from all recordings together; `joint` states the kind where it is known.
+
+    What the motion does not show has a large σ. Raises LinkposeError where there is no second sensor, where nothing
+    moves, or where the readings fit no joint.
+    """
+    names = ", ".join(str(r.path) for r in recordings)
+    if not all(r.measurements.has_imu2 for r in recordings):
+        raise LinkposeError(f"{names}: a chain needs a second inertial sensor, and a recording has none")
+    parts = [pair for r in recordings for pair in paired_stretches(r.measurements, rig.imu)]
+    chosen = _pieces(parts, _PIECE_S)
+    if not chosen:
+        raise LinkposeError(f"{names}: nowhere is a second with {1 / LONGEST_STEP_S:.0f} samples or more; record again")
+    fit = _fit(chosen, _prior(parts))
+    samples = _samples_in_motion(parts, fit.unknowns)
+    if fit.residual_m_s2 > _NO_JOINT_M_S2:
+        raise LinkposeError(
+            f"the readings fit no joint between the two sensors ({fit.residual_m_s2:.1f} m/s² rms are left over): fix "
+            "each sensor firmly on its own link, on either side of one joint"
+        )
+    motion = _relative_motion(chosen, fit)
+    kind = joint or _kind(motion)
+    levers = fit.unknowns[_LEVERS].reshape(2, 3)
+    covariance = fit.covariance[np.ix_(_LEVERS, _LEVERS)] + _coherent_errors(chosen, fit)
+    if kind == "hinge" and motion.std_deg.max() < WEAK_AXIS_DEG:
+        levers, covariance = _nearest_on_axis(levers, covariance, motion.axes)
+    return ChainCalibration(kind, motion, levers, covariance, fit.residual_m_s2, samples)
+
+
+# ---- least squares ----
+
+
+class _Fit(NamedTuple):
+    """What the forces at the joint's centre give."""
+
+    unknowns: Floats  # (2 UNKNOWNS,) of both sensors
+    covariance: Floats  # of these
+    residual_m_s2: float  # rms
+    scale_m_s2: float  # a robust measure of it
+    worth: float  # equations that count as one independent equation
+
+
+def _pieces(parts: Iterable[tuple[Stretch, Stretch]], longest_s: float) -> list[_Piece]:
+    """Pieces of this length; of a long recording some, evenly spread."""
+    found = [
+        _Piece(one, two)
+        for first, second in parts
+        for one, two in zip(pieces(first, longest_s), pieces(second, longest_s), strict=True)
+    ]
+    if len(found) <= _MOST_PIECES:
+        return found
+    return [found[at] for at in np.linspace(0, len(found) - 1, _MOST_PIECES).astype(int)]
+
+
+def _fit(chosen: Sequence[_Piece], known: _Prior) -> _Fit:
+    """Least squares over the pieces; the first passes divide them further."""
+    unknowns, worth, scale, prior = known.mean, 1.0, 1.0, np.diag(known.information)
+    for number, longest_s in enumerate((*_SHORT_PIECES_S, *[_PIECE_S] * _MOST_PASSES)):
+        divided = chosen if longest_s == _PIECE_S else _pieces(chosen, longest_s)
+        sums = _normal_equations([_turned(p, unknowns, scale) for p in divided], scale)
+        normal = sums.normals.sum(axis=0)
+        worth = 1.0 if number < _FREE_PASSES else correlation(sums, normal + worth * prior)
+        # The readings' density, shared by both sensors: without it, a fit could reduce its residuals by shrinking both.
+        volume = np.zeros(2 * UNKNOWNS)
+        volume[_ACCEL_SCALES] = 0.5 * sums.equations / (1 - unknowns[_ACCEL_SCALES])
+        curvature = 2 * volume**2 / max(sums.equations, 1.0)
+        covariance: Floats = np.linalg.inv((normal + np.diag(curvature)) / worth + prior)
+        change = covariance @ ((sums.gradients.sum(axis=0) - volume) / worth - prior @ (unknowns - known.mean))
+        unknowns = unknowns + change
+        scale = max(1.4826 * float(np.median(np.abs(sums.residual))), 1e-4)
+        if number > len(_SHORT_PIECES_S) and np.abs(change[_LEVERS]).max() < _SETTLED_M:
+            break
+    return _Fit(unknowns, covariance, float(np.sqrt(np.mean(sums.residual**2))), scale, worth)
+
+
+class _Prior(NamedTuple):
+    """What is known of the unknowns of both sensors (2 UNKNOWNS,) before the fit."""
+
+    mean: Floats
+    information: Floats  # inverse variances
+
+
+def _prior(parts: Iterable[tuple[Stretch, Stretch]]) -> _Prior:
+    """The data sheet's, and a gyro bias where its sensor rests."""
+    mean, information = np.zeros(2 * UNKNOWNS), np.empty(UNKNOWNS)
+    for first, std in _PRIOR_STD.items():
+        information[first:] = 1 / std**2
+    information = np.tile(information, 2)
+    for k, stretches_of in enumerate(zip(*parts, strict=True)):
+        rates = [s.rate[rest] for s in stretches_of for rest in find_rests(Measurements.from_imu(*s))]
+        rates = [rate for rate in rates if np.linalg.norm(rate.mean(axis=0)) < _MOST_REST_RAD_S]
+        if rates:
+            at = slice(k * UNKNOWNS + GYRO_BIAS, k * UNKNOWNS + ACCEL_BIAS)
+            mean[at], information[at] = np.concatenate(rates).mean(axis=0), 1 / _REST_STD_RAD_S**2
+    return _Prior(mean, information)
+
+
+def _turned(piece: _Piece, unknowns: Floats, scale: float) -> _Turned:
+    """The equations γ_1 = R γ_2 of a piece; R is the rotation that fits best, `scale` (m/s²) the usual residual."""
+    one, two = equations(piece.first, unknowns[:UNKNOWNS]), equations(piece.second, unknowns[UNKNOWNS:])
+    weight = np.ones(len(one.gravity))
+    for _ in range(3):
+        rotation = _rotation_between(one.gravity, two.gravity, weight)
+        residual = one.gravity - two.gravity @ rotation.T
+        weight = _huber(residual, scale)
+    jacobian = _eliminated(one, two, rotation, weight / scale**2)
+    information = _information(one.gravity, two.gravity @ rotation.T, weight / scale**2)
+    return _Turned(rotation, residual, jacobian, information, one.apart_s)
+
+
+def _huber(residual: Floats, scale: float) -> Floats:
+    """(M,) weights, up to 1."""
+    return np.asarray(np.minimum(1.0, _HUBER_SIGMAS * scale / np.maximum(np.linalg.norm(residual, axis=1), 1e-12)))
+
+
+def _rotation_between(to: Floats, of: Floats, weight: Floats) -> Floats:
+    """R (3, 3) with the least Σ w ‖to − R of‖² (G. Wahba, 1965; the solution by singular values)."""
+    left, _, right = np.linalg.svd(np.einsum("m,mi,mj->ij", weight, to, of))
+    return np.asarray(left @ np.diag([1.0, 1.0, np.linalg.det(left) * np.linalg.det(right)]) @ right)
+
+
+def _eliminated(one: Equations, two: Equations, rotation: Floats, weight: Floats) -> Floats:
+    """Jacobian (M, 3, 2 UNKNOWNS) of γ_1 − R γ_2 after R has followed the unknowns, δ = −A⁻¹ Dᵀ W J."""
+    turned = two.gravity @ rotation.T
+    jacobian = np.concatenate([one.jacobian, -np.einsum("ij,mjp->mip", rotation, two.jacobian)], axis=2)
+    by_turn = cross_matrices(turned)  # −(δ × R γ_2) = [R γ_2 ×] δ
+    inner = np.einsum("m,mia,mib->ab", weight, by_turn, by_turn) + np.eye(3) / _TURN_STD_RAD**2
+    follows = np.linalg.solve(inner, np.einsum("m,mia,mip->ap", weight, by_turn, jacobian))
+    return np.asarray(jacobian - by_turn @ follows)
+
+
+def _information(one: Floats, two: Floats, weight: Floats) -> Floats:
+    """Information (3, 3) on the error of R, 1/rad²: the curvature of Σ w ‖γ_1 − R γ_2‖² in it, halved.
+
+    It holds products of both sensors' forces. Errors of one accelerometer, which look like a slow horizontal motion,
+    add nothing on average, and what they may add by chance is subtracted.
+    """
+    products = np.einsum("m,mi,mj->ij", weight, one, two)
+    curvature = np.trace(products) * np.eye(3) - 0.5 * (products + products.T)
+    values, vectors = np.linalg.eigh(curvature)
+    values = np.maximum(values - weight.sum() * _ACCEL_ERROR_M_S2**2, 0.0) + 1 / _TURN_STD_RAD**2
+    return np.asarray(vectors @ np.diag(values) @ vectors.T)
+
+
+def _normal_equations(parts: Sequence[_Turned], scale: float) -> Sums:
+    normals, gradients, residuals, number = [], [], [], 0.0
+    for part in parts:
+        weight = _huber(part.residual, scale) / scale**2
+        number += float(weight.sum()) * scale**2
+        blocks = max(1, round(len(weight) * part.apart_s / _BLOCK_S))
+        for rows in np.array_split(np.arange(len(weight)), blocks):
+            j, w = part.jacobian[rows], weight[rows]
+            normals.append(np.einsum("n,nip,niq->pq", w, j, j))
+            gradients.append(-np.einsum("n,nip,ni->p", w, j, part.residual[rows]))
+        residuals.append(part.residual)
+    return Sums(np.array(normals), np.array(gradients), np.concatenate(residuals), number)
+
+
+def _coherent_errors(chosen: Sequence[_Piece], fit: _Fit) -> Floats:
+    """Covariance (6, 6) (m²) of r_1 and r_2 by a share of the residual that is proportional to its regressors."""
+    squares, count = np.zeros((6, 6)), 0
+    for piece in chosen:
+        jacobian = _turned(piece, fit.unknowns, fit.scale_m_s2).jacobian[:, :, _LEVERS]
+        squares += np.einsum("nip,niq->pq", jacobian, jacobian)
+        count += len(jacobian)
+    coherent = (_COHERENT_SHARE * fit.residual_m_s2) ** 2
+    values, vectors = np.linalg.eigh(squares / (3 * count))
+    return np.asarray(vectors @ np.diag(coherent / np.maximum(values, coherent / LEVER_STD_M**2)) @ vectors.T)
+
+
+def _samples_in_motion(parts: Sequence[tuple[Stretch, Stretch]], unknowns: Floats) -> int:
+    """Number of samples in motion. Raises LinkposeError where they are too few."""
+    samples, seconds = 0, 0.0
+    for first, second in parts:
+        rates = (first.rate - unknowns[GYRO_BIAS:ACCEL_BIAS], second.rate - unknowns[UNKNOWNS:][GYRO_BIAS:ACCEL_BIAS])
+        moving = np.maximum(*(np.linalg.norm(rate, axis=1) for rate in rates)) > _MOVING_RAD_S
+        samples += int(moving.sum())
+        seconds += float(np.diff(first.time_s)[moving[1:]].sum())
+    if seconds < _LEAST_MOTION_S:
+        raise LinkposeError(
+            f"only {seconds:.1f} s show motion; move both links for half a minute or more, in all directions that the "
+            "joint allows"
+        )
+    return samples
+
+
+# ---- kind of the joint, and its axis ----
+
+
+class _Rotations(NamedTuple):
+    """A piece's rotations into its own frame, at some N instants, and how well R is known."""
+
+    one: Floats  # (N, 3, 3) C_1
+    two: Floats  # (N, 3, 3) R C_2
+    rates: Floats  # (2, N, 3) rad/s, each in its sensor's axes
+    information: Floats  # (3, 3) of R's error, 1/rad²
+
+
+def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> Motion:
+    """The hinge that explains the relative motion best.
+
+    Minimises the play y = C_1 j_1 − R C_2 j_2 over both axes and over a small rotation of each R, whose prior is what
+    the accelerations show of R. Slow motion does not show the heading of R: there, the axes have to.
+    """
+    parts = [_rotations(piece, fit) for piece in chosen]
+    found = [_fit_hinge(parts, axes) for axes in _first_axes(parts)]
+    return min(found, key=lambda each: each[0])[1]
+
+
+def _rotations(piece: _Piece, fit: _Fit) -> _Rotations:
+    turned = _turned(piece, fit.unknowns, fit.scale_m_s2)
+    of = fit.unknowns[:UNKNOWNS], fit.unknowns[UNKNOWNS:]
+    rates = np.stack([_rate(piece.first, of[0]), _rate(piece.second, of[1])])
+    one, two = (attitudes(piece.first.time_s, rate) for rate in rates)
+    every = slice(None, None, max(1, round(_AXIS_STEP_S / float(np.median(np.diff(piece.first.time_s))))))
+    coherent = len(turned.residual) * (_COHERENT_SHARE * fit.residual_m_s2 / fit.scale_m_s2) ** 2
+    information = turned.information / (fit.worth + coherent)
+    return _Rotations(one[every], turned.rotation @ two[every], rates[:, every], information)
+
+
+def _rate(stretch: Stretch, unknowns: Floats) -> Floats:
+    corrected = np.eye(3) - unknowns[GYRO_MATRIX:].reshape(3, 3)
+    return np.asarray((stretch.rate - unknowns[GYRO_BIAS:ACCEL_BIAS]) @ corrected.T)
+
+
+def _first_axes(parts: Sequence[_Rotations]) -> list[Floats]:
+    """Axes (2, 3) to start from: where the pieces' rotations hold the axis best, and [Seel 2014] (6), which needs none.
+
+    The latter minimises Σ (‖ω_1 × j_1‖ − ‖ω_2 × j_2‖)², from several directions. It does not show the sense of either
+    axis, and no axis of a sensor that hardly turns: each axis is paired with its image by the rotations of the piece
+    whose R is known best.
+    """
+    mean = np.mean(np.concatenate([np.einsum("nji,njk->nik", p.one, p.two) for p in parts]), axis=0)
+    left, _, right = np.linalg.svd(mean)
+    rates = np.concatenate([p.rates for p in parts], axis=1)
+    starts = [np.stack(pair) for pair in itertools.product(_directions(_AXIS_STARTS), repeat=2)]
+    costs = [float(np.sum(_seel_residual(rates, axes) ** 2)) for axes in starts]
+    fitted = [_fit_seel(rates, starts[at]) for at in np.argsort(costs)[:_AXIS_STARTS]]
+    one, two = min(fitted, key=lambda axes: float(np.sum(_seel_residual(rates, axes) ** 2)))
+    best = max(parts, key=lambda p: float(np.linalg.eigvalsh(p.information)[0]))
+    relative = np.einsum("nji,njk->ik", best.one, best.two)
+    pairs = [(left[:, 0], right[0]), (one, relative.T @ one), (relative @ two, two)]
+    return [np.stack([axis / np.linalg.norm(axis) for axis in pair]) for pair in pairs]
+
+
+def _directions(count: int) -> Floats:
+    """Unit vectors (N, 3) spread over a half sphere (Fibonacci)."""
+    z = (np.arange(count) + 0.5) / count
+    turn = np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    wide = np.sqrt(1 - z**2)
+    return np.column_stack([wide * np.cos(turn), wide * np.sin(turn), z])
+
+
+def _seel_residual(rates: Floats, axes: Floats) -> Floats:
+    """(N,) ‖ω_1 × j_1‖ − ‖ω_2 × j_2‖."""
+    one, two = (np.linalg.norm(np.cross(rates[k], axes[k]), axis=1) for k in range(2))
+    return np.asarray(one - two)
+
+
+def _fit_seel(rates: Floats, axes: Floats) -> Floats:
+    """Axes (2, 3) after some Gauss-Newton steps."""
+    for _ in range(_SEEL_STEPS):
+        columns = []
+        for k, sign in enumerate((1.0, -1.0)):
+            across = np.cross(rates[k], axes[k])
+            unit = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-6)
+            columns.append(sign * np.cross(unit, rates[k]))  # d‖ω × j‖ = (u × ω) · dj
+        jacobian = np.concatenate(columns, axis=1)
+        damped = jacobian.T @ jacobian + 1e-3 * len(jacobian) * np.diag(np.full(6, float(np.mean(rates**2)) + 1e-9))
+        step = np.linalg.solve(damped, -jacobian.T @ _seel_residual(rates, axes)).reshape(2, 3)
+        axes = axes + step
+        axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    return axes
+
+
+class _Step(NamedTuple):
+    """Normal equations of one piece at the present axes, with the rotation of R eliminated: turn = −(own + mixed a)."""
+
+    normal: Floats  # (6, 6)
+    gradient: Floats  # (6,) downhill
+    mixed: Floats  # (3, 6)
+    own: Floats  # (3,)
+    cost: float
+
+
+def _fit_hinge(parts: Sequence[_Rotations], axes: Floats) -> tuple[float, Motion]:
+    """Gauss-Newton for both axes and the small rotations of the pieces' R. Returns the cost and the motion."""
+    turns = [np.eye(3)] * len(parts)
+    for _ in range(_HINGE_STEPS):
+        steps = [_hinge_step(part, turn, axes) for part, turn in zip(parts, turns, strict=True)]
+        normal = sum((step.normal for step in steps), np.eye(6) / _AXIS_PRIOR_STD_RAD**2)
+        across = np.zeros((6, 4))  # changes of the axes across them; along them, only their length would change
+        for k in range(2):
+            across[3 * k : 3 * k + 3, 2 * k : 2 * k + 2] = np.linalg.svd(axes[k][None])[2][1:].T
+        inverse = across @ np.linalg.inv(across.T @ normal @ across) @ across.T
+        change = inverse @ sum((step.gradient for step in steps), np.zeros(6))
+        turns = [_small_turn(-(s.own + s.mixed @ change)) @ turn for s, turn in zip(steps, turns, strict=True)]
+        axes = axes + change.reshape(2, 3)
+        axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    pulls = np.array([step.gradient for step in steps])
+    covariance = inverse @ (pulls.T @ pulls) @ inverse + inverse
+    sense = 1.0 if axes[1] @ _SIDE >= 0 else -1.0
+    found = Motion(sense * axes, covariance, *_turn_and_play(parts, turns, axes))
+    return sum(step.cost for step in steps), found
+
+
+def _hinge_step(part: _Rotations, turn: Floats, axes: Floats) -> _Step:
+    seen = turn @ (part.two @ axes[1])[:, :, None]
+    seen = seen[:, :, 0]
+    play = part.one @ axes[0] - seen
+    by_axes = np.concatenate([part.one, -turn @ part.two], axis=2)  # (N, 3, 6)
+    by_turn = cross_matrices(seen)  # −(δ × T R C_2 j_2)
+    weight = _AXIS_STEP_S / _PLAY_CORRELATION_S / _PLAY_STD_RAD**2
+    away = _rotation_vectors(turn[None])[0]
+    inner = weight * np.einsum("nia,nib->ab", by_turn, by_turn) + part.information
+    mixed = weight * np.einsum("nia,nip->ap", by_turn, by_axes)
+    pull = weight * np.einsum("nia,ni->a", by_turn, play) + part.information @ away
+    solved = np.linalg.solve(inner, np.column_stack([mixed, pull]))
+    return _Step(
+        weight * np.einsum("nip,niq->pq", by_axes, by_axes) - mixed.T @ solved[:, :6],
+        -(weight * np.einsum("nip,ni->p", by_axes, play) - mixed.T @ solved[:, 6]),
+        solved[:, :6],
+        solved[:, 6],
+        weight * float(np.sum(play**2)) + float(away @ part.information @ away),
+    )
+
+
+def _turn_and_play(parts: Sequence[_Rotations], turns: Sequence[Floats], axes: Floats) -> tuple[float, float]:
+    """Rms of the rotation about the axis and of the angle between its two directions, degrees."""
+    (side1, across1), (side2, _) = (np.linalg.svd(axis[None])[2][1:] for axis in axes)
+    across1 = np.cross(axes[0], side1)
+    vectors, play = [], []
+    for part, turn in zip(parts, turns, strict=True):
+        two = turn @ part.two
+        relative = np.einsum("nji,nj->ni", part.one, two @ side2)
+        vectors.append(relative @ side1 + 1j * (relative @ across1))
+        play.append(np.linalg.norm(part.one @ axes[0] - two @ axes[1], axis=1))
+    unit = np.concatenate(vectors) / np.maximum(np.abs(np.concatenate(vectors)), 1e-9)
+    turn_rad = np.sqrt(-2 * np.log(max(float(np.abs(unit.mean())), 1e-6)))  # circular standard deviation
+    return float(np.degrees(turn_rad)), float(np.degrees(np.sqrt(np.mean(np.concatenate(play) ** 2))))
+
+
+def _small_turn(vector: Floats) -> Floats:
+    """The rotation matrix (3, 3) of a rotation vector (rad)."""
+    angle = float(np.linalg.norm(vector))
+    cross = cross_matrices((vector / max(angle, 1e-12))[None])[0]
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
+
+
+def _kind(motion: Motion) -> Kind | None:
+    if np.hypot(motion.turn_deg, motion.play_deg) < LEAST_TURN_DEG:
+        return None
+    ratio = motion.play_deg / max(motion.turn_deg, 1e-9)
+    return "hinge" if ratio < _HINGE_RATIO else "ball" if ratio > _BALL_RATIO else None
+
+
+def _nearest_on_axis(levers: Floats, covariance: Floats, axes: Floats) -> tuple[Floats, Floats]:
+    """r_1 and r_2 from the point of a hinge's axis that lies nearest to both sensors, as [Seel 2014] (3.3) chooses it.
+
+    Every point of the axis stays in its place relative to both links, so the motion cannot show which one is meant.
+    """
+    along = np.concatenate(list(axes)) / np.sqrt(2.0)
+    across = np.eye(6) - np.outer(along, along)
+    return (across @ levers.ravel()).reshape(2, 3), across @ covariance @ across.T
+
+
+def _rotation_vectors(rotation: Floats) -> Floats:
+    """(N, 3) rotation vectors (rad) of rotation matrices (N, 3, 3), by at most a half turn."""
+    odd = np.stack([rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0],
+                    rotation[:, 1, 0] - rotation[:, 0, 1]], axis=1)  # fmt: skip
+    sine = 0.5 * np.linalg.norm(odd, axis=1)
+    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1)
+    return np.asarray(0.5 * odd * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None])

@@ -1,0 +1,189 @@
+"""Localisation among beacons: noises from the log, robots that are carried, slow fixes, constants of the ranges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from linkpose.localization.events import Event, Log
+from linkpose.localization.localizer import localize
+from linkpose.localization.noise import RangeNoise
+from linkpose.localization.settings import Settings
+from linkpose.localization.tables import Truth, score_track
+from linkpose.localization.tuning import TUNABLE, correlation_time, tune
+
+BEACONS = {"1": (0.0, 0.0, 0.0), "2": (20.0, 0.0, 0.0), "3": (20.0, 20.0, 0.0), "4": (0.0, 20.0, 0.0)}
+STEP_S = 0.1
+
+
+def circle(time_s: float) -> tuple[float, float, float]:
+    """The true pose: 1 m/s on a circle of 6 m around (10, 10) m."""
+    angle = time_s / 6.0
+    return 10.0 + 6.0 * math.cos(angle), 10.0 + 6.0 * math.sin(angle), angle + math.pi / 2
+
+
+def drive(
+    seed: int,
+    duration_s: float = 200.0,
+    range_std: float = 0.1,
+    carried: tuple[float, float] | None = None,
+    bearings: bool = False,
+    persists_s: float = 0.0,
+    offsets: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+) -> tuple[Log, Truth]:
+    """Odometry at 10 Hz (0.02 m/s, 0.02 rad/s) and ranges at 2 Hz, beacon after beacon.
+
+    From `carried` = (time, so much s) on, the robot goes on from where it would be that much later. `persists_s` is the
+    time constant of the ranges' error.
+    """
+    rng = np.random.default_rng(seed)
+    log: Log = [Event(0.0, "pose", circle(0.0))]
+    errors = dict.fromkeys(BEACONS, 0.0)
+    rows = []
+    for k in range(int(duration_s / STEP_S)):
+        time = k * STEP_S
+        pose = circle(time + (carried[1] if carried and time >= carried[0] else 0.0))
+        rows.append((time, *pose))
+        log.append(Event(time, "odometry", (1.0 + rng.normal(0, 0.02), 1.0 / 6.0 + rng.normal(0, 0.02))))
+        if k % 5 == 2:
+            for name in list(BEACONS) if persists_s else [str(1 + (k // 5) % 4)]:
+                x, y, _ = BEACONS[name]
+                keep = math.exp(-0.5 / persists_s) if persists_s else 0.0
+                errors[name] = keep * errors[name] + math.sqrt(1 - keep**2) * rng.normal(0, range_std)
+                distance = math.hypot(x - pose[0], y - pose[1]) + errors[name] + offsets[int(name) - 1]
+                bearing = math.remainder(math.atan2(y - pose[1], x - pose[0]) - pose[2] + rng.normal(0, 0.02), math.tau)
+                if bearings:
+                    log.append(Event(time, "bearing_range", (distance, bearing), name))
+                else:
+                    log.append(Event(time, "range", (distance,), name))
+    table = np.array(rows)
+    return log, Truth(table[:, 0], table[:, 1:3], np.unwrap(table[:, 3]))
+
+
+def settings(**others: object) -> Settings:
+    return replace(Settings(ranges=RangeNoise("affine", 0.1)), **others)  # type: ignore[arg-type]
+
+
+def test_noises_are_estimated_from_the_log_and_make_the_filter_consistent() -> None:
+    """Ranges five times as noisy as assumed and odometry five times better: found within a third."""
+    log, truth = drive(1, range_std=0.5)
+    tuned = tune(log, settings(), BEACONS, TUNABLE)
+    assert math.hypot(tuned.ranges.std_m, 14.0 * tuned.ranges.growth) == pytest.approx(0.5, rel=0.35)
+    assert tuned.turn_std_rad_s < 0.05
+    assert tuned.error_time_s == 0.0
+    assumed, found = (score_track(localize(log, "ekf", s, None, BEACONS), truth) for s in (settings(), tuned))
+    assert found.position_rmse_m < 0.8 * assumed.position_rmse_m
+    assert found.within_2_sigma is not None and found.within_2_sigma > 0.88
+
+
+def test_errors_that_persist_are_recognised_and_count_less() -> None:
+    """Four beacons twice a second whose errors persist for 5 s: without that, σ is several times too small."""
+    log, truth = drive(2, range_std=0.3, persists_s=5.0)
+    tuned = tune(log, settings(), BEACONS, TUNABLE)
+    assert tuned.error_time_s is not None and 3.0 < tuned.error_time_s < 20.0
+    white = tune(log, settings(), BEACONS, tuple(name for name in TUNABLE if name != "error_time"))
+    honest, sure = (score_track(localize(log, "ekf", s, None, BEACONS), truth) for s in (tuned, white))
+    assert honest.within_2_sigma is not None and sure.within_2_sigma is not None
+    assert honest.within_2_sigma > 0.75
+    assert sure.within_2_sigma < honest.within_2_sigma - 0.2
+
+
+def test_the_correlation_time_of_white_errors_is_zero_and_of_a_gauss_markov_process_twice_its_time_constant() -> None:
+    rng = np.random.default_rng(3)
+    white = rng.normal(size=4000)
+    markov = np.zeros(4000)
+    keep = math.exp(-0.1 / 2.0)
+    for k in range(1, 4000):
+        markov[k] = keep * markov[k - 1] + math.sqrt(1 - keep**2) * white[k]
+    events = [Event(0.1 * k, "range", (1.0,), "1") for k in range(4000)]
+    assert correlation_time(events, np.column_stack((white, white))) == 0.0
+    assert correlation_time(events, np.column_stack((markov, white))) == pytest.approx(4.0, rel=0.4)
+
+
+def test_too_few_measurements_leave_the_noises_as_they_are() -> None:
+    log, _ = drive(4, duration_s=30.0)
+    assert tune(log, given := settings(), BEACONS, TUNABLE) is given
+
+
+@pytest.mark.parametrize("bearings", [False, True])
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_a_robot_that_was_carried_among_beacons_is_found_again(name: str, bearings: bool) -> None:
+    """Carried to the other side of the circle: found within 5 s of the third range that contradicts (two a second)."""
+    log, truth = drive(5, duration_s=80.0, carried=(40.0, 19.0), bearings=bearings)
+    track = localize(log, name, settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)  # type: ignore[arg-type]
+    error = np.linalg.norm(track.position_m - truth.position_at(track.time_s), axis=1)
+    assert track.relocated >= 1
+    assert np.max(error[track.time_s < 39.9]) < 0.5
+    assert np.max(error[track.time_s > 40.0 + 1.5 + 5.0]) < 1.0
+
+
+def test_one_beacon_with_a_fault_does_not_relocate_the_robot() -> None:
+    """Beacon 2 reads 3 m long from 40 s on, the others are sound."""
+    log, truth = drive(6, duration_s=80.0)
+    faulty = [
+        replace(event, values=(event.values[0] + 3.0,))
+        if isinstance(event, Event) and event.beacon == "2" and event.time_s > 40.0
+        else event
+        for event in log
+    ]
+    track = localize(faulty, "ekf", settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)
+    assert track.relocated == 0
+    assert score_track(track, truth).position_max_m < 0.5
+
+
+def test_the_unscented_filter_survives_what_the_extended_one_survives() -> None:
+    """Fixes every 7 s under water, and 90 s without any: headings of sigma points spread around the circle."""
+    rng = np.random.default_rng(7)
+    log: Log = [Event(0.0, "pose", (60.0, 0.0, math.pi / 2))]
+    truth = []
+    beacons = {"1": (0.0, 0.0, 0.0), "2": (200.0, 0.0, 0.0), "3": (0.0, 200.0, 0.0)}
+    for time in [7.0 * k for k in range(60) if not 20 <= k < 33]:
+        angle = 0.5 * time / 60.0
+        x, y, heading = 60.0 * math.cos(angle), 60.0 * math.sin(angle), angle + math.pi / 2
+        truth.append((time, x, y, heading))
+        log.append(Event(time, "attitude", (0.0, 0.0, heading + rng.normal(0, 0.01))))
+        log.append(Event(time, "depth", (0.0,)))
+        for name, (bx, by, _) in beacons.items():
+            log.append(Event(time, "range", (math.hypot(x - bx, y - by) + rng.normal(0, 1.0),), name))
+        log.append(Event(time, "velocity", (0.5, 0.0, 0.0)))
+    table = np.array(truth)
+    path = Truth(table[:, 0], table[:, 1:3], None)
+    rms = {}
+    for name in ("ekf", "ukf"):
+        track = localize(log, name, settings(ranges=RangeNoise("fixed", 1.0)), None, beacons)  # type: ignore[arg-type]
+        error = np.linalg.norm(track.position_m[:, :2] - path.position_at(track.time_s), axis=1)
+        rms[name] = float(np.sqrt(np.mean(error[(track.time_s < 130.0) | (track.time_s > 260.0)] ** 2)))
+    assert rms["ukf"] < 1.1 * rms["ekf"] < 4.0
+
+
+@pytest.mark.parametrize("bearings", [False, True])
+def test_the_bias_of_each_beacon_is_estimated_with_an_honest_deviation(bearings: bool) -> None:
+    offsets = (0.5, -0.3, 0.0, 0.8)
+    log, truth = drive(8, offsets=offsets, bearings=bearings)
+    tuned = tune(log, settings(estimate=("bias:each",)), BEACONS, TUNABLE)
+    track = localize(log, "ekf", tuned, None, BEACONS)
+    for name, offset in zip(BEACONS, offsets, strict=True):
+        at = track.names.index(f"range_bias_{name}_m")
+        assert abs(track.state[-1, at] - offset) < max(3.0 * track.std[-1, at], 0.1)
+        assert track.std[-1, at] < 0.15
+    one = localize(log, "ekf", replace(tuned, estimate=("bias",)), None, BEACONS)
+    assert score_track(track, truth).position_rmse_m < 0.6 * score_track(one, truth).position_rmse_m
+
+
+def test_scale_and_bias_of_landmark_ranges_are_estimated() -> None:
+    log, _ = drive(9, bearings=True)
+    longer = [
+        replace(event, values=(1.05 * event.values[0] + 0.2, event.values[1]))
+        if isinstance(event, Event) and event.kind == "bearing_range"
+        else event
+        for event in log
+    ]
+    track = localize(longer, "ekf", settings(estimate=("scale", "bias"), turn_std_rad_s=0.05), None, BEACONS)
+    values = dict(zip(track.names, zip(track.state[-1], track.std[-1], strict=True), strict=True))
+    for name, true in (("range_scale_error", 0.05), ("range_bias_m", 0.2)):
+        value, std = values[name]
+        assert abs(value - true) < 3.0 * std
+    assert values["range_scale_error"][1] < 0.02
