@@ -62,6 +62,7 @@ _FIELDS = np.dtype(
         ("force_change", *_VECTOR),  # over the last step (m/s²)
         ("rate", *_VECTOR),  # angular rate at `time` (rad/s)
         ("newest_rate", *_VECTOR),  # may be newer than `time` while a held force is waited out (rad/s)
+        ("rate_slope", *_VECTOR),  # between the last two rates (rad/s²)
         ("turned_at", "f8"),  # time of the newest rate (s)
         ("angle", *_VECTOR),  # ∫ rate since `time`, gyro bias included (rad)
         ("angle_variance", "f8"),  # each axis (rad²)
