@@ -19,9 +19,9 @@ from linkpose.filters.inertial.state import HEIGHT, PITCH, ROLL, SIGMA, Floats, 
 
 # What a calibration leaves (simulated twelve-position calibration, ../simulation/link.py), and what the MPU-6050's data
 # sheet allows (zero-rate output ±20 °/s after a rough subtraction, zero-g output ±50 mg, scale ±3 %, cross-axis ±2 %).
-# The former drifts with the temperature, in minutes. Its accelerometer bias decides σ of the tilt: with 0.016 m/s², 78 %
-# of the simulated errors after the start are within 2σ; 0.03 m/s² costs 4 % of the tilt on a real pendulum. A part's
-# tolerances are constant: a decay in 1000 s in place of 3000 s doubles the error of the height.
+# The former drifts with the temperature, in minutes. Its accelerometer bias decides σ of the tilt: with 0.016 m/s²,
+# 78 % of the simulated errors after the start are within 2σ; 0.03 m/s² costs 4 % of the tilt on a real pendulum. A
+# part's tolerances are constant: a decay in 1000 s in place of 3000 s doubles the error of the height.
 CALIBRATED = SensorErrors(0.03, 0.0015, 0.0007, 0.025, 0.0015, 0.0005, 200.0)
 DATA_SHEET = SensorErrors(0.2, 0.02, 0.012, 0.3, 0.02, 0.012, 3000.0)
 
