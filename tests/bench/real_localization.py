@@ -1,10 +1,11 @@
 """`linkpose localize` on public recordings of real robots, beside the figures that tuned filters of others reached.
 
-    python tests/bench/real_localization.py [--data FOLDER] [--json]
+    python tests/bench/real_localization.py [--data FOLDER] [--batch] [--json]
 
 FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
-recording that is not there is named and left out. Each recording is run with the default options and with those of a
-user who knows the sensors.
+recording that is not there is named and left out. Each recording is run with the default options, smoothed, and with
+the options of a user who knows the sensors. Beside them run filterpy's extended Kalman filter, Monte-Carlo localisation
+(laser), and with --batch the batch optimum of GTSAM, which takes some minutes.
 """
 
 from __future__ import annotations
@@ -17,27 +18,30 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from _localization_peers import filterpy_path, gtsam_path, problem_of
 from _report import RECORDINGS
 
-from linkpose.localization import models
-from linkpose.localization.carmen import BEAM_ANGLES_RAD, Reading, flaser_angles, format_reading
-from linkpose.localization.grid import GridMap
-from linkpose.localization.maps import load_map
+from linkpose.localization.carmen import Reading, flaser_angles, format_reading
+from linkpose.localization.events import read_events
+from linkpose.localization.kalman import SUBMERSIBLE
+from linkpose.localization.localizer import localize
+from linkpose.localization.noise import RangeNoise
+from linkpose.localization.settings import Settings
+from linkpose.localization.tables import read_beacons, read_truth, score
+from linkpose.localization.tuning import TUNABLE, tune
+from linkpose.localization.vehicle import kinds_of, vehicle_of
 
 PLAZA_RMS_M = {"Plaza1": 0.40, "Plaza2": 0.59}  # what a tuned EKF of others reached
 MRCLAM_RMS_M, LABYRINTH_RMS_M = 0.17, 0.15
 TAG_RMS_M, AUV_RMS_M = 0.090, 5.3  # a constant-velocity EKF with a bias; GTSAM's batch optimum
 FILES = 5  # log, --beacons, file, --truth, file: what is no option of the filter
 MRCLAM_ROBOTS = range(1, 6)
-WEAN_START_SPREAD = ((0.0, 0.0, 0.0), (0.5, 0.0, 0.1), (-0.5, 0.0, -0.1), (0.0, 0.5, -0.1), (0.0, -0.5, 0.1))
-WEAN_CANDIDATES = 30
 WEAN_ENDS_M = {"robotdata1": (39.90, 41.43)}  # where a particle filter of others ended
-# An old map, people in the hall, and walls of glass: most of a beam's error is the map's.
-WEAN_OPTIONS = ["--start-std", "0.5,0.15", "--range-std", "1", "--range-growth", "0.05", "--gate", "0.95"]
+BEACONS_FOR_CONSTANTS = 3  # as `linkpose localize`
 
 
 @dataclass(frozen=True)
@@ -188,22 +192,6 @@ def wean_log(path: Path, out: Path) -> tuple[Path, list[Reading]]:
     return log, readings
 
 
-def wean_starts(grid: GridMap, first: Reading) -> list[tuple[float, float, float]]:
-    """The poses of the map from which the first scan looks most like what it was, best first."""
-    table = np.zeros((len(BEAM_ANGLES_RAD), 5))
-    seen = [int(np.argmin(np.abs(first.angles_rad - angle))) for angle in BEAM_ANGLES_RAD]
-    table[:, 0], table[:, 1], table[:, 4] = first.angles_rad[seen], 0.25, 80.0
-    rows, columns = np.nonzero(grid.blocked == 0)
-    places = np.unique(np.column_stack((columns, rows)) // 4, axis=0) * 0.4 + 0.2
-    scored, expected = [], np.empty(len(seen))
-    for x, y in places:
-        for heading in np.arange(-math.pi, math.pi, math.pi / 18):
-            models.predict(models.BEAMS, np.array([x, y, heading]), table, grid.blocked, grid.geometry, expected)
-            off = np.minimum(np.abs(expected - first.ranges_m[seen]), 1.0)
-            scored.append((float(off.mean()), (float(x), float(y), float(heading))))
-    return [pose for _, pose in sorted(scored)[:WEAN_CANDIDATES]]
-
-
 def run_localize(arguments: list[str]) -> list[dict[str, float]]:
     command = [sys.executable, "-m", "linkpose", "localize", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -220,37 +208,25 @@ def last_pose(path: Path, name: str) -> np.ndarray:
 
 
 def wean(folder: Path, out: Path) -> Iterable[dict[str, object]]:
-    """No truth: does the filter, from starts half a metre and a tenth of a radian apart, end at one place?"""
+    """No truth: where the default filter ends, without a start, and how far from the end that particle
+    filters of others found.
+    """
     map_path = wean_map(folder, out)
-    grid = load_map(map_path)
     for path in sorted(folder.glob("robotdata*.log.gz")):
-        log, readings = wean_log(path, out)
-        first = next(reading for reading in readings if reading.ranges_m is not None)
-        common = [str(log), "--map", str(map_path), *WEAN_OPTIONS]
-
-        def fits(start: tuple[float, float, float], common: list[str] = common) -> float:
-            (row,) = run_localize([*common, f"--start={start[0]},{start[1]},{start[2]}", "--filter", "ukf"])
-            return row["updates"] / (row["updates"] + row["rejected"])
-
-        best = max(wean_starts(grid, first), key=fits)
-        for name in ("ekf", "ukf"):
-            ends, accepted = [], []
-            for dx, dy, turn in WEAN_START_SPREAD:
-                start = f"--start={best[0] + dx},{best[1] + dy},{best[2] + turn}"
-                (row,) = run_localize([*common, start, "--filter", name, "-o", str(out / "wean_path.csv"), "--force"])
-                accepted.append(row["updates"] / (row["updates"] + row["rejected"]))
-                ends.append(last_pose(out / "wean_path.csv", name))
-            spread = np.max(np.linalg.norm(np.array(ends)[:, :2] - np.median(ends, axis=0)[:2], axis=1))
-            x, y, _ = np.median(ends, axis=0)
-            known = WEAN_ENDS_M.get(path.name.split(".")[0])
-            yield {
-                "bench": f"wean_{path.name.split('.')[0]}",
-                "filter": name,
-                "starts": len(ends),
-                "accepted": float(np.mean(accepted)),
-                "end_spread_m": float(spread),
-                "end_from_others_m": math.dist((x, y), known) if known else None,
-            }
+        log, _ = wean_log(path, out)
+        common = [str(log), "--map", str(map_path), "-o", str(out / "wean_path.csv"), "--force"]
+        (row,) = run_localize(common)
+        end = last_pose(out / "wean_path.csv", "scan_match")
+        known = WEAN_ENDS_M.get(path.name.split(".")[0])
+        yield {
+            "bench": f"wean_{path.name.split('.')[0]}",
+            "options": "default",
+            "filter": "scan-match",
+            "known_share": row["known_share"],
+            "relocated": row["relocated"],
+            "end_m": end[:2].tolist(),
+            "end_from_others_m": math.dist(end[:2], known) if known else None,
+        }
 
 
 def uwb_tag(folder: Path, out: Path) -> list[Case]:
@@ -281,27 +257,56 @@ def laser_maps(folder: Path, out: Path) -> Iterable[dict[str, object]]:
             yield {"bench": name, "options": " ".join(options) or "default", **row}
 
 
-def with_truth(cases: Iterable[Case]) -> Iterable[dict[str, object]]:
-    """Each case with the default options, and with the documented ones for both filters."""
+def with_truth(cases: Iterable[Case], batch: bool) -> Iterable[dict[str, object]]:
+    """Each case with the default options, smoothed, with the documented options for both filters, and the peers."""
     for case in cases:
-        for row in run_localize(case.arguments[:FILES]):
-            yield {"bench": case.name, "options": "default", **row, "others_position_rmse_m": case.limit_m}
+        others = {"others_position_rmse_m": case.limit_m}
+        for options in ((), ("--smooth",), ("--filter", "ukf")):
+            for row in run_localize([*case.arguments[:FILES], *options]):
+                yield {"bench": case.name, "options": " ".join(options) or "default", **row, **others}
         for row in run_localize([*case.arguments, "--filter", "ekf", "--filter", "ukf"]):
-            options = " ".join(case.arguments[FILES:]) or "default"
-            yield {"bench": case.name, "options": options, **row, "others_position_rmse_m": case.limit_m}
+            yield {"bench": case.name, "options": " ".join(case.arguments[FILES:]) or "default", **row, **others}
+        for row in peers(case, batch):
+            yield {"bench": case.name, "options": "noises of linkpose's default", **row}
+
+
+def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
+    """filterpy's filter and, with `batch`, GTSAM's optimum, with the noises that linkpose estimates from the log."""
+    log, beacons = read_events(Path(case.arguments[0])).events, read_beacons(Path(case.arguments[2]))
+    truth = read_truth(Path(case.arguments[4]))
+    many = len(beacons) >= BEACONS_FOR_CONSTANTS and vehicle_of(kinds_of(log)) is not SUBMERSIBLE
+    ranging = any(event.kind == "range" for event in log)
+    first = Settings(ranges=RangeNoise("affine"), estimate=("scale", "bias") if many and ranging else ())
+    settings = tune(log, first, beacons, TUNABLE)
+    problem = problem_of(log, beacons, settings)
+    time_s, path = filterpy_path(problem)
+    yield {"filter": "filterpy ekf", "position_rmse_m": score(time_s, path, None, truth).position_rmse_m}
+    if not batch:
+        return
+    track = localize(log, "ekf", replace(settings, smooth=True), None, beacons)
+    columns = [np.interp(time_s, track.time_s, column) for column in track.position_m[:, :2].T]
+    if problem.form == "odometry":
+        columns.append(np.interp(time_s, track.time_s, np.unwrap(np.asarray(track.heading_rad))))
+    elif problem.form == "none":
+        columns += [np.gradient(column, time_s) for column in columns]
+    ours = score(time_s, np.column_stack(columns[:2]), None, truth).position_rmse_m
+    time_s, path = gtsam_path(problem, np.column_stack(columns))
+    optimum = score(time_s, path, None, truth).position_rmse_m
+    yield {"filter": "gtsam batch optimum", "position_rmse_m": optimum, "smoothed_over_optimum": ours / optimum}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=RECORDINGS, help="folder of the recordings")
     parser.add_argument("--json", action="store_true", help="one object a line")
+    parser.add_argument("--batch", action="store_true", help="also the batch optimum of GTSAM: some minutes")
     options = parser.parse_args()
     sources: dict[str, Callable[[Path, Path], Iterable[dict[str, object]]]] = {
-        "plaza": lambda folder, out: with_truth(plaza(folder, out)),
-        "mrclam": lambda folder, out: with_truth(mrclam(folder, out)),
-        "uwb_labyrinth": lambda folder, out: with_truth(uwb_labyrinth(folder, out)),
-        "uwb_tag": lambda folder, out: with_truth(uwb_tag(folder, out)),
-        "auv_lbl": lambda folder, out: with_truth(auv_lbl(folder, out)),
+        "plaza": lambda folder, out: with_truth(plaza(folder, out), options.batch),
+        "mrclam": lambda folder, out: with_truth(mrclam(folder, out), options.batch),
+        "uwb_labyrinth": lambda folder, out: with_truth(uwb_labyrinth(folder, out), options.batch),
+        "uwb_tag": lambda folder, out: with_truth(uwb_tag(folder, out), options.batch),
+        "auv_lbl": lambda folder, out: with_truth(auv_lbl(folder, out), options.batch),
         "laser_maps": laser_maps,
         "wean": wean,
     }

@@ -12,9 +12,10 @@ import numpy as np
 from scipy.linalg import expm
 
 from linkpose.filters._imu import GRAVITY, ImuCalibration
+from linkpose.filters._records import record_of
 from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, rest, update
 from linkpose.filters.inertial.hypotheses import DATA_SHEET
-from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, V, Z, fresh_state, record_of
+from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, V, Z, fresh_state
 from linkpose.filters.joint_inertial import InertialParameters
 from linkpose.sensors.rig import Imu
 

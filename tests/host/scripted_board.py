@@ -51,7 +51,8 @@ class ScriptedBoard(SimulatedBoard):
 
     @property
     def _pauses(self) -> bool:
-        return self._samples is not None and self._tick == self.pauses_at
+        """Also until the host has checked the stream's settings: time at full speed would run away from a slow host."""
+        return self._samples is not None and (self._checked_at is None or self._tick == self.pauses_at)
 
     @property
     def next_tick_us(self) -> int | None:

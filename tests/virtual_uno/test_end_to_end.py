@@ -19,6 +19,7 @@ from wire_link import WireLink
 from linkpose.recording.columns import ACCEL, GYRO, MAG, mouse_columns
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
+from linkpose.simulation.chain import ChainRun
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun
 
 pytestmark = pytest.mark.realtime
@@ -127,3 +128,25 @@ def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_p
     field = np.linalg.norm([table.columns[name][settled] for name in MAG], axis=0)
     assert np.median(field) == pytest.approx(np.hypot(30.0, 42.0), abs=2.0)
     assert table.columns["mag_fresh"][settled].mean() > 0.95
+
+
+def test_the_angle_of_a_chain_from_two_sensors_on_one_board(board: Callable[..., WireLink], tmp_path: Path) -> None:
+    """Two MPU-6050 on a thigh and a shank: recorded by the firmware, estimated with unknown mounting."""
+    uno = board(imu2={}).uno
+    run = ChainRun("hinge", seed=0, duration_s=None)
+    feed = RigFeed(uno, run)
+    path, estimate = tmp_path / "r.csv", tmp_path / "e.csv"
+    with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
+        done = linkpose("record", path, "--port", server.link, "--duration", 11, "--json")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout.splitlines()[-1])
+    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
+    done = linkpose("estimate", path, "-o", estimate, "--filter", "chain", "--joint", "hinge")
+    assert done.returncode == 0, done.stderr
+    found = read_table(estimate, "estimate").columns
+    late = found["time_s"] > 7
+    time_s, angle, std = (found[name][late] for name in ("time_s", "chain_angle_deg", "chain_angle_std_deg"))
+    shifts = np.arange(0.0, 3.0, 0.01)  # the rig moved since the board's reset
+    errors = [angle - run.truth_columns(time_s + shift)["angle_deg"] for shift in shifts]
+    error = min((e - e.mean() for e in errors), key=rms)  # counted from the first sample, which may be in motion
+    assert rms(error) < 1.0 < 5.0 < np.ptp(angle) and (std < 3.0).all()

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from linkpose.filters._imu import ImuCalibration, ImuSamples
+from linkpose.filters._records import record_of
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
     BA,
@@ -27,7 +28,6 @@ from linkpose.filters.inertial.state import (
     Floats,
     SensorErrors,
     fresh_state,
-    record_of,
 )
 from linkpose.filters.joint_inertial import InertialParameters, declared
 from linkpose.sensors.measurements import Measurements

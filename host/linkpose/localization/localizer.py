@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError, MissingBeacons, MissingMap, MissingStart, NeedsScans, NothingToEstimate
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
-from linkpose.localization.grid import GridMap, no_map
+from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
 from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
@@ -105,8 +105,21 @@ def batches(log: Log) -> Iterator[tuple[int, int]]:
 def warm_up(names: Iterable[Method]) -> None:
     """Compiles the filters, or loads them compiled."""
     at_one_place: Log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(0.1, "pose", (0.0, 0.0, 0.0))]
+    angles = np.linspace(-np.pi, np.pi, 37)
+    in_a_round_room: Log = [*at_one_place, Scan(0.2, np.ones(37), angles, (0.0, 0.0, 0.0), 5.0)]
     for name in names:
-        localize(at_one_place, name, Settings())
+        if name in ("mcl", "scan-match"):
+            localize(in_a_round_room, name, Settings(), _round_room())
+        else:
+            localize(at_one_place, name, Settings())
+
+
+def _round_room() -> GridMap:
+    """A map of 4 m by 4 m, free within 1 m of its middle, the origin."""
+    cell_m, cells = 0.1, 40
+    middle_m = (np.arange(cells) + 0.5) * cell_m - 2.0
+    blocked = np.hypot(middle_m[:, None], middle_m) > 1.0
+    return GridMap(np.where(blocked, OCCUPIED, FREE).astype(np.uint8), np.array([cell_m, -2.0, -2.0, 0.0]))
 
 
 class Localizer:

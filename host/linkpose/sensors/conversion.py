@@ -184,7 +184,8 @@ class Converter:
         """Accelerations, temperature and rates (N, 7) of inertial sensor 0 or 1."""
         scale, offset = self._imu_scales[number]
         imu = np.rint((counts * scale + offset) * _IMU_STEPS) / _IMU_STEPS
-        imu[invalid] = np.nan
+        if invalid.any():
+            imu[invalid] = np.nan
         return np.asarray(imu)
 
     def _convert_mag(self, counts: Integers, flags: Integers) -> dict[str, Any]:
@@ -204,11 +205,10 @@ class Converter:
             return np.full((size, 2), np.nan), np.zeros(size, np.bool_)
         valid = flags & BARO_VALID != 0
         fresh, self._baro_count = _new_readings(valid, counts[:, 2], self._baro_count)
-        if fresh.all():
-            baro = self._compensate(counts)
-        else:
-            readings = np.concatenate([self._baro, self._compensate(counts[fresh])]) if fresh.any() else self._baro
-            baro = readings[np.cumsum(fresh)]
+        latest = np.cumsum(fresh)
+        readings = np.concatenate([self._baro, self._compensate(counts[fresh])]) if latest[-1] else self._baro
+        baro = readings.take(latest, axis=0)
+        if not valid.all():
             baro[~valid] = np.nan
         self._baro = baro[-1:].copy()
         return baro, fresh & np.isfinite(baro[:, 0])

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters._records import zeros
 from linkpose.filters.frozen import MEMORY, fresh_memory
 from linkpose.sensors.rig import Chain, Rig, Vector
 
@@ -219,15 +220,9 @@ ESTIMATE = np.dtype(
 )
 
 
-def record_of(parameters: NamedTuple) -> Any:
-    """Parameters as a record, which compiled code reads by name."""
-    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
-    return np.array([tuple(parameters)], dtype=dtype).view(np.recarray)
-
-
 def fresh_bank(rig: Rig) -> Any:
     """The shared record of a chain that begins."""
-    banks = np.zeros(1, BANK).view(np.recarray)
+    banks = zeros(1, BANK)
     bank: Any = banks[0]
     bank.last_readings[:] = fresh_memory()
     bank.length, bank.hinge, bank.fixed = BALL_SIZE, -1, -1
@@ -240,7 +235,7 @@ def fresh_bank(rig: Rig) -> Any:
 
 def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
     """The hypotheses before the first sample: mounting and sensor errors as the rig states them."""
-    states = np.zeros(HYPOTHESES, STATE).view(np.recarray)
+    states = zeros(HYPOTHESES, STATE)
     chain = rig.chain
     gyro_std = _known(rig.imu.gyro_bias_std_rad_s, parameters.gyro_bias_rad_s)
     accel_std = _known(rig.imu.accel_offset_std_m_s2, parameters.accel_bias_m_s2)

@@ -74,7 +74,9 @@ _LONGEST_BLIND_S = 0.3
 # Identical readings for less than this are one reading of a slower sensor, held by the logger (s).
 LONGEST_HOLD_S = 0.1
 _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
-_JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0  # from one sample to the next: a spike, or at least no smooth motion
+# From one sample to the next: a spike, or at least no smooth motion. A rate is compared with its linear extrapolation:
+# at 1200 °/s it changes by more between sound samples.
+_JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0
 _JUMP_VARIANCES = 100.0  # and beyond the measured noise: six times the σ of a difference of two readings
 _NO_JUMP = cast(bool, np.bool_(False))  # the compiler would take a Python constant for a type of its own
 _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
@@ -128,6 +130,7 @@ def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
     vec.store(s.force, force)
     vec.store(s.rate, rate)
     vec.store(s.newest_rate, rate)
+    vec.store(s.rate_slope, (0.0, 0.0, 0.0))
     vec.store(s.angle, (0.0, 0.0, 0.0))
     vec.store(s.force_change, (0.0, 0.0, 0.0))
     start_noise(s, force, rate)
@@ -210,7 +213,7 @@ def _advance(
     force = force if has_force or clipped else before_force
     rate = rate if has_rate or is_bounded(rate) else newest
     waits = has_force and has_rate and h < LONGEST_HOLD_S and _same(force, before_force)
-    jerk = vec.minus(rate, newest)
+    jerk = vec.axpy(s.turned_at - time_s, vec.load(s.rate_slope), vec.minus(rate, newest))
     jumped = vec.dot(jerk, jerk) > _JUMP_RAD_S**2 + _JUMP_VARIANCES * noisy.gyro_variance
     if time_s > s.turned_at and not (waits and (jumped or _same(rate, newest))):
         _turn(s, time_s - s.turned_at, has_rate, rate, jumped, noisy)
@@ -259,6 +262,8 @@ def _turn(s: Record, step: float, has_rate: bool, rate: Vec, jumped: bool, imu: 
     if jumped:
         jerk = vec.minus(rate, newest)
         s.angle_variance += 0.25 * step * step * vec.dot(jerk, jerk)
+    smooth = has_rate and not jumped and s.blind_s == 0.0
+    vec.store(s.rate_slope, vec.scale(1.0 / step, vec.minus(rate, newest)) if smooth else (0.0, 0.0, 0.0))
     s.turned_at += step
     vec.store(s.newest_rate, rate)
 
@@ -396,12 +401,14 @@ def _same(a: Vec, b: Vec) -> bool:
 @inner
 def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     """The estimate at the time of the stamp: the readings' delay, and a step that waits, are extrapolated."""
-    bias = vec.load(s.gyro_bias)
+    bias, waited = vec.load(s.gyro_bias), 0.0
     ahead = vec.scale(imu.delay, vec.minus(vec.load(s.newest_rate), bias))
     if s.time < time_s < math.inf:  # while the step waits
+        waited = time_s - s.turned_at
         ahead = vec.axpy(1.0, vec.load(s.angle), ahead)
-        ahead = vec.axpy(time_s - s.turned_at, vec.load(s.newest_rate), ahead)
+        ahead = vec.axpy(waited, vec.load(s.newest_rate), ahead)
         ahead = vec.axpy(s.time - time_s, bias, ahead)
+    ahead = vec.axpy(0.5 * min(waited + imu.delay, LONGEST_HOLD_S) ** 2, vec.load(s.rate_slope), ahead)
     ahead = corrected(s.nominal, MG, ahead)
     tilt, north = vec.turn_back(ahead, vec.load(s.tilt)), vec.turn_back(ahead, vec.load(s.north))
     west, d = vec.cross(tilt, north), vec.load(s.j2s)

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters._records import zeros
 from linkpose.filters.frozen import MEMORY, fresh_memory
 
 Floats = NDArray[np.float64]
@@ -61,6 +62,7 @@ _FIELDS = np.dtype(
         ("force_change", *_VECTOR),  # over the last step (m/s²)
         ("rate", *_VECTOR),  # angular rate at `time` (rad/s)
         ("newest_rate", *_VECTOR),  # may be newer than `time` while a held force is waited out (rad/s)
+        ("rate_slope", *_VECTOR),  # between the last two rates (rad/s²)
         ("turned_at", "f8"),  # time of the newest rate (s)
         ("angle", *_VECTOR),  # ∫ rate since `time`, gyro bias included (rad)
         ("angle_variance", "f8"),  # each axis (rad²)
@@ -158,12 +160,6 @@ class SensorErrors(NamedTuple):
         return np.concatenate([np.zeros(6), biases, accel.ravel(), gyro.ravel(), np.zeros(4)]) ** 2
 
 
-def record_of(parameters: NamedTuple) -> Any:
-    """Parameters as an array of one record, which compiled code reads by name through one pointer."""
-    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
-    return np.array([tuple(parameters)], dtype=dtype).view(np.recarray)
-
-
 def fresh_state(
     errors: SensorErrors, j2s_m: tuple[float, float, float], j2s_std_m: float, largest_distance: float = np.inf
 ) -> Any:
@@ -171,7 +167,7 @@ def fresh_state(
 
     `largest_distance`: half the χ² of the sensor errors beyond which the filter begins anew.
     """
-    states = np.zeros(1, STATE).view(np.recarray)
+    states = zeros(1, STATE)
     state: Any = states[0]
     state.time = np.nan
     state.last_readings[:] = fresh_memory()

@@ -20,6 +20,7 @@ import numpy as np
 
 from linkpose.compiling import compiled, inner
 from linkpose.errors import CannotRun
+from linkpose.filters._records import record_of
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
 from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
@@ -40,7 +41,6 @@ from linkpose.filters.mice.state import (
     Records,
     fresh_state,
     mouse_records,
-    parameters_record,
     sample_records,
 )
 from linkpose.sensors.measurements import Measurements
@@ -67,7 +67,7 @@ class MiceFilter:
         check_placement(rig.mouse)
         self.parameters = parameters or MiceParameters()
         self.state = fresh_state(len(rig.mouse), BIAS_STD)
-        self._parameters, self._mice, self._imu = parameters_record(self.parameters), mouse_records(rig.mouse), rig.imu
+        self._parameters, self._mice, self._imu = record_of(self.parameters), mouse_records(rig.mouse), rig.imu
 
     @property
     def rejected(self) -> int:
@@ -82,7 +82,7 @@ class MiceFilter:
         starts at 0, heading in [−π, π). Excluded is a bit mask, bit 0 is mouse 1. The standard deviation covers the
         modelled noise, not the error of the mice's calibration.
         """
-        out = np.empty(len(block), ESTIMATE).view(np.recarray)
+        out = np.empty(len(block), ESTIMATE)
         _process(sample_records(block, self._imu), self._parameters, self._mice, self.state, out)
         return out.view(np.float64).reshape(len(block), len(self.columns))
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.filters._records import zeros
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Imu, Mouse
 from linkpose.wire.messages import SampleFlags
@@ -126,15 +127,9 @@ class MiceParameters(NamedTuple):
     noise_m_s: float = 0.0  # of one mouse, from sample to sample, at any speed, beyond the rounding to counts
 
 
-def parameters_record(parameters: Any) -> Any:
-    """Parameters (a NamedTuple of numbers) as an array of one record."""
-    dtype = np.dtype([(name, "f8") for name in parameters._fields], align=True)
-    return np.array([tuple(parameters)], dtype).view(np.recarray)
-
-
 def mouse_records(mice: tuple[Mouse, ...]) -> Any:
     """The rig's [[mouse]] tables as an array of MOST records of MOUSE."""
-    records = np.zeros(MOST, MOUSE).view(np.recarray)
+    records = zeros(MOST, MOUSE)
     for i, mouse in enumerate(mice):
         metres = 1.0 / mouse.counts_per_m
         records[i].arm = complex(-mouse.y_m, mouse.x_m)
@@ -145,7 +140,7 @@ def mouse_records(mice: tuple[Mouse, ...]) -> Any:
 
 def fresh_state(count: int, bias_std_rad_s: float) -> Any:
     """An array of one state record before the first sample, for so many mice."""
-    records = np.zeros(1, STATE).view(np.recarray)
+    records = zeros(1, STATE)
     state: Any = records[0]
     state.count = count
     state.time = state.sample_time = state.interval = state.known_time = state.rate = state.mean_rate = np.nan
@@ -153,18 +148,18 @@ def fresh_state(count: int, bias_std_rad_s: float) -> Any:
     return records
 
 
-def sample_records(block: Measurements, imu: Imu) -> Any:
+def sample_records(block: Measurements, imu: Imu) -> NDArray[Any]:
     """What the compiled steps read of N samples: an array (N,) of SAMPLE."""
-    samples: Any = np.empty(len(block), SAMPLE).view(np.recarray)
-    samples.time = block.time_s
+    samples = np.empty(len(block), SAMPLE)
+    samples["time"] = block.time_s
     rate = block.gyro_rad_s - imu.gyro_bias_rad_s
     is_usable = (np.abs(rate) < _MOST_RAD_S).all(axis=1) & (block.flags & _GYRO_SATURATED == 0)
-    samples.rate = np.where(is_usable, rate[:, 2], np.nan)
-    samples.is_stale = block.flags & STALE != 0
-    samples.is_after_gap = block.flags & _GAP_BEFORE != 0
+    samples["rate"] = np.where(is_usable, rate[:, 2], np.nan)
+    samples["is_stale"] = block.flags & STALE != 0
+    samples["is_after_gap"] = block.flags & _GAP_BEFORE != 0
     ports = min(MOST, block.mice_counts.shape[1])
-    samples.counts[:, ports:] = np.nan
+    samples["counts"][:, ports:] = np.nan
     for i in range(ports):
-        samples.counts[:, i] = block.mice_counts[:, i, 0] + 1j * block.mice_counts[:, i, 1]
-        samples.counts[block.flags & (_OVERFLOW << i) != 0, i] = np.nan
+        samples["counts"][:, i] = block.mice_counts[:, i, 0] + 1j * block.mice_counts[:, i, 1]
+        samples["counts"][block.flags & (_OVERFLOW << i) != 0, i] = np.nan
     return samples

@@ -20,9 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
 from linkpose.filters.mice.reading import BIAS_STD
-from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, parameters_record, sample_records
+from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, sample_records
 from linkpose.filters.planar.process import process
 from linkpose.filters.planar.state import (
     ANGLE,
@@ -72,10 +73,10 @@ class _PlanarFilter:
         self.parameters, self.planar = parameters or MiceParameters(), planar or PlanarParameters()
         self._rig = rig
         self._placed, self._mice = mouse_records(rig.mouse)[: len(rig.mouse)], mouse_records(rig.mouse)
-        self._parameters, self._planar = parameters_record(self.parameters), parameters_record(self.planar)
+        self._parameters, self._planar = record_of(self.parameters), record_of(self.planar)
         self._mice_state = fresh_state(len(rig.mouse), BIAS_STD)
-        self._tangent = None if self._is_ukf else np.zeros(1, TANGENT).view(np.recarray)
-        self._points = np.zeros(1, SIGMA).view(np.recarray) if self._is_ukf else None
+        self._tangent = None if self._is_ukf else zeros(1, TANGENT)
+        self._points = zeros(1, SIGMA) if self._is_ukf else None
         self.state = fresh_planar_state(len(rig.mouse), self.planar, rig.imu.gyro_noise_rad_s**2)
 
     @property
@@ -128,7 +129,7 @@ class _PlanarFilter:
 
     def process(self, block: Measurements) -> Floats:
         """x, y, heading (in [−π, π)), v_x, v_y, ω and their standard deviations at each of the N samples: (N, 12)."""
-        out = np.empty(len(block), ESTIMATE).view(np.recarray)
+        out = np.empty(len(block), ESTIMATE)
         process(
             sample_records(block, self._rig.imu), self._parameters, self._planar, self._placed, self._mice,
             self._mice_state, self._tangent, self._points, self.state, out,

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from linkpose.filters._records import zeros
 from linkpose.filters.mice.state import MOST
 
 
@@ -169,7 +170,7 @@ class PlanarParameters(NamedTuple):
 
 def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
     """An array of one state record before the first sample."""
-    records = np.zeros(1, STATE).view(np.recarray)
+    records = zeros(1, STATE)
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
     state.gyro_variance, state.gyro_samples = gyro_variance, 20.0
