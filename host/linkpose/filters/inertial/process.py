@@ -15,6 +15,7 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
+    LONGEST_BLIND_S,
     ImuCalibration,
     ImuSamples,
     blind_for,
@@ -71,8 +72,6 @@ from linkpose.filters.inertial.update import sub_covariance
 
 # Least interval between two updates (s). A faster pace gains nothing: what the models leave over is correlated.
 _UPDATE_INTERVAL_S = 0.035
-# Without a rate for longer, a moving link has turned by more than its tilt can be guessed to: align to gravity anew.
-_LONGEST_BLIND_S = 0.3
 # Identical readings for less than this are one reading of a slower sensor, held by the logger (s).
 LONGEST_HOLD_S = 0.1
 _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
@@ -113,7 +112,7 @@ def process(
         if good and first and math.isfinite(time_s):
             _begin(s, force, rate, noisy, q)
             _take_sample(s, time_s, force, rate)
-        elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
+        elif good and max(h, s.blind_s) > LONGEST_BLIND_S and h < math.inf:
             _bridge(s, h, rate, noisy)
             _align(s, force, rate, noisy, q)
             _take_sample(s, time_s, force, rate)
@@ -258,7 +257,7 @@ def _advance(
 @inner
 def _turn(s: Record, step: float, has_rate: bool, rate: Vec, jumped: bool, imu: ImuCalibration) -> None:
     """Sum the rotation, gyro bias included, up to a new rate, and its variance."""
-    s.blind_s = blind_for(s.blind_s, step, has_rate, _LONGEST_BLIND_S)
+    s.blind_s = blind_for(s.blind_s, step, has_rate, LONGEST_BLIND_S)
     newest = vec.load(s.newest_rate)
     angle = vec.axpy(0.5 * step, newest, vec.load(s.angle))
     vec.store(s.angle, vec.axpy(0.5 * step, newest if jumped else rate, angle))
