@@ -3,7 +3,8 @@
     python tests/bench/chains.py [--data FOLDER] [--only TEXT] [--json]
 
 FOLDER (../shared/data beside the checkout) holds diodem_chain, openaxes_robot and mpu6050_encoder, each as its authors
-published it; a missing one is named and skipped. Our filter is causal and is given the kind of the joint alone.
+published it; a missing one is named and skipped. Our filter is causal and is given the kind of the joint alone;
+`chain --smooth` uses the whole recording.
 
 Peers: two VQF without and with a magnetometer (`vqf_6d`, `vqf_9d`), and for hinges qmt's heading correction of the
 former, with windows that end at the estimate (`qmt_causal`) or lie around it (`qmt_batch`); both use axes that qmt
@@ -146,7 +147,7 @@ class Found(NamedTuple):
     sample_us: float
 
 
-def ours(case: Case) -> Found:
+def ours(case: Case, smooth: bool) -> Found:
     """The chain filter, with nothing known but the kind of the joint."""
     accel, gyro = case.pair.accel_m_s2, case.pair.gyro_rad_s
     measured = lp.Measurements.from_imu(
@@ -154,7 +155,7 @@ def ours(case: Case) -> Found:
     )
     began = time.perf_counter()
     joint = "hinge" if case.joint == "hinge" else "ball"
-    estimates = lp.estimate(measured, filters=["chain"], joint=joint)
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint, smooth=smooth)
     took = time.perf_counter() - began
     quaternion = np.column_stack([estimates[f"chain_q{axis}"] for axis in "wxyz"])
     return Found(quaternion, estimates["chain_rotation_std_deg"], 1e6 * took / len(accel))
@@ -274,7 +275,8 @@ def scores(case: Case, found: Found) -> dict[str, object]:
 def rows(case: Case) -> Iterator[dict[str, object]]:
     """The scores of each filter on a pair of sensors."""
     about = {"set": case.data, "data": case.name, "joint": case.joint, "chosen_on": case.chosen_on}
-    yield {**about, "filter": "chain", **scores(case, ours(case))}
+    yield {**about, "filter": "chain", **scores(case, ours(case, smooth=False))}
+    yield {**about, "filter": "chain --smooth", **scores(case, ours(case, smooth=True))}
     for name, found in peers(case):
         yield {**about, "filter": name, **scores(case, found)}
 

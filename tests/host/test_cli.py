@@ -195,7 +195,7 @@ def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
     recording = tmp_path / "r.csv"
     linkpose("record", recording, "--port", SIM, "--duration", 1)
     done = linkpose("estimate", recording, "--smooth", "--filter", "tilt")
-    assert done.status == 2 and "no filter that can be smoothed (joint-inertial) runs" in done.err
+    assert done.status == 2 and "no filter that can be smoothed (joint-inertial, chain) runs" in done.err
     recording.write_text(re.sub(r'"joint": \{.*?\}, ', "", recording.read_text()))
     done = linkpose("estimate", recording, "--smooth", "-o", tmp_path / "e.csv")
     assert done.status == 2 and "joint-inertial needs J2S" in done.err

@@ -12,6 +12,7 @@ from linkpose.errors import InvalidValue
 from linkpose.filters.chain import ChainFilter
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Chain, Rig
+from linkpose.simulation.chain import ChainRun
 
 RATE_HZ, SECONDS = 100.0, 30.0
 R1, R2 = np.array([0.05, -0.02, -0.20]), np.array([-0.03, 0.04, 0.15])
@@ -133,3 +134,55 @@ def test_a_long_gap_blanks_and_keeps_the_mounting() -> None:
 def test_an_unknown_joint_is_refused() -> None:
     with pytest.raises(InvalidValue, match='must be "ball" or "hinge"'):
         lp.estimate(_chain("ball")[0][:10], filters=["chain"], joint="slider")  # type: ignore[arg-type]
+
+
+def test_the_smoother_is_better_than_the_filter_and_its_std_holds() -> None:
+    measured, truth, angle = _chain("hinge")
+    filtered = lp.estimate(measured, filters=["chain"], joint="hinge")
+    smoothed = lp.estimate(measured, filters=["chain"], joint="hinge", smooth=True)
+    early = (measured.time_s > 2.5) & (measured.time_s < 8)
+    error = _error_deg(smoothed, truth)
+    assert np.isfinite(error).all()  # from the first sample on
+    assert np.sqrt(np.mean(error[early] ** 2)) < 0.8 * np.sqrt(np.nanmean(_error_deg(filtered, truth)[early] ** 2))
+    assert np.mean(error < 2 * smoothed["chain_rotation_std_deg"]) > 0.9
+    turned = smoothed["chain_angle_deg"]
+    assert min(np.std(sign * turned - angle) for sign in (1, -1)) < 0.6
+
+
+def test_the_angle_of_a_vertical_hinge_does_not_drift_between_its_end_stops() -> None:
+    n = round(120 * RATE_HZ)
+    t = np.arange(n) / RATE_HZ
+    phase = (t / 6) % 1
+    angle = np.pi * np.where(phase < 0.5, 2 * phase, 2 - 2 * phase)
+    rate = np.gradient(angle, t)
+    rng, up, z = np.random.default_rng(1), [0.0, 0.0, STANDARD_GRAVITY], np.eye(3)[2]
+    force1, force2 = (up + 0.04 * rng.standard_normal((n, 3)) for _ in range(2))
+    gyro1, gyro2 = (0.0009 * rng.standard_normal((n, 3)) for _ in range(2))
+    gyro2 += np.outer(rate + 0.002, z)  # 0.11 °/s: 14° in two minutes
+    measured = lp.Measurements.from_imu(t, force1, gyro1, accel2_m_s2=force2, gyro2_rad_s=gyro2)
+    found = np.radians(lp.estimate(measured, filters=["chain"], joint="hinge")["chain_angle_deg"])
+    late = t > 60
+    error = min((np.unwrap(sign * found[late]) - np.unwrap(angle[late]) for sign in (1, -1)), key=np.std)
+    assert np.degrees(np.std(error)) < 1.0
+
+
+def test_heights_over_a_fixed_first_joint_with_unknown_mounting() -> None:
+    run = ChainRun("hinge", 0, 40.0)
+    measured = run.measurements()
+    truth, late = run.truth_columns(measured.time_s), measured.time_s > 20
+    estimates = lp.estimate(measured, filters=["chain"], rig=run.rig)
+    for k in (1, 2):
+        error = (estimates[f"chain_height{k}_m"] - truth[f"height{k}_m"])[late]
+        assert np.sqrt(np.mean(error**2)) < 0.01
+        assert np.mean(np.abs(error) < 2 * estimates[f"chain_height{k}_std_m"][late]) > 0.9
+
+
+def test_a_first_rest_gives_the_gyro_biases_of_the_data_sheet() -> None:
+    measured, truth, _ = _chain("ball")  # which rests for a second
+    bias = np.radians([[12.0, -15.0, 8.0], [-9.0, 14.0, 18.0]])
+    measured = lp.Measurements.from_imu(
+        measured.time_s, measured.accel_m_s2, measured.gyro_rad_s + bias[0],
+        accel2_m_s2=measured.accel2_m_s2, gyro2_rad_s=measured.gyro2_rad_s + bias[1],
+    )  # fmt: skip
+    error = _error_deg(lp.estimate(measured, filters=["chain"]), truth)[measured.time_s > 15]
+    assert np.sqrt(np.mean(error**2)) < 1.5

@@ -55,3 +55,14 @@ def test_shaking_does_not_shrink_the_accelerometers_matrix():
     error = made.tilt_error_deg(f.process(made.block())[:, 2:4])
     assert np.abs(f.state.nominal[MA:MG]).max() < 0.001
     assert np.sqrt(np.mean(error[3000:] ** 2)) < 0.5
+
+
+def test_a_fast_turn_is_no_spike():
+    """±14 rad/s at 2 Hz: the rate changes by 1.8 rad/s from one sample to the next."""
+
+    def rate(t):
+        return min(max(t - 2.0, 0.0), 1.0) * np.array([14 * np.sin(12.6 * t), 5 * np.sin(9 * t), 10 * np.cos(11 * t)])
+
+    made = motion(20.0, rate, lambda time_s: np.column_stack([3 * np.sin(8 * time_s)] * 3) * (time_s > 2.0)[:, None])
+    error = made.tilt_error_deg(TiltInertialFilter(Rig()).process(made.block())[:, 2:4])
+    assert np.sqrt(np.mean(error**2)) < 0.7

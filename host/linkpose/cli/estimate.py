@@ -68,7 +68,9 @@ class Request:
     help="Run this filter; may be repeated. Default: every filter that the sensors and the rig support.",
 )
 @click.option(
-    "--smooth", is_flag=True, help="Use the smoother of joint-inertial, which also uses later samples; recordings only."
+    "--smooth",
+    is_flag=True,
+    help="Use the smoothers of joint-inertial and chain, with later samples; recordings only.",
 )
 @options.rig_and_j2s
 @click.option(

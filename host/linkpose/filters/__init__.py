@@ -31,7 +31,7 @@ class Capabilities:
     j2s: Literal["none", "guess", "known"] = "none"
     needs_mice: bool = False
     is_odometric: bool = False  # its pose is relative to the robot's pose at the first sample
-    smoother: str | None = None  # class in linkpose.filters.smoother that replaces it for a whole recording
+    smoother: str | None = None  # module below linkpose.filters and class that replace it for a whole recording
 
     @property
     def is_barometric(self) -> bool:
@@ -44,12 +44,12 @@ _IMU, _ANY = Sensors.MPU6050, Sensors(0)
 # Best first: the order of columns, tables and legends.
 REGISTRY: dict[str, Capabilities] = {
     "joint-inertial": Capabilities(
-        "joint_inertial", "JointInertialFilter", _IMU, "guess", smoother="JointInertialSmoother"
+        "joint_inertial", "JointInertialFilter", _IMU, "guess", smoother="smoother.JointInertialSmoother"
     ),
     "tilt-inertial": Capabilities("tilt_inertial", "TiltInertialFilter", _IMU),
     "joint": Capabilities("joint", "JointFilter", _IMU, "known"),
     "tilt": Capabilities("tilt", "TiltFilter", _IMU),
-    "chain": Capabilities("chain", "ChainFilter", _IMU | Sensors.IMU2),
+    "chain": Capabilities("chain", "ChainFilter", _IMU | Sensors.IMU2, smoother="chain.smoother.ChainSmoother"),
     "imu-baro": Capabilities("imu_baro", "ImuBaroFilter", _IMU | Sensors.BMP180),
     "baro": Capabilities("baro", "BaroFilter", Sensors.BMP180),
     "planar-ekf": Capabilities("planar", "PlanarEkf", _ANY, needs_mice=True, is_odometric=True),
@@ -120,10 +120,11 @@ def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_
 
 def create_smoother(name: str, rig: Rig) -> Filter:
     """The smoother named in a filter's capabilities; it replaces the filter and processes one whole recording."""
-    cls = REGISTRY[name].smoother
-    if cls is None:
+    smoother = REGISTRY[name].smoother
+    if smoother is None:
         raise CannotRun(f"{name} has no smoother")
-    made: Filter = getattr(importlib.import_module("linkpose.filters.smoother"), cls)(rig)
+    module, _, cls = smoother.rpartition(".")
+    made: Filter = getattr(importlib.import_module(f"linkpose.filters.{module}"), cls)(rig)
     return made
 
 

@@ -81,7 +81,8 @@ class InertialParameters(NamedTuple):
     least_speed_m_s: float = 0.1  # σ at rest
     most_speed_m_s: float = 2.0  # σ of a throwing arm
     swing_time_s: float = 1.0  # over which acceleration is integrated to measure σ (s)
-    speed_memory_s: float = 2.0  # over which the result is averaged (s)
+    # Over which the result is averaged (s): some swings. At 2 s a chain of links is 5 % worse, BROAD the same.
+    speed_memory_s: float = 5.0
     # A squared velocity beyond this many times its expected mean square shows a covariance that is too small.
     suspect: float = 6.0
     grow_s: float = 1.0  # in which a covariance that is too small grows e-fold (s)
@@ -127,7 +128,7 @@ class JointInertialFilter:
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
         self._states = [
-            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
+            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES
         ]
         self._imu = ImuCalibration.of(rig.imu)
 

@@ -38,6 +38,15 @@ _HEIGHT, _STD, _ROLL, _PITCH, _YAW, _X, _Y, _Z, _ROLL_STD, _PITCH_STD, _Z_STD = 
 )  # fmt: skip
 
 
+# Arrays of measurements, the flag of a saturated reading, and the sign with time reversed; the first sensor's first.
+_READINGS = (
+    ("accel_m_s2", SampleFlags.ACCEL_SATURATED, 1.0),
+    ("gyro_rad_s", SampleFlags.GYRO_SATURATED, -1.0),
+    ("accel2_m_s2", SampleFlags.ACCEL2_SATURATED, 1.0),
+    ("gyro2_rad_s", SampleFlags.GYRO2_SATURATED, -1.0),
+)
+
+
 class JointInertialSmoother:
     """The smoother over one whole recording; its columns are those of the filter."""
 
@@ -66,31 +75,29 @@ class JointInertialSmoother:
         """
         self._ahead = JointInertialFilter(self._rig)
         self._ahead.process(block)
-        forward, backward = JointInertialFilter(self._rig), JointInertialFilter(_reversed_rig(self._rig))
+        forward, backward = JointInertialFilter(self._rig), JointInertialFilter(reversed_rig(self._rig))
         forward.start_from(self._ahead)
         backward.start_from(self._ahead, backwards=True)
-        after = backward.process(_reversed(block))[::-1]
+        after = backward.process(reversed_in_time(block))[::-1]
         return _combined(forward.process(block), after, *self.j2s_m)
 
 
-def _reversed_rig(rig: Rig) -> Rig:
+def reversed_rig(rig: Rig) -> Rig:
     x, y, z = rig.imu.gyro_bias_rad_s
     bias: Vector = (-x, -y, -z)
     return replace(rig, imu=replace(rig.imu, gyro_bias_rad_s=bias, delay_s=-rig.imu.known_delay_s))
 
 
-def _reversed(block: Measurements) -> Measurements:
-    """The recording with time reversed. Only the arrays that the filter reads are changed."""
-    at_accel, at_gyro = (_next_reading(block.time_s, v) for v in (block.accel_m_s2, block.gyro_rad_s))
-    accel, gyro = block.accel_m_s2[at_accel], block.gyro_rad_s[at_gyro]
-    accel_bit, gyro_bit = np.uint32(SampleFlags.ACCEL_SATURATED), np.uint32(SampleFlags.GYRO_SATURATED)
-    flags = block.flags & ~(accel_bit | gyro_bit) | block.flags[at_accel] & accel_bit | block.flags[at_gyro] & gyro_bit
+def reversed_in_time(block: Measurements) -> Measurements:
+    """The recording with time reversed. Only the arrays that inertial filters read are changed."""
+    flags, arrays = block.flags.copy(), {}
+    for name, bit, sign in _READINGS[: 4 if block.has_imu2 else 2]:
+        values = getattr(block, name)
+        at = _next_reading(block.time_s, values)
+        arrays[name] = np.ascontiguousarray(sign * values[at][::-1])
+        flags = flags & ~np.uint32(bit) | block.flags[at] & np.uint32(bit)
     return replace(
-        block,
-        time_s=np.ascontiguousarray(-block.time_s[::-1]),
-        accel_m_s2=np.ascontiguousarray(accel[::-1]),
-        gyro_rad_s=np.ascontiguousarray(-gyro[::-1]),
-        flags=np.ascontiguousarray(flags[::-1]),
+        block, time_s=np.ascontiguousarray(-block.time_s[::-1]), flags=np.ascontiguousarray(flags[::-1]), **arrays
     )
 
 

@@ -118,12 +118,6 @@ class TextTable:
             self.closing = last_comment(lines, self._before) or self.closing
             return None
         cells = split_cells(self._path, chunk.data, self._before, chunk.first_line)
-        if cells.names != self.names:
-            raise FileFormatError(
-                self._path,
-                f"{self._path}, line {cells.lines[0]}: the columns differ from those before; the file was edited",
-                cells.lines[0],
-            )
         return self._part_of(cells)
 
     def _part_of(self, cells: Cells) -> Part:

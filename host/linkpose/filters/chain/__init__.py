@@ -19,7 +19,19 @@ from numpy.typing import NDArray
 from linkpose.filters._imu import ImuSamples
 from linkpose.filters._records import record_of
 from linkpose.filters.chain.process import process
-from linkpose.filters.chain.state import ESTIMATE, ChainParameters, Floats, fresh_bank, fresh_states
+from linkpose.filters.chain.state import (
+    AXES,
+    BG,
+    ESTIMATE,
+    OF_SENSOR,
+    START,
+    TH,
+    ChainParameters,
+    Floats,
+    V,
+    fresh_bank,
+    fresh_states,
+)
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -71,6 +83,11 @@ class ChainFilter:
         return int(np.count_nonzero(self._states["alive"]))
 
     @property
+    def knows_heading(self) -> bool:
+        """Whether the motion has given the relative heading."""
+        return bool(self._bank[0].spread) and self.hypotheses == 1
+
+    @property
     def state(self) -> Any:
         """The record (fields of `state.STATE`) of the most probable hypothesis."""
         return self._states[self._bank[0].best]
@@ -85,21 +102,31 @@ class ChainFilter:
 
         Gyro biases drift: only reversed time begins with those of the other filter's end.
         """
-        other = learned.state
+        other, hinge = learned.state, int(self._bank[0].hinge)
+        not_constant = {TH, V, OF_SENSOR + TH, OF_SENSOR + V}
+        if not backwards:
+            not_constant |= {BG, OF_SENSOR + BG}
+        if hinge >= 0:
+            not_constant |= {hinge + START, hinge + START + 3}
+            if not learned.knows_heading:  # the axis in sensor 1's axes depends on it
+                not_constant |= {hinge + AXES, hinge + AXES + 3}
         for state in self._states:
-            for name in ("accel_bias", "lever", "axis", "lever0", "has_axis"):
+            for name in ("accel_bias", "lever", "lever0"):
                 setattr(state, name, getattr(other, name))
-            for first in range(0, self.size, 3):
-                is_gyro = first in (6, 21)
-                if first in (0, 3, 15, 18, self._bank[0].hinge) or (is_gyro and not backwards):
-                    continue
-                at = slice(first, first + 3)
-                state.covariance[at, at] = other.covariance[at, at]
+            if learned.knows_heading:
+                state.axis, state.has_axis = other.axis, other.has_axis
             if backwards:
                 state.gyro_bias = -other.gyro_bias
+            for first in set(range(0, self.size, 3)) - not_constant:
+                at = slice(first, first + 3)
+                state.covariance[at, at] = other.covariance[at, at]
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, len(columns)); NaN where not known yet."""
+        return self.table(self.estimates(block))
+
+    def estimates(self, block: Measurements) -> NDArray[Any]:
+        """Estimates at each of the N samples as records of `state.ESTIMATE` (N,); NaN where not known yet."""
         estimates = np.empty(len(block), ESTIMATE)
         # A sensor that is absent has arrays without memory of their own.
         accel2, gyro2 = np.ascontiguousarray(block.accel2_m_s2), np.ascontiguousarray(block.gyro2_rad_s)
@@ -108,9 +135,9 @@ class ChainFilter:
             ImuSamples.of(block), second, self._calibration, self._bank, self._states, self._record, self._noise,
             estimates,
         )  # fmt: skip
-        return self._table(estimates)
+        return estimates
 
-    def _table(self, found: NDArray[Any]) -> Floats:
+    def table(self, found: NDArray[Any]) -> Floats:
         """Records of ESTIMATE (N,) as columns."""
         table = np.empty((len(found), len(self.columns)))
         table[:, :4] = found["q"]

@@ -103,13 +103,15 @@ def _horizontal_variance(s: Record, size: int, hinge: int) -> float:
 
 @inner
 def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
-    """Apply the constraint, `h` (s) after the last time. Returns its log likelihood."""
+    """Apply the constraint, `h` (s) after the last time. Returns its log likelihood, at most 0."""
     rotate(s.rotation[0], s.axis[0], s.a)
     rotate(s.rotation[1], s.axis[1], s.b)
     variance = q.play_correlation * max(s.play_square, q.least_play_rad**2)
     uncertain = _horizontal_variance(s, size, hinge)
     across = s.b[0] ** 2 + s.b[1] ** 2
     heading_share = min(max(across / (_CLEAR_AXIS * uncertain) - 1, 0.0), 1.0)
+    # A hypothesis without an axis yet has no such term, so it is relative to the density of a fit to `first_play_rad`.
+    density = 0.5 * math.log(q.play_correlation * q.first_play_rad**2)
     likelihood = found = expected = 0.0
     for row in range(3):
         clear_row(s)
@@ -126,7 +128,7 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
         value = s.a[row] - s.b[row]
         found += value * value
         expected += expected_square(s, size)
-        likelihood += update(s, size, -value, variance, q.huber)[0]
+        likelihood += min(update(s, size, -value, variance, q.huber)[0] + density, 0.0)
     s.play_square += min(h / q.play_s, 1.0) * (max(found - expected, 0.0) / 2 - s.play_square)
     return likelihood
 

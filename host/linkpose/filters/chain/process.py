@@ -91,37 +91,40 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             _begin_start(s, bank.length, bank.hinge)
     bank.begun, bank.spread, bank.best = 1, 0, 0
     if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
-        _spread(bank, states, gyro, q)
+        _spread(bank, states, 0.0, gyro, q)
 
 
 @inner
-def _spread(bank: Record, states: Record, gyro: Floats, q: Record) -> None:
+def _spread(bank: Record, states: Record, axis_turns: float, gyro: Floats, q: Record) -> None:
     """From now on the heading can be found: copies of the one filter, with headings of sensor 2 all around."""
     count = states.shape[0]
     for i in range(count - 1, -1, -1):
         if i > 0:
             states[i] = states[0]
-        _turn_link(states[i], bank, 2 * math.pi * i / count, gyro, q)
+        _turn_link(states[i], bank, 2 * math.pi * i / count, axis_turns, gyro, q)
     bank.spread = 1
 
 
 @inner
-def _turn_link(s: Record, bank: Record, heading: float, gyro: Floats, q: Record) -> None:
-    """Turn link 2 by `heading` (rad); its velocity is forgotten and follows from the joint."""
+def _turn_link(s: Record, bank: Record, heading: float, axis_turns: float, gyro: Floats, q: Record) -> None:
+    """Turn link 2 by `heading` (rad); its velocity is forgotten and follows from the joint.
+
+    `axis_turns` 1: the axis in sensor 1's axes was found with the former heading and turns, too.
+    """
     p, size, hinge, m = s.covariance, bank.length, bank.hinge, s.m
     turn(s.attitude[1], 0.0, 0.0, heading, 1.0)
     to_matrix(s.attitude[1], s.rotation[1])
     _about(s.rotation[0, 2], heading, m)
-    if hinge >= 0:
+    if hinge >= 0 and axis_turns > 0.0:
         rotate(m, s.axis[0], s.a)
         for i in range(3):
             s.axis[0, i] = s.a[i]
         _turn_block(p, size, hinge + AXES, m, s.a, s.b)
-        turn(s.start[1], 0.0, 0.0, heading, 1.0)
     s.a[0], s.a[1], s.a[2] = 0.0, 0.0, 1.0
     _about(s.a, heading, m)
     _turn_block(p, size, OF_SENSOR, m, s.a, s.b)
     if hinge >= 0:
+        turn(s.start[1], 0.0, 0.0, heading, 1.0)
         _turn_block(p, size, hinge + START + 3, m, s.a, s.b)
     for k in range(2):
         for i in range(3):
@@ -281,10 +284,12 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     for i in range(4):
         known = out.rotation_std < q.unknown_rad or best.has_axis > 0.0
         out.q[i] = sign * best.relative[i] if known else math.nan
-    if hinge >= 0:
+    out.angle = out.angle_std = math.nan
+    if hinge >= 0 and best.has_axis > 0.0:
         _report_angle(best, states, out)
-    if base >= 0:
-        for k in range(2):
+    for k in range(2):
+        out.height[k] = out.height_std[k] = math.nan
+        if base >= 0:
             out.height[k], out.height_std[k] = _height(best, k, size, base)
     for k in range(2):
         for i in range(3):
@@ -309,9 +314,6 @@ def _report_covariance(s: Record, out: Record) -> None:
 
 @inner
 def _report_angle(best: Record, states: Record, out: Record) -> None:
-    out.angle = out.angle_std = math.nan
-    if best.has_axis == 0.0:
-        return
     weights = mean = square = 0.0
     first = hinge_angle(best)
     for i in range(states.shape[0]):
@@ -415,7 +417,7 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
         bank.since_update = 0.0
         _select(bank, states, q)
         if not bank.spread and states[0].heading_share > 0.0:
-            _spread(bank, states, gyro, q)
+            _spread(bank, states, 1.0, gyro, q)
 
 
 @inner

@@ -1,0 +1,140 @@
+"""`chain` over a whole recording: each estimate from the samples before it and from those after it.
+
+The scheme is that of `linkpose.filters.smoother`: a first pass estimates mounting and sensor errors, then one filter
+runs forwards and one backwards from these. At each sample their relative rotations are weighted by their covariances,
+
+    φ = P_f (P_f + P_b)⁻¹ log(q_f⁻¹ q_b),   q = q_f exp(φ),   P = P_f − P_f (P_f + P_b)⁻¹ P_f
+
+and hinge angle and heights by their variances.
+
+Source: D. C. Fraser, J. E. Potter, "The optimum linear smoother as a combination of two optimum linear filters", IEEE
+Trans. Automatic Control 14(4), 1969.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from linkpose.filters.chain import ChainFilter
+from linkpose.filters.smoother import reversed_in_time, reversed_rig
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Rig
+
+# Both filters begin with the same mounting and sensor errors, so that their errors have a common part: the variance of
+# the mean is no less than this share of the smaller one.
+_COMMON = 0.7
+_KNOWN_RAD = 1.0  # σ of a relative rotation beyond which its heading is unknown
+
+
+class ChainSmoother:
+    """The smoother over one whole recording; its columns are those of the filter."""
+
+    name = ChainFilter.name
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._ahead = ChainFilter(rig)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return self._ahead.columns
+
+    @property
+    def rejected(self) -> int:
+        """Number of samples in the first pass at which a sensor had no usable reading."""
+        return self._ahead.rejected
+
+    def process(self, block: Measurements) -> Floats:
+        """Estimates at each of the N samples: (N, len(columns)). The block is a whole recording."""
+        self._ahead = ChainFilter(self._rig)
+        self._ahead.estimates(block)
+        forward, backward = ChainFilter(self._rig), ChainFilter(reversed_rig(self._rig))
+        forward.start_from(self._ahead)
+        backward.start_from(self._ahead, backwards=True)
+        before, after = forward.estimates(block), backward.estimates(reversed_in_time(block))[::-1]
+        return forward.table(_combined(before, after))
+
+
+def _combined(before: Any, after: Any) -> Any:
+    """The mean of two estimates (N,) of `state.ESTIMATE`; that of one where the other is NaN."""
+    out = before.copy()
+    p, other = _covariance(before), _covariance(after)
+    known, other_known = (np.isfinite(each["q"]).all(axis=1) for each in (before, after))
+    # Two rotations with unknown headings have no mean: the surer one stands.
+    both = known & other_known & (np.maximum(before["rotation_std"], after["rotation_std"]) < _KNOWN_RAD)
+    apart = _logarithm(_product(before["q"] * [1, -1, -1, -1], after["q"]))[both]
+    gain = p[both] @ np.linalg.inv(p[both] + other[both])
+    out["q"][both] = _product(before["q"][both], _exponential(np.einsum("nij,nj->ni", gain, apart)))
+    out["q"] *= np.where(out["q"][:, :1] < 0, -1, 1)
+    left = np.trace(p[both] - gain @ p[both], axis1=1, axis2=2)
+    least = _COMMON * np.minimum(before["rotation_std"], after["rotation_std"])[both] ** 2
+    out["rotation_std"][both] = np.sqrt(np.maximum(left, least))
+    only = ~both & other_known & (~known | (after["rotation_std"] < before["rotation_std"]))
+    for name in ("q", "rotation_std"):
+        out[name][only] = after[name][only]
+    _combine_angles(out, after)
+    for k in range(2):  # NaN without a fixed first joint
+        _combine(out["height"][:, k], out["height_std"][:, k], after["height"][:, k], after["height_std"][:, k])
+    return out
+
+
+def _covariance(found: Any) -> Floats:
+    """Covariances (N, 3, 3) of the relative rotation that amount to its σ, which includes other hypotheses."""
+    trace = np.trace(found["covariance"], axis1=1, axis2=2)
+    scale: Floats = np.square(found["rotation_std"]) / np.where(trace > 0, trace, 1.0)
+    return np.asarray(scale[:, None, None] * found["covariance"] + 1e-12 * np.eye(3))
+
+
+def _combine_angles(out: Any, after: Any) -> None:
+    """The hinge angle. That of the filter backwards counts from the last sample, so its mean is fitted first.
+
+    Where the heading is unknown, the filters may also have found opposite senses of the axis.
+    """
+    angle, std = after["angle"].copy(), after["angle_std"]
+    both = np.isfinite(out["angle"]) & np.isfinite(angle)
+    if both.any():
+        weight = 1 / (out["angle_std"][both] ** 2 + std[both] ** 2 + 1e-12)
+        fits = [np.sum(weight * np.exp(1j * (out["angle"][both] - sense * angle[both]))) for sense in (1, -1)]
+        sense = 1 if abs(fits[0]) >= abs(fits[1]) else -1
+        angle = sense * angle + np.angle(fits[0 if sense > 0 else 1])
+        angle[both] = out["angle"][both] - _wrapped(out["angle"][both] - angle[both])
+    _combine(out["angle"], out["angle_std"], angle, std)
+    out["angle"] = _wrapped(out["angle"])
+
+
+def _combine(mean: Floats, std: Floats, other: Floats, other_std: Floats) -> None:
+    """Means and σ (N,) become those of both estimates."""
+    only = ~np.isfinite(mean)
+    mean[only], std[only] = other[only], other_std[only]
+    both = ~only & np.isfinite(other)
+    before, after = np.square(std[both]), np.square(other_std[both])
+    share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
+    mean[both] = share * mean[both] + (1 - share) * other[both]
+    std[both] = np.sqrt(np.maximum(share * before, _COMMON * np.minimum(before, after)))
+
+
+def _wrapped(angle: Floats) -> Floats:
+    return np.asarray(angle - 2 * math.pi * np.floor((angle + math.pi) / (2 * math.pi)))
+
+
+def _product(a: Floats, b: Floats) -> Floats:
+    """Quaternions (N, 4) wxyz a b."""
+    w, v = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True), np.cross(a[:, 1:], b[:, 1:])
+    return np.hstack([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + v])
+
+
+def _logarithm(q: Floats) -> Floats:
+    """Rotation vectors (N, 3) of unit quaternions, rad."""
+    q = q * np.where(q[:, :1] < 0, -1, 1)
+    size = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(size, q[:, :1])
+    return np.asarray(q[:, 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0))
+
+
+def _exponential(v: Floats) -> Floats:
+    """Unit quaternions (N, 4) of rotation vectors."""
+    angle = np.linalg.norm(v, axis=1, keepdims=True)
+    return np.hstack([np.cos(angle / 2), v * 0.5 * np.sinc(angle / (2 * math.pi))])

@@ -1,0 +1,341 @@
+"""Each message in the tables of the documentation is produced here, and each sentence of these parts is in a table."""
+
+from __future__ import annotations
+
+import ast
+import errno
+import os
+import re
+import socket
+import sys
+from binascii import crc_hqx
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import serial
+from cobs import cobs
+from pty_board import PtyBoard
+
+from linkpose import errors, plotting
+from linkpose.cli.cures import CURES, sentence
+from linkpose.convert import convert
+from linkpose.device import ports, session
+from linkpose.device.ports import PortInfo
+from linkpose.errors import LinkposeError
+from linkpose.estimation import Estimator, estimate
+from linkpose.evaluation.scores import evaluate
+from linkpose.recording import chunks
+from linkpose.recording.csvfile import CsvFile, create, write_all
+from linkpose.recording.reader import load_recording
+from linkpose.recording.table import read_table
+from linkpose.sensors.devices import Sensors
+from linkpose.sensors.rig import Rig
+from linkpose.simulation import board
+from linkpose.simulation.link import LinkRun
+from linkpose.streams import open_output
+from linkpose.wire.frames import encode
+from linkpose.wire.messages import Hello
+
+PACKAGE = Path(errors.__file__).parent
+PAGE = PACKAGE.parent / "docs" / "messages.md"
+T = np.arange(40) / 10
+IMU = "time_s,accel_x_m_s2,accel_y_m_s2,accel_z_m_s2,gyro_x_rad_s,gyro_y_rad_s,gyro_z_rad_s"
+ROW = "0,0,9.8,0,0,0"
+UNO = PortInfo("/dev/ttyACM0", "Arduino Uno", 0x2341, 0x0043, "55", True, False)
+Producer = Callable[[Path, pytest.MonkeyPatch], object]
+
+
+def table(text: str, kind: str | None = None, name: str = "a.csv") -> Producer:
+    return lambda folder, _: read_table(written(folder / name, text), kind)
+
+
+def recording(text: str | bytes, name: str = "a.csv") -> Producer:
+    return lambda folder, _: load_recording(written(folder / name, text))
+
+
+def written(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+def rig(text: str) -> Producer:
+    return lambda folder, _: Rig.load(written(folder / "rig.toml", text))
+
+
+def scored(ours: str, theirs: str) -> Producer:
+    def run(folder: Path, _: pytest.MonkeyPatch) -> object:
+        return evaluate(
+            *(read_table(written(folder / name, text)) for name, text in (("e.csv", ours), ("t.csv", theirs)))
+        )
+
+    return run
+
+
+def rows(names: str, start: float = 0.0) -> str:
+    width = names.count(",")
+    body = [f"{t:.2f}" + f",{np.sin(3 * t):.4f}" * width for t in T + start]
+    return names + "\n" + "\n".join(body) + "\n"
+
+
+def parquet(columns: list[str]) -> Producer:
+    def run(folder: Path, _: pytest.MonkeyPatch) -> object:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        values = ["a" if name == "word" else 0.0 for name in columns]
+        pq.write_table(pa.Table.from_arrays([pa.array([v]) for v in values], columns), folder / "a.parquet")
+        return read_table(folder / "a.parquet")
+
+    return run
+
+
+def to_full_disk(folder: Path, _: pytest.MonkeyPatch) -> object:
+    return CsvFile(Path("/dev/full"), "recording", {}, ["time_s"], force=True)
+
+
+def to_closed_pipe(folder: Path, _: pytest.MonkeyPatch) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        write_all(writing, folder / "pipe", b"1\n")
+    finally:
+        os.close(writing)
+
+
+def to_removed_file(folder: Path, _: pytest.MonkeyPatch) -> None:
+    with CsvFile(folder / "a.csv", "recording", {}, ["time_s"], force=False) as file:
+        (folder / "a.csv").unlink()
+        file.write("1\n")
+
+
+def with_long_line(folder: Path, patch: pytest.MonkeyPatch) -> object:
+    patch.setattr(chunks, "CHUNK_BYTES", 100)
+    return read_table(written(folder / "a.csv", "time_s,a\n0,1\n" + "9" * 500))
+
+
+def without_library(folder: Path, patch: pytest.MonkeyPatch) -> object:
+    patch.setitem(sys.modules, "pylsl", None)
+    return open_output("lsl:a", ["time_s"])
+
+
+def with_filter(name: str, rig: Rig, sensors: Sensors) -> Producer:
+    return lambda *_: Estimator([name] if name else [], rig, sensors)
+
+
+def unknown_filter(folder: Path, _: pytest.MonkeyPatch) -> object:
+    return estimate(LinkRun(duration_s=1.0).measurements(), ["join"])
+
+
+def choosing(*found: PortInfo) -> Producer:
+    def run(_: Path, patch: pytest.MonkeyPatch) -> object:
+        patch.delenv("LINKPOSE_PORT", raising=False)
+        patch.setattr(ports, "find_ports", lambda: list(found))
+        patch.setattr(ports, "devices_without_port", lambda: [])
+        return ports.choose_port()
+
+    return run
+
+
+def opening(name: str, error: OSError) -> Producer:
+    """The system's error where a port is opened."""
+
+    def run(_: Path, patch: pytest.MonkeyPatch) -> object:
+        def refuse(*_args: object, **_options: object) -> None:
+            raise serial.SerialException(error.errno, str(error))
+
+        patch.setattr(serial, "serial_for_url", refuse)
+        return ports.open_port(name)
+
+    return run
+
+
+def answering(chatter: bytes) -> Producer:
+    """A port at which nothing but this comes."""
+
+    def run(folder: Path, patch: pytest.MonkeyPatch) -> object:
+        patch.setattr(session, "HANDSHAKE_TIMEOUT_S", 0.4)
+        patch.setattr(session, "ASK_INTERVAL_S", 0.1)
+        with PtyBoard(folder / "port", spoil=lambda _: b"", chatter=chatter):
+            return session.Session(str(folder / "port"), print)
+
+    return run
+
+
+def hello_of_protocol(major: int) -> bytes:
+    payload = bytes([1, major, 0]) + bytes(40)
+    return cobs.encode(payload + crc_hqx(payload, 0xFFFF).to_bytes(2, "little")) + b"\0"
+
+
+def capture(hello: Hello | None, samples: int) -> bytes:
+    frames = [encode(s) for s in LinkRun(duration_s=1.0).samples()][:samples]
+    return (b"" if hello is None else encode(hello)) + b"".join(frames)
+
+
+def converting(text: str, name: str, wanted: str | None = None) -> Producer:
+    return lambda folder, _: convert(written(folder / "e.csv", text), folder / name, wanted)
+
+
+def serving(folder: Path, _: pytest.MonkeyPatch) -> object:
+    with socket.socket() as busy:
+        busy.bind(("127.0.0.1", 0))
+        busy.listen()
+        return open_output(f"ws://127.0.0.1:{busy.getsockname()[1]}", ["time_s"])
+
+
+HELLO = board.hello(board.DEFAULTS)
+NO_J2S, GUESS = Rig(), Rig.from_dict({"joint": {"j2s_m": [0, 0, 1], "j2s_std_m": 2.0}}, "a")
+ESTIMATE = "time_s,tilt_height_m,tilt_roll_deg,tilt_pitch_deg"
+# In the order of the page.
+PRODUCERS: list[Producer] = [
+    lambda folder, _: create(written(folder / "a", ""), False),
+    lambda folder, _: read_table(folder / "none.csv"),
+    lambda folder, _: create(folder / "no" / "a.csv", False),
+    to_removed_file,
+    to_full_disk,
+    to_closed_pipe,
+    lambda folder, _: plotting.check_output(folder / "a.xyz", False),
+    without_library,
+    # tables
+    table("# a comment alone\n"),
+    table("time_s,height_m\n"),
+    lambda folder, _: _without_rows(folder),
+    with_long_line,
+    table("0,1\n2,3\n"),
+    table("time_s;a;a\n0;1;2\n"),
+    parquet(["a", "a"]),
+    table("time_s;a\n0;1\n1;2;3\n"),
+    table("time_s,a\n0,5,1,5\n"),
+    table('time_s;a\n0;"1\n1;2\n'),
+    table("time_s;a\n0;tall\n"),
+    table("time_s;a\n0;01. Mai\n"),
+    table("time_s;a\n0,5;1.5\n"),
+    parquet(["word"]),
+    lambda folder, _: read_table(written(folder / "a.csv", "a,b\n1,2\n")).require("time_s"),
+    table("time_s,a\n,1\n"),
+    table("time_s,a\n1,1\n0,1\n"),
+    recording(f"{IMU}\n0,{ROW}\ninf,{ROW}\n"),
+    recording(f"{IMU}\n1,{ROW}\n1,{ROW}\n"),
+    table("time_s,a\n0,1e20\n"),
+    table("# linkpose estimate 1\n# {}\ntime_s,a\n0,1\n", "recording"),
+    table("# linkpose recording 9\n# {}\ntime_s,a\n0,1\n"),
+    table("# linkpose recording 1\n# {\ntime_s,a\n0,1\n"),
+    table("# linkpose recording 1\n# []\ntime_s,a\n0,1\n"),
+    recording(f'# linkpose recording 1\n# {{"settings": 3}}\n{IMU}\n0,{ROW}\n'),
+    lambda folder, _: (written(folder / "a.meta.json", "{}"), read_table(written(folder / "a.csv", "time_s\n0\n"))),
+    recording(f"{IMU},pressure_hPa\n0,{ROW},1\n"),
+    recording("time_s,accel_x_m_s2\n0,1\n"),
+    recording(f"{IMU},baro_fresh\n0,{ROW},2\n"),
+    recording(f"{IMU},flags\n0,{ROW},-1\n"),
+    # raw captures
+    recording(capture(None, 5), "a.bin"),
+    recording(capture(HELLO, 0), "a.bin"),
+    recording(capture(HELLO._replace(sample_rate_hz=0), 5), "a.bin"),
+    recording(hello_of_protocol(0) * 2, "a.bin"),
+    # evaluation
+    scored(rows(ESTIMATE), rows("time_s,height_m,roll_deg,pitch_deg", 3.0)),
+    scored("time_s,tilt_height_m\n0,1\n1,1\n", "time_s,height_m\n5,1\n6,1\n"),
+    scored(f"# linkpose recording 1\n# {{}}\n{IMU}\n0,{ROW}\n", rows("time_s,height_m")),
+    scored(rows("time_s,length_m"), rows("time_s,height_m")),
+    scored(rows(ESTIMATE), rows("time_s,length_m")),
+    scored(rows(ESTIMATE), rows("time_s,vx_m_s")),
+    # filters and rig
+    unknown_filter,
+    with_filter("joint", NO_J2S, Sensors.MPU6050),
+    with_filter("joint", GUESS, Sensors.MPU6050),
+    with_filter("imu-baro", NO_J2S, Sensors.MPU6050),
+    with_filter("", NO_J2S, Sensors(0)),
+    rig("[joint\n"),
+    rig("[joint]\nj2s = [0, 0, 1]\n"),
+    rig("joint = 1\n"),
+    rig("[mouse]\nx_m = 1\n"),
+    rig("[baro]\npressure_noise_Pa = 0\n"),
+    rig('[chain]\njoint = "knee"\n'),
+    rig("[[mouse]]\nx_m = 1\n"),
+    # ports and boards
+    choosing(),
+    choosing(PortInfo("/dev/ttyS0", "", None, None, None, False, None)),
+    choosing(UNO, replace(UNO, port="/dev/ttyACM1")),
+    opening("/dev/ttyX", OSError(errno.ENOENT, "none")),
+    opening("/dev/ttyX", OSError(errno.ENOTTY, "no terminal")),
+    opening("/dev/ttyX", OSError(errno.EBUSY, "busy")),
+    opening("/dev/ttyX", OSError(errno.EACCES, "denied")),
+    answering(b""),
+    answering(hello_of_protocol(0)),
+    answering(hello_of_protocol(99)),
+    # live outputs and conversion
+    lambda *_: open_output("http://a:1", []),
+    lambda *_: open_output("udp://no host.invalid:1", []),
+    serving,
+    converting(rows(ESTIMATE), "a.xyz"),
+    converting(rows("time_s,tilt_height_m"), "a.tum"),
+    converting("time_s,tilt_roll_deg,tilt_pitch_deg\n0,1,1\n1,,\n", "a.tum"),
+    converting("time_s,tilt_roll_deg,tilt_pitch_deg\n0,1,1\n0.01,1,1\n0.02,1,1\n99999,1,1\n", "a.trc"),
+]
+
+
+def _without_rows(folder: Path) -> object:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({"time_s": pa.array([], pa.float64())}), folder / "a.parquet")
+    return read_table(folder / "a.parquet")
+
+
+def messages() -> list[str]:
+    """The messages of the page's tables, in order."""
+    text = PAGE.read_text(encoding="utf-8").split("## Messages and cures")[1]
+    return re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
+
+
+def pattern(message: str) -> str:
+    return ".*".join(re.escape(part) for part in message.split("…"))
+
+
+def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = messages()
+    assert len(shown) == len(PRODUCERS) == len(set(shown))
+    found, kinds = [], set()
+    for number, (message, produce) in enumerate(zip(shown, PRODUCERS, strict=True)):
+        (folder := tmp_path / str(number)).mkdir()
+        with monkeypatch.context() as patch, pytest.raises(LinkposeError) as raised:
+            produce(folder, patch)
+            pytest.fail(f"nothing was raised for {message!r}")
+        text = sentence(raised.value)
+        assert re.fullmatch(pattern(message), text.replace("`", "")), f"{text!r} is not {message!r}"
+        found.append(text)
+        kinds |= {type(raised.value), type(getattr(raised.value, "reason", None))}
+    assert not [of for of in sentences() if not any(re.search(pattern(of), text) for text in found)]
+    assert {kind.__name__ for kind in CURES} - ELSEWHERE <= {kind.__name__ for kind in kinds}
+
+
+# With a cure, and produced by the tests of localization and of the magnetometer.
+ELSEWHERE = {
+    "MissingMap", "MissingBeacons", "MissingStart", "NothingToEstimate", "NeedsScans", "NotPositiveDefinite",
+    "UncalibratedMagnetometer",
+}  # fmt: skip
+
+
+RAISED = ("FileFormatError", "LinkposeError", "FileError")
+
+
+def sentences() -> Iterator[str]:
+    """The sentences of the errors in these parts of the program, `…` for what is put in."""
+    for path in [*(PACKAGE / "recording").glob("*.py"), PACKAGE / "streams.py", *(PACKAGE / "convert").glob("*.py")]:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
+                "FileFormatError",
+                "LinkposeError",
+                "FileError",
+            ):
+                yield from (text for argument in node.args if len(text := text_of(argument)) > 20)
+
+
+def text_of(node: ast.expr) -> str:
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(text_of(part) for part in node.values)
+    return "…"
