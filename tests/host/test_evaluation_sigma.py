@@ -133,6 +133,13 @@ def test_a_hinge_is_scored_by_its_angle():
     assert row["angle_rmse_deg"] == pytest.approx(1.0, abs=0.03) and row["angle_nees"] == pytest.approx(1.0, abs=0.05)
 
 
+def test_an_angle_of_the_opposite_sense_is_named():
+    angle = 30 * np.sin(2 * T) + 10 * np.sin(0.7 * T)
+    (remark,) = evaluate(table(chain_angle_deg=3 - angle), table("truth", angle_deg=angle)).remarks
+    assert "opposite senses" in remark and "negate axis1 and axis2" in remark
+    assert not evaluate(table(chain_angle_deg=3 + angle), table("truth", angle_deg=angle)).remarks
+
+
 @pytest.mark.parametrize("late_s", [1e6, 1e12, 1e300])
 def test_one_late_stamp_takes_no_memory_and_no_score_away(late_s):
     time_s = T + 7.3

@@ -353,7 +353,7 @@ def test_lost_samples_and_a_hole_of_seconds(name):
     assert np.isfinite(estimate).all()
     assert np.sqrt(np.mean(error[:1500] ** 2)) < 0.04
     after = thinned.time_s > 40.0
-    assert np.sqrt(np.mean(error[after] ** 2)) < {"joint": 0.015, "tilt": 0.1, OURS: 0.03}[name]
+    assert np.sqrt(np.mean(error[after] ** 2)) < {"joint": 0.015, "tilt": 0.2, OURS: 0.03}[name]
 
 
 @pytest.mark.parametrize("name", [*INERTIAL, OURS])
@@ -443,3 +443,16 @@ def test_tilt_without_j2s_gives_the_attitude_but_no_height(name):
     _, block = recorded(1, 0, 20.0)
     estimate = filters.create(name, Rig()).process(block)
     assert np.isnan(estimate[:, :2]).all() and np.isfinite(estimate[:, 2:4]).all()
+
+
+@pytest.mark.parametrize("gap_s", [1.0, 3.0])
+@pytest.mark.parametrize("name", ["tilt", "joint"])
+def test_a_gap_in_a_fast_swing_is_followed_by_an_alignment(name, gap_s):
+    """Propagated across the gap with a guessed rate, the tilt is wrong by 90° for tens of seconds."""
+    run, block = recorded()
+    kept = (block.time_s < 20) | (block.time_s > 20 + gap_s)
+    cut = Measurements(*(np.ascontiguousarray(getattr(block, field)[kept]) for field in block.__slots__))
+    height = filters.create(name, run.rig).process(cut)[:, 0]
+    late = cut.time_s > 25 + gap_s
+    most_m = {"joint": 0.1, "tilt": 0.3}[name]  # Method B needs some swings to average the acceleration
+    assert np.sqrt(np.mean((height[late] - run.truth().height_m[kept][late]) ** 2)) < most_m

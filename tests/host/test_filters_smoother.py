@@ -70,7 +70,7 @@ def test_a_gyro_bias_that_drifts_is_not_that_of_the_end_at_the_beginning():
     block, truth = run.measurements(), run.truth()
     drift = np.radians(3 / 60) * block.time_s[:, None] * [1.0, -1.0, 1.0]
     estimate = JointInertialSmoother(KNOWN).process(replace(block, gyro_rad_s=block.gyro_rad_s + drift))
-    assert rmse_cm(estimate, truth) < 0.4
+    assert rmse_cm(estimate, truth) < 0.45
 
 
 def test_a_gyro_bias_of_the_rig_file_holds_backwards_too():

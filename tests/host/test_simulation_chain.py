@@ -7,6 +7,8 @@ import pytest
 
 import linkpose as lp
 from linkpose.errors import LinkposeError
+from linkpose.estimation import Estimator
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY, accel_scale, gyro_scale
 from linkpose.simulation.chain import ChainRun
 from linkpose.wire.messages import IMU2_OFFSET_US_400_KHZ, IMU_OFFSET_US
@@ -67,6 +69,14 @@ def test_the_simulated_board_is_this_run() -> None:
         measured = np.concatenate([block.gyro2_rad_s for block in board.stream(duration_s=3.0)])
     counts = ChainRun("ball", 2, None).block(0, len(measured)).imu2[:, 4:]
     assert len(measured) > 290 and measured == pytest.approx(counts * gyro_scale(1000), abs=1e-7)
+
+
+def test_the_filter_runs_by_default_where_a_second_sensor_is_and_only_there() -> None:
+    run = ChainRun("hinge")
+    both = Estimator((), run.rig, run.hello_sensors)
+    assert "chain" in [f.name for f in both.filters] and "chain_angle_deg" in both.columns
+    alone = Estimator((), run.rig, run.hello_sensors & ~Sensors.IMU2)
+    assert "chain" not in [f.name for f in alone.filters] and "chain" in alone.left_out
 
 
 def test_a_joint_that_does_not_exist_is_refused() -> None:

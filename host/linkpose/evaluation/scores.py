@@ -12,6 +12,7 @@ from linkpose.evaluation.scoring import CHAIN, LINK, Compared, Score, Scorer, Wi
 from linkpose.evaluation.series import Lag, Pair, Series, find_offset, paired
 from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.quantities import (
+    ANGLE,
     CHAIN_ROTATION,
     HEADING,
     HEIGHT,
@@ -35,6 +36,7 @@ from linkpose.sensors.measurements import Floats
 SCORED = (*LINK, VX, VY, WZ, X, Y, HEADING, Z)
 _UNRELATED = 0.9  # share of the reference's motion that remains when even the best filter's is subtracted
 _SAME_TILT_DEG = 30.0
+_MIRRORED = 0.8  # correlation, negated
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,10 +197,25 @@ def mismatches(
             else "are they of the same run, and of the same axes?"
         )
         return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]
+    if any(_is_mirrored(both.pairs[ANGLE]) for both in compared if ANGLE in both.pairs):
+        return [
+            f"{both_files} count the joint angle in opposite senses: the sense of an axis that a filter finds is "
+            "arbitrary; negate axis1 and axis2 in the rig file and estimate again"
+        ]
     is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
     if is_link and _UNRELATED < residual < np.inf:
         return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
     return []
+
+
+def _is_mirrored(pair: Pair) -> bool:
+    """Whether an angle and its reference turn in opposite senses, on the clocks as they are."""
+    ours, theirs = np.array(paired(*pair, 0.0))
+    known = np.isfinite(ours) & np.isfinite(theirs)
+    if known.sum() < 3:
+        return False
+    turned = [angle[known] - np.median(angle[known]) for angle in (ours, theirs)]
+    return bool(turned[0] @ turned[1] < -_MIRRORED * np.linalg.norm(turned[0]) * np.linalg.norm(turned[1]))
 
 
 def _tilt_apart_deg(both: Mapping[Quantity, Pair], offset_s: float) -> float:

@@ -22,6 +22,9 @@ GRAVITY = STANDARD_GRAVITY  # m/s²
 # s: 1.25 periods of the slowest sampling rate, 50 Hz. A longer step, or one without a usable gyro reading, adds
 # variance to the rotation.
 LONGEST_STEP_S = 0.025
+# s: without a usable rate for longer, the tilt of a moving link is unknown: it is aligned to gravity again. Doubled, a
+# swing of 1 s period is propagated with the wrong sign.
+LONGEST_BLIND_S = 0.3
 LONGEST_GAP_S = (
     2.0  # s: after a longer gap the attitude is unknown; doubled, an arbitrary attitude is propagated longer
 )

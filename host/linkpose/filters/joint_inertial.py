@@ -128,7 +128,7 @@ class JointInertialFilter:
         self.parameters = parameters or InertialParameters()
         self._record = record_of(self.parameters)
         self._states = [
-            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.largest_std_m) for errors in _HYPOTHESES
+            fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES
         ]
         self._imu = ImuCalibration.of(rig.imu)
 

@@ -39,6 +39,7 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
+    LONGEST_BLIND_S,
     LONGEST_GAP_S,
     Floats,
     ImuCalibration,
@@ -274,17 +275,21 @@ def store_state(state: TiltState, now: Registers, rejected: int) -> None:
 
 @inner
 def advance(now: Registers, samples: ImuSamples, i: int, imu: ImuCalibration) -> tuple[Registers, bool, Vec, bool]:
-    """Predict up to a sample, or start: the state, whether the force is usable, the force, whether the rate is."""
+    """Predict up to a sample, or start, also after a gap.
+
+    Returns the state, whether the force is usable, the force, and whether the rate is usable.
+    """
     time_s, flags = samples.time_s[i], samples.flags[i]
     has_force, force = read_accel(vec.row(samples.accel, i), flags, imu)
     has_rate, rate = read_gyro(vec.row(samples.gyro, i), flags, imu)
-    if math.isnan(now.time):
-        if not (has_force and has_rate and math.isfinite(time_s)):
+    good = has_force and has_rate and math.isfinite(time_s)
+    has_passed, step_s = step_between(time_s, now.time)
+    if math.isnan(now.time) or (good and has_passed and max(step_s, now.held) > LONGEST_BLIND_S):
+        if not good:
             return now, False, force, False
         tilt, covariance = start(force, rate, imu)
         none = MeanResidual((0.0, 0.0, 0.0), 0.0, 1.0)
         return Registers(time_s, rate, 0.0, tilt, covariance, acceleration(force, tilt), none), True, force, True
-    has_passed, step_s = step_between(time_s, now.time)
     if not has_passed:
         return now, False, force, False
     held = 0.0 if has_rate else now.held + step_s

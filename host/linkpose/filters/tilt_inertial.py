@@ -65,7 +65,7 @@ class TiltInertialFilter:
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
         self._states = fresh_state(
-            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.largest_std_m, _LARGEST_DISTANCE
+            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu)
 

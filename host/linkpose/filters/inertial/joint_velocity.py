@@ -132,3 +132,4 @@ def _follow_residual(s: Record, innovation: Vec, expected: float, share: float, 
     square = min(vec.dot(innovation, innovation), _GATE * (expected + 3.0 * share * reach))
     s.residual_square += keep * ((square - expected) / 3.0 - s.residual_square)
     s.reach_square += keep * (reach - s.reach_square)
+    s.assumed *= 1.0 - keep

@@ -15,6 +15,7 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
+    LONGEST_BLIND_S,
     ImuCalibration,
     ImuSamples,
     blind_for,
@@ -42,6 +43,7 @@ from linkpose.filters.inertial.propagate import (
     velocity_variance,
 )
 from linkpose.filters.inertial.rest import (
+    align_at_rest,
     follow_rest,
     follow_steadiness,
     update_bias_from_rest,
@@ -65,12 +67,11 @@ from linkpose.filters.inertial.state import (
     Y,
     Z,
 )
+from linkpose.filters.inertial.unobservable import restore_unobservable
 from linkpose.filters.inertial.update import sub_covariance
 
 # Least interval between two updates (s). A faster pace gains nothing: what the models leave over is correlated.
 _UPDATE_INTERVAL_S = 0.035
-# Without a rate for longer, a moving link has turned by more than its tilt can be guessed to: align to gravity anew.
-_LONGEST_BLIND_S = 0.3
 # Identical readings for less than this are one reading of a slower sensor, held by the logger (s).
 LONGEST_HOLD_S = 0.1
 _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
@@ -84,6 +85,7 @@ _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
+_FIRST_REACH_M2_S2 = 0.5  # mean square speed that the assumed share of the constraint's residual counts for
 _LOST, _LOST_M2_S2 = 0.5, 0.01
 # σ of what was learned grows by this factor then: after two or three losses in a row it is that of the start.
 _WIDEN = 3.0
@@ -110,7 +112,7 @@ def process(
         if good and first and math.isfinite(time_s):
             _begin(s, force, rate, noisy, q)
             _take_sample(s, time_s, force, rate)
-        elif good and max(h, s.blind_s) > _LONGEST_BLIND_S and h < math.inf:
+        elif good and max(h, s.blind_s) > LONGEST_BLIND_S and h < math.inf:
             _bridge(s, h, rate, noisy)
             _align(s, force, rate, noisy, q)
             _take_sample(s, time_s, force, rate)
@@ -156,7 +158,7 @@ def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
 @inner
 def _forget_motion(s: Record, q: Record) -> None:
     """What was measured of the motion is measured again: the constraint's residual, the excited directions, a rest."""
-    s.residual_square, s.reach_square = 0.5 * q.first_residual**2, 0.5
+    s.residual_square, s.reach_square, s.assumed = _FIRST_REACH_M2_S2 * q.first_residual**2, _FIRST_REACH_M2_S2, 1.0
     s.rest_s = 0.0
     for i in range(3):
         for j in range(3):
@@ -225,10 +227,11 @@ def _advance(
     )
     if jumped and s.span > 0.0:  # so that this reading is judged alone
         _update(s, had_rate, _NO_JUMP, before_rate, before_rate, imu, noisy, q)
+    north = vec.load(s.north)
     _integrate(s, h, force, change, noisy)
     if has_force and has_rate:
         follow_noise(s, force, rate, h, imu)
-        follow_rest(s, force, rate, h, imu)
+        follow_rest(s, north, force, rate, h, imu)
     if not q.has_joint:
         follow_speed(s, vec.scale(h, angular_rate(s, rate)), force, h, q)
         if has_force and has_rate:
@@ -254,7 +257,7 @@ def _advance(
 @inner
 def _turn(s: Record, step: float, has_rate: bool, rate: Vec, jumped: bool, imu: ImuCalibration) -> None:
     """Sum the rotation, gyro bias included, up to a new rate, and its variance."""
-    s.blind_s = blind_for(s.blind_s, step, has_rate, _LONGEST_BLIND_S)
+    s.blind_s = blind_for(s.blind_s, step, has_rate, LONGEST_BLIND_S)
     newest = vec.load(s.newest_rate)
     angle = vec.axpy(0.5 * step, newest, vec.load(s.angle))
     vec.store(s.angle, vec.axpy(0.5 * step, newest if jumped else rate, angle))
@@ -297,8 +300,12 @@ def _update(
     propagate_covariance(s, force, rotation, velocity, _bias_walk(s, q) ** 2 * h)
     clear_increments(s)
     for i in range(D, PSI):
-        s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[D, D] * h
+        s.covariance[i, i] += q.j2s_walk**2 * s.start_covariance[i, i] * h
     decay_to_prior(s, h)
+    if q.has_joint and s.undecayed_s == 0.0:
+        restore_unobservable(s)
+    if q.has_joint:
+        align_at_rest(s, h, noisy)
     update_bias_from_rest(s, h, noisy)
     if q.has_joint:
         if has_rate:
@@ -317,11 +324,13 @@ def _bias_walk(s: Record, q: Record) -> float:
     """Random walk of the gyro bias ((rad/s)/√s); more where the joint's constraint leaves over more than its floor.
 
     Play, bending and the sensor's nonlinearity then act as a bias that follows the motion, and a bias that drifts fast
-    shows there too. The third power makes the change steep: twice the floor allows eight times the walk.
+    shows there too. The third power makes the change steep: twice the floor allows eight times the walk. Only what has
+    been measured counts: a share that is assumed at the start would widen a bias that is known already.
     """
     if not q.has_joint:
         return float(q.gyro_bias_walk_rad_s)
-    share = math.sqrt(max(s.residual_square / s.reach_square, q.least_residual**2)) / q.least_residual
+    measured = s.residual_square - s.assumed * _FIRST_REACH_M2_S2 * q.first_residual**2
+    share = math.sqrt(max(measured / s.reach_square, q.least_residual**2)) / q.least_residual
     return float(min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s))
 
 
@@ -415,6 +424,7 @@ def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     _report_values(tilt, north, west, d, row)
     _report_stds(s, vec.scale(-1.0, vec.axpy(1.0, vec.load(s.turned), ahead)), tilt, north, west, d, row)
     row.distance = s.distance
+    row.unknown = vec.trace(sub_covariance(s.covariance, BA)) / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])
     unknown = 0
     if math.isnan(s.time) or max(s.blind_s, s.no_force_s) > _NO_SENSOR_S:
         vec.store(row.tilt, (math.nan, math.nan, math.nan))

@@ -6,8 +6,9 @@ from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._vector import Vec
+from linkpose.filters.inertial.gravity import align_to_gravity
 from linkpose.filters.inertial.propagate import specific_force
-from linkpose.filters.inertial.state import BA, BG, MA, SIZE, Record, Z
+from linkpose.filters.inertial.state import BA, BG, MA, PSI, SIZE, Record, Z
 from linkpose.filters.inertial.update import constrain_attitude, project, sub_covariance, update_scalar, update_vector
 
 # Stillness before the mean rate counts as the gyro bias and the mean force as gravity (s): longer than a turning point
@@ -18,15 +19,19 @@ REST_S = 0.5
 _SWAY_RAD = 5e-4
 _MOST_SWAY_RAD_S = _SWAY_RAD / REST_S
 _REST_SIGMAS = 5.0  # within which the readings must stay: one sound sample in 10⁶ ends a rest
+# Rotation since the rest began that an unknown bias may have added (rad, 1σ, all axes), beyond which the attitude is
+# taken from the rest anew. A linear update is wrong by half its square (0.03° at this).
+_FAR_RAD = 0.03
 _TURN_SIGMAS = 3.0  # a mean rate this far from the bias estimate is a turn at constant rate
 _SWAY_M_S = 0.05  # change of velocity over a rest (m/s, 1σ): a hand's tremor
+_REST_SPEED_M2_S2 = 1e-4  # variance of the velocity at rest, each axis: a hand's tremor
 _NORM_M_S2 = 0.5  # 1σ of the force along Z at rest (m/s²): 3 % scale and 50 mg, an uncalibrated MPU-6050
 _GATE = 25.0  # χ² with one degree of freedom: five standard deviations
 
 
 @inner
-def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> None:
-    """Measure how long neither force nor rate has left its noise."""
+def follow_rest(s: Record, north: Vec, force: Vec, rate: Vec, h: float, imu: ImuCalibration) -> None:
+    """Measure how long neither force nor rate has left its noise; `north` is X at the sample before."""
     still = s.rest_s
     change = vec.minus(force, vec.load(s.rest_force))
     drift = vec.axpy(-1.0, vec.load(s.rest_rate_sum), vec.scale(still, rate))
@@ -37,6 +42,8 @@ def follow_rest(s: Record, force: Vec, rate: Vec, h: float, imu: ImuCalibration)
         s.rest_s = 0.0
         return
     if still == 0.0:
+        vec.store(s.rest_north, north)
+        s.rest_heading_variance = s.covariance[PSI, PSI]
         vec.store(s.rest_force, force)
         vec.store(s.rest_force_sum, (0.0, 0.0, 0.0))
         vec.store(s.rest_rate_sum, (0.0, 0.0, 0.0))
@@ -55,15 +62,47 @@ def update_bias_from_rest(s: Record, h: float, imu: ImuCalibration) -> None:
     if rest_s <= REST_S:
         return
     variance = imu.gyro_variance * h / rest_s + (_SWAY_RAD / rest_s) ** 2
-    if vec.trace(sub_covariance(p, BG)) <= 6.0 * variance:
+    if vec.trace(sub_covariance(p, BG)) <= 6.0 * variance or _is_turn(s, variance):
         return
-    for j in range(3):
-        innovation = s.rest_rate_sum[j] / rest_s - s.nominal[BG + j]
-        if innovation * innovation > _TURN_SIGMAS**2 * (p[BG + j, BG + j] + variance):
-            return
     for j in range(3):
         update_scalar(s, BG + j, s.rest_rate_sum[j] / rest_s - s.nominal[BG + j], variance)
     constrain_attitude(s)
+
+
+@inner
+def _is_turn(s: Record, variance: float) -> bool:
+    """Whether the mean rate is too far from the bias to be one."""
+    for j in range(BG, BA):
+        innovation = s.rest_rate_sum[j - BG] / s.rest_s - s.nominal[j]
+        if innovation * innovation > _TURN_SIGMAS**2 * (s.covariance[j, j] + variance):
+            return True
+    return False
+
+
+@inner
+def align_at_rest(s: Record, h: float, imu: ImuCalibration) -> None:
+    """Gyro bias and attitude from a rest, where the bias was unknown: no axis has turned since the rest began.
+
+    Until then, the bias has turned the attitude, by up to 10° after switch-on. `h` as for `update_bias_from_rest`.
+    """
+    p, rest_s = s.covariance, s.rest_s
+    if rest_s <= REST_S or vec.trace(sub_covariance(p, BG)) * rest_s * rest_s <= _FAR_RAD**2:
+        return
+    variance = imu.gyro_variance * h / rest_s + (_SWAY_RAD / rest_s) ** 2
+    if _is_turn(s, variance):
+        return
+    for i in range(BG, BG + 4):
+        k = i if i < BA else PSI
+        for j in range(SIZE):
+            p[k, j] = p[j, k] = 0.0
+    for i in range(3):
+        s.nominal[BG + i] = s.rest_rate_sum[i] / rest_s
+        p[BG + i, BG + i] = variance
+    p[PSI, PSI] = s.rest_heading_variance + _SWAY_RAD**2
+    vec.store(s.north, vec.load(s.rest_north))
+    force = vec.scale(1.0 / rest_s, vec.load(s.rest_force_sum))
+    accel = imu.accel_variance * h / rest_s + (_SWAY_M_S / rest_s) ** 2
+    align_to_gravity(s, force, accel, (0.0, 0.0, 0.0), _REST_SPEED_M2_S2)
 
 
 @inner

@@ -83,12 +83,15 @@ _FIELDS = np.dtype(
         ("rate_noise", "f8"),  # rad²/s²
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
+        ("rest_north", *_VECTOR),  # X when it began
+        ("rest_heading_variance", "f8"),  # rad²
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
         ("rest_force_sum", *_VECTOR),  # ∫ force over the rest (m/s)
         ("rest_rate_sum", *_VECTOR),  # ∫ rate over the rest (rad)
         ("steady_force", *_VECTOR),  # force without its noise (m/s²)
         ("residual_square", "f8"),  # mean square of the joint constraint's excess residual (m²/s²)
         ("reach_square", "f8"),  # mean of ‖ω‖² ‖d‖² (m²/s²)
+        ("assumed", "f8"),  # share of these two means that is assumed rather than measured
         ("spread", "f8", (3, 3)),  # mean of ω ωᵀ (rad²/s²)
         ("swing", *_VECTOR),  # velocity that the acceleration of the last second adds up to (m/s)
         ("speed_square", "f8"),  # variance of the sensor's own velocity (m²/s²)
@@ -99,6 +102,7 @@ _FIELDS = np.dtype(
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
+        ("direction", "f8", (SIZE,)),  # the one that cannot be observed
         ("gradient", "f8", (7,)),  # of a reported value with respect to Z, d and ψ
         ("work", "f8", (7, SIZE)),
         # Counters.
@@ -136,6 +140,7 @@ ESTIMATE = np.dtype(
         ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
         ("distance", "f8"),  # `distance` of the state
+        ("unknown", "f8"),  # share of the accelerometer's bias variance that the motion has not resolved
     ],
     align=True,
 )
@@ -161,9 +166,12 @@ class SensorErrors(NamedTuple):
 
 
 def fresh_state(
-    errors: SensorErrors, j2s_m: tuple[float, float, float], j2s_std_m: float, largest_distance: float = np.inf
+    errors: SensorErrors,
+    j2s_m: tuple[float, float, float],
+    j2s_std_m: float | tuple[float, float, float],
+    largest_distance: float = np.inf,
 ) -> Any:
-    """An array of one state record before the first sample; J2S is assumed accurate to `j2s_std_m` on each axis.
+    """An array of one state record before the first sample; `j2s_std_m` is of all axes of J2S, or of each.
 
     `largest_distance`: half the χ² of the sensor errors beyond which the filter begins anew.
     """
@@ -173,7 +181,8 @@ def fresh_state(
     state.last_readings[:] = fresh_memory()
     state.prior[:] = errors.variances()
     state.start_mean[D:PSI] = j2s_m
-    state.start_covariance[:] = np.diag(state.prior + np.repeat([0.0, j2s_std_m**2, 0.0], [D, 3, 1]))
+    state.start_covariance[:] = np.diag(state.prior)
+    state.start_covariance[range(D, PSI), range(D, PSI)] = np.square(j2s_std_m)
     state.decay_s = errors.decay_s
     state.largest_distance = largest_distance
     return states
