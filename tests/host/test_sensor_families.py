@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from linkpose.errors import LinkposeError
+from linkpose.recording.reader import Recording
+from linkpose.recording.writer import metadata
 from linkpose.sensors import bmp280, magnetometer, mpu6050
 from linkpose.sensors.barometer import Barometer
+from linkpose.sensors.conversion import BoardSettings
 from linkpose.sensors.devices import Sensors, check_hello, describe, found, names
+from linkpose.sensors.rig import Rig
 from linkpose.simulation import board
 from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.wire.messages import DeviceFamily, DeviceState, HelloMouse
@@ -121,3 +126,24 @@ def test_a_reading_alone_gives_the_same_bits_as_in_a_block(words, ut, up, oversa
     for one, two in zip(alone, block, strict=True):
         assert one.shape == (1,) and one.dtype == two.dtype
         assert one.tobytes() == two[:1].tobytes()
+
+
+@pytest.mark.parametrize(
+    ("dlpf", "family", "filter_ms"),
+    [
+        (3, DeviceFamily.MPU6050, 4.9),  # RM-MPU-6000A 4.3
+        (6, DeviceFamily.MPU6050, 19.0),
+        (3, DeviceFamily.MPU6500, 5.9),  # RM-MPU-6500A, register 0x1A
+        (6, DeviceFamily.ICM20600, 33.48),
+        (3, DeviceFamily.UNKNOWN_IMU, 4.9),
+    ],
+)
+def test_readings_are_as_old_as_their_family_filters_them(dlpf, family, filter_ms):
+    """In addition, a sample of a 1 kHz sensor is 0.5 ms old in the mean."""
+    assert 1e3 * mpu6050.delay_s(dlpf, family) == pytest.approx(filter_ms + 0.5)
+    hello = board.hello(board.DEFAULTS._replace(dlpf=dlpf))
+    hello = hello._replace(devices=(hello.devices[0]._replace(family=family), *hello.devices[1:]))
+    settings = BoardSettings.of(hello)
+    head = metadata(hello, settings, "sim", Rig(), {})
+    recording = Recording(Path("r.csv"), None, None, 100.0, head, [])
+    assert recording.imu_delay_s == settings.imu_delay_s == mpu6050.delay_s(dlpf, family)

@@ -26,6 +26,7 @@ from pty_server import PtyServer  # noqa: E402
 from rig_signals import RigFeed  # noqa: E402
 
 from linkpose.errors import LinkposeError  # noqa: E402
+from linkpose.simulation.chain import ChainRun  # noqa: E402
 from linkpose.simulation.link import LinkRun  # noqa: E402
 from linkpose.simulation.mice import MiceRun, ring  # noqa: E402
 from virtual_uno import Mouse, VirtualUno, VirtualUnoError  # noqa: E402
@@ -85,7 +86,12 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--hex", type=Path, default=DEFAULT_HEX, help="the firmware")
     parser.add_argument("--blank", action="store_true", help="Optiboot and no firmware: a board for `linkpose flash`")
     parser.add_argument("--link", type=Path, default=Path("virtual-uno"), help="symbolic link to the port")
-    parser.add_argument("--rig", choices=("link", "mice"), default="link", help="what is simulated (default: the link)")
+    parser.add_argument(
+        "--rig",
+        choices=("link", "chain", "mice"),
+        default="link",
+        help="what is simulated (default: link; chain needs --imu2)",
+    )
     parser.add_argument("--test", type=int, default=1, help="Test of the link: 1, 2 or 3")
     parser.add_argument("--seed", type=int, default=0, help="of the rig and of everything random on the board")
     parser.add_argument("--errors", default="calibrated", help="of the sensors: calibrated, datasheet or none")
@@ -155,6 +161,8 @@ def _runs(options: argparse.Namespace) -> tuple[LinkRun | MiceRun, MiceRun | Non
     drive = MiceRun(options.seed, None, mice=ring(options.mice), errors=options.errors) if options.mice else None
     if options.rig == "mice":
         return MiceRun(options.seed, None, mice=ring(options.mice), errors=options.errors), None
+    if options.rig == "chain":
+        return ChainRun("hinge", options.seed, None, errors=options.errors), drive
     link = LinkRun(
         options.test,
         options.seed,

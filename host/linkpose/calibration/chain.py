@@ -70,8 +70,9 @@ _ACCEL_SCALES = np.concatenate([first + ACCEL_MATRIX + np.arange(0, 9, 4) for fi
 _LEVERS = [*range(J2S, GYRO_BIAS), *range(UNKNOWNS + J2S, UNKNOWNS + GYRO_BIAS)]
 _TURN_STD_RAD = 1.0  # of a piece's rotation about a direction that its forces do not show
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
-_NO_JOINT_M_S2 = 3.0
-LARGE_RESIDUAL_M_S2 = 0.5
+# Residuals: real chains leave 0.01 to 0.1 m/s², a shaft with a vibrating motor 0.6; two unrelated sensors leave more
+# than 3. Doubled, sensors on links that slide against each other are accepted.
+LARGE_RESIDUAL_M_S2, _NO_JOINT_M_S2 = 0.5, 3.0
 # Share of the residual that may follow the motion and shift r_k. On diodem_chain, whose residuals are 0.01 to 0.07
 # m/s², results from four starting times differ by as much as 0.2 predicts. Doubled, σ of a clear direction doubles.
 _COHERENT_SHARE = 0.2
@@ -404,7 +405,7 @@ def _rate(stretch: Stretch, unknowns: Floats) -> Floats:
 
 
 def _first_axes(parts: Sequence[_Rotations]) -> list[Floats]:
-    """Axes (2, 3) to start from: where the pieces' rotations hold the axis best, and [Seel 2014] (6), which needs none.
+    """Axes (2, 3) to start from: where the pieces' rotations hold the axis best, and [Seel2014] (6), which needs none.
 
     The latter minimises Σ (‖ω_1 × j_1‖ − ‖ω_2 × j_2‖)², from several directions. It does not show the sense of either
     axis, and no axis of a sensor that hardly turns: each axis is paired with its image by the rotations of the piece
@@ -535,7 +536,7 @@ def _kind(motion: Motion) -> Kind | None:
 
 
 def _nearest_on_axis(levers: Floats, covariance: Floats, axes: Floats) -> tuple[Floats, Floats]:
-    """r_1 and r_2 from the point of a hinge's axis that lies nearest to both sensors, as [Seel 2014] (3.3) chooses it.
+    """r_1 and r_2 from the point of a hinge's axis that lies nearest to both sensors, as [Seel2014] (3.3) chooses it.
 
     Every point of the axis stays in its place relative to both links, so the motion cannot show which one is meant.
     """
