@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from linkpose.cli.evaluate import command
-from linkpose.errors import LinkposeError, TooFewRows
+from linkpose.errors import FileFormatError, LinkposeError, TooFewRows
 from linkpose.evaluation import longfiles
 from linkpose.evaluation.longfiles import evaluate_files
 from linkpose.evaluation.scores import evaluate
@@ -166,6 +166,15 @@ def test_long_files_that_do_not_belong_together(tmp_path, in_small_blocks):
         evaluate_files(estimate, write(tmp_path / "s.csv", **reference(link, T[:900])))
     other = reference(link, T) | {"height_m": 1.6 + noise(), "roll_deg": noise(20), "pitch_deg": noise(20)}
     assert "hardly any motion" in evaluate_files(estimate, write(tmp_path / "o.csv", **other)).remarks[0]
+
+
+def test_a_long_reference_whose_stamps_do_not_increase_is_named(tmp_path, in_small_blocks, monkeypatch):
+    """All its rows would be in memory at once."""
+    monkeypatch.setattr(longfiles, "_MOST_HELD_ROWS", 1_000)
+    estimate = write(tmp_path / "e.csv", **link_estimate())
+    truth = write(tmp_path / "t.csv", **(reference(link, T) | {"time_s": np.full(N, 5.0)}))
+    with pytest.raises(FileFormatError, match=r"more than 1000 rows at about .* its time_s must increase"):
+        evaluate_files(estimate, truth)
 
 
 def test_the_command_scores_and_draws_long_files(tmp_path, in_small_blocks):

@@ -12,6 +12,7 @@ from linkpose.errors import InvalidValue
 from linkpose.filters.chain import ChainFilter
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Chain, Rig
+from linkpose.simulation.chain import ChainRun
 
 RATE_HZ, SECONDS = 100.0, 30.0
 R1, R2 = np.array([0.05, -0.02, -0.20]), np.array([-0.03, 0.04, 0.15])
@@ -163,3 +164,25 @@ def test_the_angle_of_a_vertical_hinge_does_not_drift_between_its_end_stops() ->
     late = t > 60
     error = min((np.unwrap(sign * found[late]) - np.unwrap(angle[late]) for sign in (1, -1)), key=np.std)
     assert np.degrees(np.std(error)) < 1.0
+
+
+def test_heights_over_a_fixed_first_joint_with_unknown_mounting() -> None:
+    run = ChainRun("hinge", 0, 40.0)
+    measured = run.measurements()
+    truth, late = run.truth_columns(measured.time_s), measured.time_s > 20
+    estimates = lp.estimate(measured, filters=["chain"], rig=run.rig)
+    for k in (1, 2):
+        error = (estimates[f"chain_height{k}_m"] - truth[f"height{k}_m"])[late]
+        assert np.sqrt(np.mean(error**2)) < 0.01
+        assert np.mean(np.abs(error) < 2 * estimates[f"chain_height{k}_std_m"][late]) > 0.9
+
+
+def test_a_first_rest_gives_the_gyro_biases_of_the_data_sheet() -> None:
+    measured, truth, _ = _chain("ball")  # which rests for a second
+    bias = np.radians([[12.0, -15.0, 8.0], [-9.0, 14.0, 18.0]])
+    measured = lp.Measurements.from_imu(
+        measured.time_s, measured.accel_m_s2, measured.gyro_rad_s + bias[0],
+        accel2_m_s2=measured.accel2_m_s2, gyro2_rad_s=measured.gyro2_rad_s + bias[1],
+    )  # fmt: skip
+    error = _error_deg(lp.estimate(measured, filters=["chain"]), truth)[measured.time_s > 15]
+    assert np.sqrt(np.mean(error**2)) < 1.5

@@ -11,6 +11,7 @@ from free_motion import motion
 from linkpose.filters.inertial.state import MA, MG
 from linkpose.filters.tilt_inertial import TiltInertialFilter
 from linkpose.sensors.rig import Rig
+from linkpose.wire.messages import SampleFlags
 
 
 def still(t: float) -> np.ndarray:
@@ -66,3 +67,23 @@ def test_a_fast_turn_is_no_spike():
     made = motion(20.0, rate, lambda time_s: np.column_stack([3 * np.sin(8 * time_s)] * 3) * (time_s > 2.0)[:, None])
     error = made.tilt_error_deg(TiltInertialFilter(Rig()).process(made.block())[:, 2:4])
     assert np.sqrt(np.mean(error**2)) < 0.7
+
+
+def test_a_saturated_gyro_widens_sigma():
+    """Blows of 15 rad/s in 20 ms, of which a range of 4 rad/s shows the beginning, flagged: σ counts the rest."""
+
+    def rate(t):
+        blow = 15.0 * np.exp(-(((t % 3.0 - 1.5) / 0.02) ** 2)) * (1 if t % 6.0 < 3.0 else -1)
+        return np.array([np.sin(4 * t), 0.5 * np.cos(3 * t) + blow, 0.0])
+
+    made = motion(30.0, rate, lambda time_s: np.column_stack([np.sin(5 * time_s)] * 3))
+    block, limit = made.block(), 4.0
+    flags = block.flags | np.where(
+        (np.abs(block.gyro_rad_s) > limit).any(axis=1), np.uint32(SampleFlags.GYRO_SATURATED), np.uint32(0)
+    )
+    estimate = TiltInertialFilter(Rig()).process(
+        replace(block, gyro_rad_s=np.clip(block.gyro_rad_s, -limit, limit), flags=flags)
+    )
+    error, std = made.tilt_error_deg(estimate[:, 2:4]), np.hypot(estimate[:, 4], estimate[:, 5])
+    assert np.mean(error[300:] < 2 * std[300:]) > 0.95
+    assert np.sqrt(np.mean(error[300:] ** 2)) < 6

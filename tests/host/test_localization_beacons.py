@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from linkpose.localization.events import Event, Log
+from linkpose.cli.localize import command
+from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
@@ -187,3 +189,22 @@ def test_scale_and_bias_of_landmark_ranges_are_estimated() -> None:
         value, std = values[name]
         assert abs(value - true) < 3.0 * std
     assert values["range_scale_error"][1] < 0.02
+
+
+def test_the_command_reports_the_noises_it_found_and_draws_the_path(tmp_path) -> None:
+    log, _ = drive(1, duration_s=80.0, range_std=0.5)
+    rows = [format_event(event) for event in log if isinstance(event, Event)]
+    write_lines(tmp_path / "log.csv", ["time_s,kind,a,b,c", *rows], force=False)
+    places = [f"{name},{x},{y}" for name, (x, y, _) in BEACONS.items()]
+    write_lines(tmp_path / "beacons.csv", ["id,x_m,y_m", *places], force=False)
+    picture = tmp_path / "path.png"
+    done = CliRunner().invoke(
+        command, [str(tmp_path / "log.csv"), "--beacons", str(tmp_path / "beacons.csv"), "--plot", str(picture)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "noises estimated from the log: range " in done.output
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    again = CliRunner().invoke(
+        command, [str(tmp_path / "log.csv"), "--beacons", str(tmp_path / "beacons.csv"), "--plot", str(picture)]
+    )
+    assert "exists" in str(again.exception or again.output)

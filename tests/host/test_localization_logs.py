@@ -287,3 +287,12 @@ def test_sparse_truth_is_compared_at_its_own_times():
     result = score(times, np.column_stack((times, np.full(len(times), 300.0))), None, truth)
     assert result.position_rmse_m == pytest.approx(300.0)
     assert result.rows == result.possible == 10
+
+
+@pytest.mark.parametrize(("separator", "comma"), [(";", ","), (";", "."), ("\t", ",")])
+def test_logs_as_spreadsheets_save_them_are_read(tmp_path, separator, comma):
+    text = "# drive 1\ntime_s,kind,a,b,c\n0.0,pose,1.5,2,0.25\n0.5,odometry,0.5,0.1,\n0.5,range,A1,3.25,\n"
+    plain, saved = tmp_path / "plain.csv", tmp_path / "saved.csv"
+    plain.write_text(text)
+    saved.write_text(text.replace(",", separator).replace(".", comma).replace("\n", "\r\n"), newline="")
+    assert read_events(saved).events == read_events(plain).events

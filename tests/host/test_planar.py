@@ -179,3 +179,24 @@ def test_mice_that_agree_against_the_gyro_are_all_distrusted(kind):
     assert (excluded[2100:2300] == 7).all() and (excluded[2500:] == 0).all()
     assert out[2299, 6] > 10 * out[1999, 6] and filter_.distrusted == 0
     assert math.degrees(pose_error(out[:, :3], run.pose).heading_rad) < 0.3
+
+
+@BOTH
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_lift_on_a_straight_widens_the_stated_position(name, seed):
+    """All mice stop at once while gyro and motion go straight on: nothing shows the way, and the ± must say so."""
+    run = MiceRun(seed, 40.0, 100.0)
+    block = run.measurements()
+    truth = np.column_stack(list(run.at(block.time_s).columns().values())[1:])
+    straight = (np.abs(truth[:, 5]) < 0.15) & (np.hypot(truth[:, 3], truth[:, 4]) > 0.25)
+    turns = np.flatnonzero(np.diff(np.concatenate(([0], straight.astype(int), [0]))))
+    first, last = max(zip(turns[::2], turns[1::2], strict=True), key=lambda span: span[1] - span[0])
+    first, last = first + 5, min(first + 155, last - 5)
+    counts = block.mice_counts.copy()
+    counts[first:last] = 0
+    sound, lifted = (filters.create(name, run.rig).process(b) for b in (block, replace(block, mice_counts=counts)))
+    off = np.hypot(*errors(run, lifted, block.time_s)[:, :2].T)
+    std = np.hypot(lifted[:, 6], lifted[:, 7])
+    assert off[last] > 0.1 > np.hypot(*errors(run, sound, block.time_s)[last, :2])
+    assert np.all(off[first + 20 :] < 3.0 * std[first + 20 :])
+    assert std[-1] < 2.0 * off[-1]

@@ -170,3 +170,14 @@ def test_a_c3d_file_that_states_more_than_it_holds_is_refused_before_memory_is_r
     path.write_bytes(data)
     with pytest.raises(FileFormatError, match=reason):
         read_any(path, None)
+
+
+def test_a_c3d_file_on_which_ezc3d_crashes_is_named(tmp_path):
+    """A parameter that a flipped bit has made a group: the process that reads it ends by a segmentation fault."""
+    path = c3d(tmp_path / "take.c3d", ["S_O", "S_X", "S_Y"])
+    data = bytearray(path.read_bytes())
+    at = data.index(b"\x0c\x02DESCRIPTIONS") + 1
+    data[at] = 130
+    path.write_bytes(bytes(data))
+    with pytest.raises(FileFormatError, match=r"take.c3d is damaged or no C3D file: .*; export the take again"):
+        read_any(path)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from linkpose.localization.settings import Settings
     from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
+    from linkpose.plotting import Scene
 
 # The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
 # value for streams, laser scans, and logs of fewer than 100 measurements.
@@ -216,6 +217,13 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of --filter mcl.")
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
+    "--plot",
+    "picture",
+    type=options.FILE,
+    metavar="PICTURE",
+    help="Draw the paths with 2σ ellipses over the map or the beacons, and the truth (.png, .pdf, .svg).",
+)
+@click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
 @options.force
@@ -227,6 +235,7 @@ def command(
     odometry_path: Path | None,
     filters: tuple[str, ...],
     output: Path | None,
+    picture: Path | None,
     truth_path: Path | None,
     force: bool,
     json_lines: bool,
@@ -253,6 +262,10 @@ def command(
         _stream(settings, filters, beacons)
         return
     truth = read_truth(truth_path) if truth_path else None
+    if picture is not None:
+        from linkpose.plotting import check_output
+
+        check_output(picture, force)
     carmen = is_carmen(log)
     read = read_carmen(log) if carmen else read_events(log)
     for remark in read.remarks:
@@ -291,10 +304,31 @@ def command(
     options.refuse_mixed_output(output, json_lines)
     if output is not None:
         write_tracks(output, tracks, log, force)
+    if picture is not None:
+        from linkpose.plotting import Scene
+
+        _draw(picture, tracks, log, [truth_path] if truth_path else [], Scene(grid, beacons), force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
+
+
+def _draw(
+    picture: Path, tracks: dict[str, Track], log: Path, references: list[Path], scene: Scene, force: bool
+) -> None:
+    """Draws the paths as `plot` draws them from their file."""
+    import tempfile
+
+    from linkpose import plotting
+    from linkpose.evaluation.references import read_for_picture
+
+    with tempfile.TemporaryDirectory() as folder:
+        estimates = Path(folder) / "path.csv"
+        write_tracks(estimates, tracks, log, force=False)
+        tables = [read_for_picture(path, "z", lambda share: None) for path in (estimates, *references)]
+        figure, _ = plotting.plot_tables(tables, [], scene)
+        plotting.save(figure, picture, force)
 
 
 def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:

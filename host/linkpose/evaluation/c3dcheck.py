@@ -12,6 +12,7 @@ import struct
 _BLOCK = 512
 _BIG_ENDIAN = 86  # the processor type of the parameter section; 84 and 85 are little-endian
 _SIZES = {-1: 1, 1: 1, 2: 2, 4: 4}  # bytes of a value by the type of a parameter
+_MOST_DIMENSIONS = 7  # of a parameter
 _FACTS = ("USED", "FRAMES", "RATE")  # of the groups POINT, ANALOG and ROTATION: ezc3d reserves memory by them
 
 
@@ -62,6 +63,8 @@ def _parameters(data: bytes, at: int, order: str) -> dict[str, list[float]]:
 def _first_value(data: bytes, at: int, order: str) -> float | None:
     """The first value of a parameter; None for text and for none. Raises Damaged where its values exceed the file."""
     kind, dimensions = struct.unpack_from("bB", data, at)
+    if dimensions > _MOST_DIMENSIONS:
+        raise Damaged(f"a parameter has {dimensions} dimensions")
     sizes = data[at + 2 : at + 2 + dimensions]
     start = at + 2 + dimensions
     if kind not in _SIZES or start + _SIZES[kind] * math.prod(sizes) > len(data):

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from linkpose.errors import FileFormatError
 from linkpose.evaluation.errors import CommonStart, errors_of
 from linkpose.evaluation.references import read_take
 from linkpose.evaluation.scores import (
@@ -44,6 +45,9 @@ _STRETCHES, _STRETCH_ROWS = 100, 1000
 _FAR_S = 1e300  # stamps beyond are infinite
 # Rows that are scored at once, and rows of the other file that may belong to them. Twice of it doubles the memory.
 _PIECE_ROWS, _MOST_OTHER_ROWS = 50_000, 200_000
+# Rows of one file at once; ten times as many as the usual step gives. Twice of it doubles the memory of a file whose
+# stamps do not increase.
+_MOST_HELD_ROWS = 10 * _MOST_OTHER_ROWS
 _KEPT_FOR_PICTURES = 0.4  # of the rows that the picture of a table has. Twice of it doubles their memory
 
 
@@ -179,11 +183,14 @@ class _Reader:
     """Reads stretches of time from a file, each beginning no earlier than the one before."""
 
     def __init__(self, source: _Source, progress: Progress) -> None:
-        self._parts = source.parts(progress)
+        self._path, self._parts = source.path, source.parts(progress)
         self._held: list[Part] = []
 
     def within(self, span: _Span) -> dict[str, Floats]:
-        """The columns of the rows in this stretch, and of one more row on either side."""
+        """The columns of the rows in this stretch, and of one more row on either side.
+
+        Raises FileFormatError where the stretch has far more rows than the usual step between two rows allows.
+        """
         while len(self._held) > 1 and self._held[1].columns["time_s"][0] < span.start:
             del self._held[0]
         while not self._held or self._held[-1].columns["time_s"][-1] <= span.stop:
@@ -193,6 +200,12 @@ class _Reader:
             if self._held and part.columns["time_s"][0] < span.start:
                 self._held.clear()
             self._held.append(part)
+            if sum(map(len, self._held)) > _MOST_HELD_ROWS:
+                raise FileFormatError(
+                    self._path,
+                    f"{self._path} has more than {_MOST_HELD_ROWS} rows at about {span.start:.6g} s: "
+                    "its time_s must increase",
+                )
         columns = {name: np.concatenate([part.columns[name] for part in self._held]) for name in self._held[0].columns}
         time_s = columns["time_s"]
         first, last = int(np.searchsorted(time_s, span.start)), int(np.searchsorted(time_s, span.stop, "right"))

@@ -7,14 +7,17 @@ Three markers on the sensor are used, as `linkpose.evaluation.takes` describes: 
 from __future__ import annotations
 
 import importlib
+import json
+import subprocess
+import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from linkpose.errors import FileFormatError, LinkposeError, MissingLibrary
-from linkpose.evaluation.c3dcheck import check_sizes
+from linkpose.evaluation.c3dcheck import Damaged, check_sizes
 from linkpose.evaluation.takes import reference_of, take_of_markers
 from linkpose.recording.chunks import read_bytes
 from linkpose.recording.delimited import text_lines, to_utf8
@@ -24,6 +27,8 @@ from linkpose.sensors.measurements import Floats
 _METRES = {"m": 1.0, "meters": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, "mm": 0.001, "millimeters": 0.001}
 _FARTHEST_M = 1e6
 _LARGEST = 1e15  # of a coordinate in any unit; larger ones count as hidden
+_LONGEST_S = 60  # to read a C3D file: an hour of ten markers takes 1 s
+_LONGEST_REASON = 200
 _HEAD_LINES = 5  # of a TRC file, before its frames
 
 
@@ -43,28 +48,55 @@ def read_c3d(path: Path, up: str | None) -> Table:
     Raises MissingLibrary without ezc3d, and LinkposeError naming the file and what is missing in it.
     """
     try:
-        ezc3d: Any = importlib.import_module("ezc3d")
+        importlib.import_module("ezc3d")
     except ImportError as error:
         raise MissingLibrary("ezc3d", path) from error
-    data = read_bytes(path)
     try:
-        check_sizes(data)
-        file = ezc3d.c3d(str(path))
-        points: dict[str, Any] = file["parameters"]["POINT"]
-        positions = np.array(file["data"]["points"], dtype=np.float64)[:3].transpose(2, 1, 0)
-        positions[~(np.abs(positions) < _LARGEST)] = np.nan
-        names = [str(name) for name in points["LABELS"]["value"]]
-        rate_hz = float(points["RATE"]["value"][0])
-        unit = str(points.get("UNITS", {}).get("value", ["mm"])[0])
-        screen = str(points.get("Y_SCREEN", {}).get("value", [""])[0])
-        first = int(file["header"]["points"]["first_frame"])
-    except Exception as error:  # ezc3d's own errors are of many types, RuntimeError and KeyError among them
+        check_sizes(read_bytes(path))
+        positions, names, rate_hz, unit, screen, first = _read_in_child(path)
+    except (Damaged, subprocess.TimeoutExpired) as error:
         raise FileFormatError(path, f"{path} is damaged or no C3D file: {error}; export the take again") from error
+    positions[~(np.abs(positions) < _LARGEST)] = np.nan
     if not 0 < rate_hz < _FARTHEST_M:
         raise FileFormatError(path, f"{path} states a rate of {rate_hz:g} Hz; export the take again")
     time_s = (first + np.arange(len(positions))) / rate_hz
     axis = up or (screen[-1:].lower() if screen[-1:].lower() in ("y", "z") else "z")
     return _reference(path, time_s, names, positions, unit, axis)
+
+
+# ezc3d crashes on some damaged files. A process of its own crashes alone.
+_CHILD = """
+import json, sys
+import ezc3d
+import numpy
+file = ezc3d.c3d(sys.argv[1])
+points = file["parameters"]["POINT"]
+facts = [
+    [str(name) for name in points["LABELS"]["value"]],
+    float(points["RATE"]["value"][0]),
+    str(points.get("UNITS", {}).get("value", ["mm"])[0]),
+    str(points.get("Y_SCREEN", {}).get("value", [""])[0]),
+    int(file["header"]["points"]["first_frame"]),
+]
+positions = numpy.array(file["data"]["points"], dtype=numpy.float64)[:3].transpose(2, 1, 0)
+numpy.savez(sys.argv[2], positions=positions, facts=json.dumps(facts))
+"""
+
+
+def _read_in_child(path: Path) -> tuple[Floats, list[str], float, str, str, int]:
+    """Positions (N, markers, 3), names, rate (Hz), unit, vertical axis of the screen, and number of the first frame.
+
+    Raises Damaged where ezc3d cannot read the file.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder, "take.npz")
+        child = [sys.executable, "-c", _CHILD, str(path.resolve()), str(out)]
+        done = subprocess.run(child, capture_output=True, text=True, errors="replace", timeout=_LONGEST_S)
+        if done.returncode:
+            last = (done.stderr.strip().splitlines() or ["ezc3d has crashed"])[-1]
+            raise Damaged(last[:_LONGEST_REASON] if done.returncode > 0 else "ezc3d has crashed")
+        with np.load(out) as found:
+            return found["positions"], *json.loads(str(found["facts"]))
 
 
 def read_trc(path: Path, up: str | None) -> Table:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 import os
 import re
@@ -117,12 +118,24 @@ def read_events(path: Path) -> LogFile:
 
 
 def stream_events(lines: Iterable[str], path: Path) -> Iterator[Event]:
-    """The measurements of the lines of a CSV log, one by one as they come, negative ranges among them."""
+    """The measurements of the lines of a CSV log, one by one as they come, negative ranges among them.
+
+    Semicolons and tabs separate cells too, then with decimal commas or points.
+    """
     header_seen = False
+    lines = iter(lines)
+    head: list[str] = []
+    for text in lines:  # up to the header, which shows the separator
+        head.append(text)
+        if text.strip() and not text.lstrip('"').startswith("#"):
+            break
+    separator = max((",", ";", "\t"), key=head[-1].count) if head else ","
     try:
-        for line, row in enumerate(csv.reader(lines), 1):
+        for line, row in enumerate(csv.reader(itertools.chain(head, lines), delimiter=separator), 1):
             if not row or not "".join(row).strip() or row[0].startswith("#"):
                 continue
+            if separator != ",":  # decimal commas
+                row = [cell.replace(",", ".") for cell in row]
             if header_seen:
                 yield _read_row(path, line, row)
             else:

@@ -12,6 +12,7 @@ from linkpose.compiling import inner
 from linkpose.filters.chain.state import BG, OF_SENSOR, Floats, Record, V
 from linkpose.filters.chain.update import clear_row, update
 
+_UNLEARNED = 0.5  # share of the prior variance above which a gyro bias has not been measured
 _REST_MEAN_S = 0.5  # over which readings are averaged to find rests
 
 
@@ -35,9 +36,13 @@ def update_velocity(s: Record, size: int, k: int, h: float, q: Record) -> float:
 def update_rest(s: Record, size: int, k: int, gyro: Floats, q: Record, noise: Floats) -> None:
     """At rest the rate is the gyro bias."""
     for row in range(3):
+        at = OF_SENSOR * k + BG + row
         clear_row(s)
-        s.row[OF_SENSOR * k + BG + row] = 1.0
-        update(s, size, gyro[k, row] - s.gyro_bias[k, row], noise[0] + q.rest_std_rad_s**2, q.huber)
+        s.row[at] = 1.0
+        innovation, variance = gyro[k, row] - s.gyro_bias[k, row], noise[0] + q.rest_std_rad_s**2
+        if s.covariance[at, at] > _UNLEARNED * q.gyro_bias_rad_s**2:  # it may be a sensor that nobody has calibrated
+            s.covariance[at, at] += innovation**2
+        update(s, size, innovation, variance, q.huber)
 
 
 @inner
@@ -54,5 +59,7 @@ def follow_rest(bank: Record, best: Record, k: int, gyro: Floats, accel: Floats,
         rate = max(rate, abs(bank.mean_gyro[k, i] - best.gyro_bias[k, i]))
     std = math.sqrt(p[o, o] + p[o + 1, o + 1] + p[o + 2, o + 2])
     allowed = min(q.most_rest_rad_s, 3 * std + 5 * q.rest_std_rad_s)
+    if std**2 > 3 * _UNLEARNED * q.gyro_bias_rad_s**2:
+        allowed = q.most_first_rest_rad_s
     steady = rate_off < q.rest_gyro_rad_s and force_off < q.rest_accel_m_s2 and rate < allowed
     bank.still_s[k] = bank.still_s[k] + h if steady else 0.0

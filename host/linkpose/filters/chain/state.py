@@ -92,7 +92,10 @@ class ChainParameters(NamedTuple):
     rest_accel_m_s2: float = 0.3
     rest_s: float = 0.3
     rest_std_rad_s: float = 0.001
-    most_rest_rad_s: float = 0.03  # largest rate that may be a bias: slower turns of links at a constant rate are rare
+    # Largest rate that may be a bias before the first rest (data sheet: ±20 °/s) and after it: slower turns of links at
+    # a constant rate are rare.
+    most_first_rest_rad_s: float = 0.35
+    most_rest_rad_s: float = 0.03
     huber: float = 3.0  # innovations beyond so many σ count less (P. J. Huber, 1964)
     # Successive innovations are correlated: log likelihoods of hypotheses count by this factor. [O]; doubled, a slow
     # start drops the true heading.
@@ -104,7 +107,7 @@ class ChainParameters(NamedTuple):
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
     speed_m_s: float = 0.3
-    gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a rest of 0.3 s finds any larger one
+    gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a first rest of 0.3 s finds any larger one
     accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
     lever_m: float = 0.3  # of an unknown r_k: links of people and robots
 

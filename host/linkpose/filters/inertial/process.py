@@ -79,6 +79,8 @@ _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
 # at 1200 °/s it changes by more between sound samples.
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0
 _JUMP_VARIANCES = 100.0  # and beyond the measured noise: six times the σ of a difference of two readings
+# By how much a rate beyond the gyro's range may exceed it (rad/s): a blow. Doubled, σ after one is twice as large.
+_LARGEST_EXCESS_RAD_S = 10.0
 _NO_JUMP = cast(bool, np.bool_(False))  # the compiler would take a Python constant for a type of its own
 _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 # Start in motion: angular acceleration (rad/s²) at rest, and per rad/s of rate (1/s).
@@ -265,8 +267,15 @@ def _turn(s: Record, step: float, has_rate: bool, rate: Vec, jumped: bool, imu: 
     if jumped:
         jerk = vec.minus(rate, newest)
         s.angle_variance += 0.25 * step * step * vec.dot(jerk, jerk)
-    smooth = has_rate and not jumped and s.blind_s == 0.0
-    vec.store(s.rate_slope, vec.scale(1.0 / step, vec.minus(rate, newest)) if smooth else (0.0, 0.0, 0.0))
+    change = vec.scale(1.0 / step, vec.minus(rate, newest))
+    pace = math.sqrt(vec.dot(change, change))
+    if s.blind_s > 0.0:  # a saturated or missing rate departs from the last as fast as it did before
+        s.rate_pace = max(pace, s.rate_pace)
+        error = min(s.rate_pace * s.blind_s, _LARGEST_EXCESS_RAD_S)
+        s.angle_variance += step * step * error * error
+    else:
+        s.rate_pace = pace
+        vec.store(s.rate_slope, (0.0, 0.0, 0.0) if jumped else change)
     s.turned_at += step
     vec.store(s.newest_rate, rate)
 
@@ -417,7 +426,8 @@ def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
         ahead = vec.axpy(1.0, vec.load(s.angle), ahead)
         ahead = vec.axpy(waited, vec.load(s.newest_rate), ahead)
         ahead = vec.axpy(s.time - time_s, bias, ahead)
-    ahead = vec.axpy(0.5 * min(waited + imu.delay, LONGEST_HOLD_S) ** 2, vec.load(s.rate_slope), ahead)
+    if s.blind_s == 0.0:
+        ahead = vec.axpy(0.5 * min(waited + imu.delay, LONGEST_HOLD_S) ** 2, vec.load(s.rate_slope), ahead)
     ahead = corrected(s.nominal, MG, ahead)
     tilt, north = vec.turn_back(ahead, vec.load(s.tilt)), vec.turn_back(ahead, vec.load(s.north))
     west, d = vec.cross(tilt, north), vec.load(s.j2s)

@@ -9,7 +9,7 @@ from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number
 from linkpose.filters.mice.least_squares import squared_speed
-from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
+from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.measure import arm, update
@@ -18,6 +18,14 @@ from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, 
 
 # How long mice that contradict the prediction are left out (s). Doubled: the velocity is held longer after a collision.
 _PATIENCE_S = 0.5
+# A change of velocity that only the mice show stays unconfirmed for at most so long (s), until mice and gyro agree on a
+# turn of so much (rad, within a share and a rate in rad/s), or until the velocity jumps back. The stated ± of the
+# position grows by the way that the robot went if the mice are wrong. Doubling the time doubles the ± after a collision
+# on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and this much (m/s, eight
+# times the rounding of three mice): small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
+_JUMP_M_S2, _JUMP_M_S = 6.0, 0.04
+_SPREAD_S = 0.05  # a jump spreads over two or three readings
+_UNCONFIRMED_S, _CONFIRMING_RAD, _AGREED_SHARE, _AGREED_RAD_S = 10.0, 0.2, 0.1, 0.05
 # Within one step a velocity changes by about this (m/s², rad/s²): the velocity is the mean over the step, the estimate
 # belongs to its end. Doubled: the stated ± of the velocity grows by half.
 _ACCEL_M_S2, _ANGULAR_RAD_S2 = 0.6, 1.2
@@ -155,10 +163,57 @@ def _correct(
         linear.moments(state, tangent[0], rig, m.mean_rate)
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
-    if not update(state, limit if state.refused_s < _PATIENCE_S else math.inf):
+    before = complex(state.at.vx, state.at.vy)
+    is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
+    if not update(state, limit if is_patient else math.inf):
         return False
+    _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
     return True
+
+
+@inner
+def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
+    """Begin to doubt the mice when their velocity jumps from one reading to the next, and end it when it is back.
+
+    `before` is the filter's velocity before this reading.
+    """
+    shown, last, limit = m.velocity, state.shown, _JUMP_M_S + _JUMP_M_S2 * dt
+    state.shown = shown
+    is_jump = square(shown - last) > limit * limit
+    if state.unconfirmed_s > 0.0:
+        state.unconfirmed_s += dt
+        is_back = is_jump and square(state.held - shown) < square(state.held - last)
+        if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
+            state.unconfirmed_s = -_SPREAD_S
+    elif state.unconfirmed_s < 0.0:
+        state.unconfirmed_s = min(state.unconfirmed_s + dt, 0.0)
+    elif is_jump and square(shown - state.earlier) > limit * limit:
+        state.held, state.unconfirmed_s, state.unconfirmed_turn, state.unconfirmed_m = state.earlier, dt, 0.0, 0.0
+    state.earlier = before
+
+
+@inner
+def _doubt_way(state: Record, m: Record, dt: float) -> None:
+    """The way that the robot goes if the mice are wrong, as variance of the position along it."""
+    if not state.unconfirmed_s > 0.0:
+        return
+    turn = m.mean_rate - state.at.bias
+    if abs(m.turn_rate - turn) < _AGREED_SHARE * abs(turn) + _AGREED_RAD_S and number(m.used) > 1:
+        state.unconfirmed_turn += abs(turn) * dt
+        if state.unconfirmed_turn > _CONFIRMING_RAD:
+            state.unconfirmed_s = 0.0
+            return
+    way = scaled(dt, turned(unit(state.at.heading), state.held - complex(state.at.vx, state.at.vy)))
+    length = math.sqrt(square(way))
+    if not length > 0.0:
+        return
+    grown = length * (2.0 * state.unconfirmed_m + length) / (length * length)
+    state.unconfirmed_m += length
+    state.covariance[X, X] += grown * way.real * way.real
+    state.covariance[Y, Y] += grown * way.imag * way.imag
+    state.covariance[X, Y] += grown * way.real * way.imag
+    state.covariance[Y, X] = state.covariance[X, Y]
 
 
 @inner
@@ -195,6 +250,7 @@ def _step(
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
+    _doubt_way(state, m, dt)
     _watch_floor(state, m, q)
     _calibrate(state, m, mice, rig)
 

@@ -69,6 +69,13 @@ _FIELDS = [
     ("floors", "i8"),  # how often the floor has changed
     ("chi2", "f8"),  # of the last innovation
     ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
+    # A sudden change of velocity that only the mice show: a collision, or a lift or slip on a straight.
+    ("held", "c16"),  # velocity before it, in the robot's axes (m/s)
+    ("shown", "c16"),  # velocity of the last reading (m/s)
+    ("earlier", "c16"),  # the filter's velocity before the last reading (m/s)
+    ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
+    ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
+    ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
