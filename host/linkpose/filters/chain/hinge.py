@@ -127,8 +127,9 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
             s.row[hinge + AXES + 3 + c] = -s.rotation[1, row, c]
         value = s.a[row] - s.b[row]
         found += value * value
-        expected += expected_square(s, size)
-        likelihood += min(update(s, size, -value, variance, q.huber)[0] + density, 0.0)
+        fit, share = update(s, size, -value, variance, q.huber)
+        likelihood += min(fit + density, 0.0)
+        expected += share
     s.play_square += min(h / q.play_s, 1.0) * (max(found - expected, 0.0) / 2 - s.play_square)
     return likelihood
 

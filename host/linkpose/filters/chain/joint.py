@@ -16,7 +16,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import cross, rotate, square
 from linkpose.filters.chain.state import BG, OF_SENSOR, Floats, R, Record, V
-from linkpose.filters.chain.update import clear_row, expected_square, update
+from linkpose.filters.chain.update import clear_row, update
 
 # Square of a rate over its noise variance from which on it updates the lever that it multiplies (errors in variables).
 _CLEAR = 30.0
@@ -86,8 +86,9 @@ def update_joint(s: Record, size: int, first: int, gyro: Floats, h: float, q: Re
         for k in range(2):
             value += _add_side(s, k, row, 2.0 * k - 1.0, gyro, s.lever[k], OF_SENSOR * k + R, noise)
         found += value * value
-        expected += expected_square(s, size)
-        likelihood += update(s, size, -value, variance, q.huber)[0]
+        fit, share = update(s, size, -value, variance, q.huber)
+        likelihood += fit
+        expected += share
     if first == 0:
         _follow_residual(s, found, expected, own, variance, reach, h, q)
     return likelihood
