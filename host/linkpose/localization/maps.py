@@ -79,15 +79,25 @@ def save_map(path: Path, occupied: NDArray[np.bool_], resolution: float, origin:
         raise LinkposeError(f"cannot write the map {path}: {error.strerror}; choose another place") from error
 
 
+_DEEPEST = 20  # levels of a map's YAML; a map file has two
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
     """The keys of a map file. YAML aliases are refused: nested ones expand to any size."""
     import yaml
 
     class Loader(yaml.SafeLoader):
+        depth = 0
+
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
                 raise LinkposeError(f"{path} uses YAML aliases (*name); write each value out")
-            return super().compose_node(parent, index)
+            self.depth += 1
+            if self.depth > _DEEPEST:  # the scanner's time grows with the square of the depth
+                raise RecursionError
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
 
     try:
         with path.open("rb") as file:

@@ -488,6 +488,8 @@ def _std(s: Record, across: Vec, along: float, towards: Vec) -> float:
         g[i], g[3 + i] = across[i], towards[i]
     g[6] = along
     for i in range(7):
+        if g[i] == 0.0:  # an angle does not depend on J2S
+            continue
         row = i if i < 3 else i + D - 3  # J2S and ψ are neighbours
         part = 0.5 * g[i] * p[row, row]
         for j in range(i):
