@@ -79,7 +79,7 @@ def test_a_filter_needs_what_its_capabilities_say():
 
 
 def test_smoothing_needs_a_filter_with_a_smoother():
-    with pytest.raises(LinkposeError, match=r"no filter that can be smoothed \(joint-inertial\) runs"):
+    with pytest.raises(LinkposeError, match=r"no filter that can be smoothed \(joint-inertial, chain\) runs"):
         Estimator(("tilt",), RIG, filters.ALL_SENSORS).smooth()
     estimator = Estimator(("tilt", "joint-inertial"), RIG, filters.ALL_SENSORS)
     estimator.smooth()
