@@ -34,6 +34,7 @@ from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
 from linkpose.page.panel import with_gap_rows
 from linkpose.quantities import by_filter
+from linkpose.rotations import product
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.chain import ChainRun
 
@@ -347,5 +348,5 @@ def test_turns_follow_each_other_as_their_product() -> None:
     first, second = geometry.attitude(10.0, 0.0, 30.0), geometry.attitude(-20.0, 40.0, 5.0)
     vector = np.array([0.3, -1.0, 2.0])
     one_by_one = geometry.turned(first, geometry.turned(second, vector))
-    assert geometry.turned(geometry.product(first, second), vector) == pytest.approx(one_by_one)
+    assert geometry.turned(product(first, second), vector) == pytest.approx(one_by_one)
     assert geometry.turned(geometry.attitude(0.0, 0.0, 90.0), np.eye(3)[0]) == pytest.approx(np.eye(3)[1])

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 # From the bottom up. A part imports parts of lower levels only; those of one level do not import each other, except as
 # listed. A string that names a module of linkpose, for import_module or for pyserial, counts as an import.
 LEVELS = [
-    {"lean_compiler"},
+    {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
     {"wire", "presentation"},
     {"sensors"},

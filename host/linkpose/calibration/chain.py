@@ -49,6 +49,7 @@ from linkpose.calibration.normal_equations import Sums, correlation
 from linkpose.calibration.rests import find_rests
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
+from linkpose.rotations import of_matrices, rotation_vectors
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Chain, Rig, Vector, to_vector
 
@@ -492,7 +493,7 @@ def _hinge_step(part: _Rotations, turn: Floats, axes: Floats) -> _Step:
     by_axes = np.concatenate([part.one, -turn @ part.two], axis=2)  # (N, 3, 6)
     by_turn = cross_matrices(seen)  # −(δ × T R C_2 j_2)
     weight = _AXIS_STEP_S / _PLAY_CORRELATION_S / _PLAY_STD_RAD**2
-    away = _rotation_vectors(turn[None])[0]
+    away = rotation_vectors(of_matrices(turn[None]))[0]
     inner = weight * np.einsum("nia,nib->ab", by_turn, by_turn) + part.information
     mixed = weight * np.einsum("nia,nip->ap", by_turn, by_axes)
     pull = weight * np.einsum("nia,ni->a", by_turn, play) + part.information @ away
@@ -543,12 +544,3 @@ def _nearest_on_axis(levers: Floats, covariance: Floats, axes: Floats) -> tuple[
     along = np.concatenate(list(axes)) / np.sqrt(2.0)
     across = np.eye(6) - np.outer(along, along)
     return (across @ levers.ravel()).reshape(2, 3), across @ covariance @ across.T
-
-
-def _rotation_vectors(rotation: Floats) -> Floats:
-    """(N, 3) rotation vectors (rad) of rotation matrices (N, 3, 3), by at most a half turn."""
-    odd = np.stack([rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0],
-                    rotation[:, 1, 0] - rotation[:, 0, 1]], axis=1)  # fmt: skip
-    sine = 0.5 * np.linalg.norm(odd, axis=1)
-    cosine = 0.5 * (np.trace(rotation, axis1=1, axis2=2) - 1)
-    return np.asarray(0.5 * odd * (np.arctan2(sine, cosine) / np.maximum(sine, 1e-12))[:, None])

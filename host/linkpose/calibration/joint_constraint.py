@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.rotations import product
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Imu
 from linkpose.wire.messages import SampleFlags
@@ -210,7 +211,7 @@ def attitudes(time_s: Floats, rate: Floats) -> Floats:
     q = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps])
     reach = 1
     while reach < len(q):  # products of all quaternions up to each, doubling how many are in
-        q = np.concatenate([q[:reach], _product(q[:-reach], q[reach:])])
+        q = np.concatenate([q[:reach], product(q[:-reach], q[reach:])])
         reach *= 2
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     rows = [
@@ -218,13 +219,6 @@ def attitudes(time_s: Floats, rate: Floats) -> Floats:
         2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return np.stack(rows, axis=1).reshape(-1, 3, 3)
-
-
-def _product(p: Floats, q: Floats) -> Floats:
-    """Quaternion products (N, 4), the scalar first."""
-    scalar = p[:, 0] * q[:, 0] - (p[:, 1:] * q[:, 1:]).sum(axis=1)
-    vector = p[:, :1] * q[:, 1:] + q[:, :1] * p[:, 1:] + np.cross(p[:, 1:], q[:, 1:])
-    return np.column_stack([scalar, vector])
 
 
 def _integral(time_s: Floats, values: Floats) -> Floats:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from linkpose import filters
 from linkpose.evaluation.statistics import Statistics
 from linkpose.quantities import CHAIN_ROTATION, HEADING, POSE, ROTATION, VX, VY, WZ, YAW, Quantity, X, Y, Z
+from linkpose.rotations import wrapped
 from linkpose.sensors.measurements import Floats
 
 Values = Mapping[Quantity, Floats]  # (N,) each; angles in radians
@@ -150,13 +151,9 @@ def _vector(time_s: Floats, errors: Values, parts: list[Quantity], unit: str, la
     return Errors(time_s, _in_score_unit(unit) * size, None, unit, label)
 
 
-def _wrapped(angle: Floats) -> Floats:
-    return (angle + np.pi) % (2 * np.pi) - np.pi
-
-
 def _difference(quantity: Quantity, ours: Floats, theirs: Floats) -> Floats:
     error = ours - theirs
-    return _wrapped(error) if quantity.is_angle else error
+    return wrapped(error) if quantity.is_angle else error
 
 
 def _first_common(errors: Values, needed: tuple[Quantity, ...]) -> int | None:
@@ -173,14 +170,14 @@ def _from_common_start(ours: Values, errors: Values, start: _Place, start_error:
     return {
         X: moved_x - x + errors[X] - start_error[X],
         Y: moved_y - y + errors[Y] - start_error[Y],
-        HEADING: _wrapped(errors[HEADING] + turn),
+        HEADING: wrapped(errors[HEADING] + turn),
     }
 
 
 def _from_common_yaw(ours: Values, theirs: Values, errors: Values, start_error: float) -> dict[Quantity, Floats]:
     """Errors of a link's yaw and horizontal position, turned to agree in yaw at the common start."""
     turn = -start_error
-    turned: dict[Quantity, Floats] = {YAW: _wrapped(errors[YAW] + turn)}
+    turned: dict[Quantity, Floats] = {YAW: wrapped(errors[YAW] + turn)}
     if X in ours and Y in ours:
         x, y = ours[X], ours[Y]
         turned[X] = np.cos(turn) * x - np.sin(turn) * y - theirs[X]

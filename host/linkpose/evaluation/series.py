@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.recording.table import LONGEST_HOLE
+from linkpose.rotations import wrapped
 from linkpose.sensors.measurements import Floats
 
 # An offset is taken only if it is more than half a sample and leaves less than this share of the residual.
@@ -108,7 +109,7 @@ def difference(estimate: Series, reference: Series, offset_s: float) -> Floats:
     ours, theirs = paired(estimate, reference, offset_s)
     error = ours - theirs
     if estimate.is_angle:
-        error = (error + np.pi) % (2 * np.pi) - np.pi
+        error = wrapped(error)
     return error
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from linkpose.rotations import wrapped
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.drive import Hastened, Manoeuvres
@@ -115,4 +116,4 @@ def errors_from_first(pose: Floats, truth: Floats) -> Floats:
     c, s = math.cos(truth[0, 2]), math.sin(truth[0, 2])
     way = (truth[:, :2] - truth[0, :2]) @ np.array([[c, -s], [s, c]])
     turn = pose[:, 2] - (truth[:, 2] - truth[0, 2])
-    return np.column_stack([pose[:, :2] - way, (turn + math.pi) % (2.0 * math.pi) - math.pi])
+    return np.column_stack([pose[:, :2] - way, wrapped(turn)])

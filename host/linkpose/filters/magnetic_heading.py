@@ -31,6 +31,7 @@ import numpy as np
 
 from linkpose.errors import CannotRun, UncalibratedMagnetometer
 from linkpose.filters import Filter
+from linkpose.rotations import wrapped
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Mag
 
@@ -294,7 +295,7 @@ class MagneticHeading:
         self._correct(measured, innovation, variance)
         self._strength_square += _WINDOW_S / _STRENGTH_S * (window.strength_square - self._strength_square)
         if self._foreign_uT == 0.0:
-            self.found.north_deg = math.degrees(_wrapped(float(self._mean[_NORTH])))
+            self.found.north_deg = math.degrees(wrapped(float(self._mean[_NORTH])))
 
     def _accept_anew(self, window: _Window, is_same: bool) -> None:
         """Take a field that was rejected but is steady: the old one but for a small angle, or a new reference."""
@@ -353,7 +354,7 @@ class MagneticHeading:
         An error of the tilt turns the direction by the tangent of the dip.
         """
         measured = np.array([1.0, 0.0, 1.0, 1.0])
-        innovation = _wrapped(window.direction_rad - float(measured @ self._mean))
+        innovation = wrapped(window.direction_rad - float(measured @ self._mean))
         tilt = window.field_uT[2] / window.level_uT * window.tilt_std_rad
         scatter = window.scatter_uT / window.level_uT
         return innovation, measured, _DIRECTION_RAD**2 + float(tilt) ** 2 + scatter**2 / _SWINGS
@@ -377,7 +378,7 @@ class MagneticHeading:
         if self._dip_deg is not None:
             strength, vertical = self._calibrated_uT, -self._calibrated_uT * math.sin(math.radians(self._dip_deg))
         level = math.sqrt(max(strength**2 - vertical**2, 0.0))
-        turned = _wrapped(window.direction_rad - float(self._mean[_DRIFT] + self._mean[_NORTH]))
+        turned = wrapped(window.direction_rad - float(self._mean[_DRIFT] + self._mean[_NORTH]))
         aside, along = window.level_uT * math.sin(turned), window.level_uT * math.cos(turned)
         return math.sqrt(aside**2 + (along - level) ** 2 + float(window.field_uT[2] - vertical) ** 2)
 
@@ -397,7 +398,3 @@ def _level_axes(field: Floats, roll: Floats, pitch: Floats, yaw: Floats) -> Floa
     return np.column_stack(
         [np.cos(yaw) * ahead - np.sin(yaw) * across, np.sin(yaw) * ahead + np.cos(yaw) * across, vertical]
     )
-
-
-def _wrapped(angle: float) -> float:
-    return (angle + math.pi) % (2 * math.pi) - math.pi

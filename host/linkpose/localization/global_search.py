@@ -11,6 +11,7 @@ from linkpose.compiling import compiled
 from linkpose.localization.distance_field import Field, distance_at
 from linkpose.localization.grid import FREE, GridMap
 from linkpose.localization.linalg import Floats
+from linkpose.rotations import wrapped
 
 # Spacing of the grid of poses. A beam of 5 m then ends within 0.3 m + 5 m x 0.065 rad of where it ends from the nearest
 # grid pose, well inside the distance field. Halving both takes eight times as long and finds the same poses.
@@ -86,7 +87,7 @@ def _separate(places: Floats, headings: Floats, scores: NDArray[np.float32], mos
     for index in best:
         place, heading = divmod(int(index), len(headings))
         pose = np.array([*places[place], headings[heading]])
-        turned = np.abs((chosen[:, 2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi)
+        turned = np.abs(wrapped(chosen[:, 2] - pose[2]))
         near = np.hypot(chosen[:, 0] - pose[0], chosen[:, 1] - pose[1]) < SAME_PLACE_M
         if not (near & (turned < SAME_HEADING_RAD)).any():
             chosen = np.vstack((chosen, pose))

@@ -23,6 +23,7 @@ from linkpose.localization.scan_matching import beam_ends
 from linkpose.localization.settings import Settings
 from linkpose.localization.track import Track
 from linkpose.localization.vehicle import first_pose
+from linkpose.rotations import wrapped
 
 # AMCL's defaults: odom_alpha1..4, laser_z_hit, laser_z_rand, laser_sigma_hit, laser_likelihood_max_dist,
 # laser_max_beams, update_min_d, update_min_a.
@@ -139,7 +140,7 @@ def _moments(particles: Floats, weights: Floats) -> tuple[Floats, Floats]:
     heading = math.atan2(float(weights @ np.sin(particles[:, 2])), float(weights @ np.cos(particles[:, 2])))
     mean = np.array([weights @ particles[:, 0], weights @ particles[:, 1], heading])
     off = particles - mean
-    off[:, 2] = (off[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
+    off[:, 2] = wrapped(off[:, 2])
     return mean, (off.T * weights) @ off
 
 

@@ -22,6 +22,7 @@ from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE, KalmanFilter, Motion
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import Sensors
+from linkpose.rotations import wrapped
 
 # Of the latest so many measurements, so many contradict the pose: fewer are outliers, more delay the recovery.
 LATEST, CONTRADICTIONS = 4, 3
@@ -237,7 +238,7 @@ class _Problem:
         seen = self.has_bearing
         flat = np.maximum(dx * dx + dy * dy, 1e-6)[:, seen]
         off = self.bearings - (np.arctan2(-dy, -dx) - angle - self.turned)
-        off = ((off + np.pi) % (2.0 * np.pi) - np.pi)[:, seen] / self.bearing_std[seen]
+        off = wrapped(off)[:, seen] / self.bearing_std[seen]
         turn = np.zeros((*flat.shape, poses.shape[1]))
         by_x, by_y = -dy[:, seen] / flat, dx[:, seen] / flat
         turn[..., 0], turn[..., 1] = by_x, by_y

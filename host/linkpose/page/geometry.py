@@ -30,12 +30,6 @@ def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
     ])  # fmt: skip
 
 
-def product(a: Floats, b: Floats) -> Floats:
-    """The quaternion (4,) a b: first the rotation b, then a."""
-    scalar = a[0] * b[0] - a[1:] @ b[1:]
-    return np.concatenate([[scalar], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
-
-
 def turned(q: Floats, vector: Floats) -> Floats:
     """A vector (3,) after the rotation by the quaternion q (4,)."""
     across = 2 * np.cross(q[1:], vector)

@@ -12,6 +12,7 @@ import numpy as np
 from linkpose.page import geometry
 from linkpose.presentation import Row, best_filter
 from linkpose.quantities import CHAIN_ROTATION, HEADING, HEIGHT, PITCH, QW, ROLL, YAW, Quantity, X, Y
+from linkpose.rotations import product
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -252,7 +253,7 @@ class ChainScene:
             self._joint.position = self._base_m - geometry.turned(attitude, self._fixed_m)
         self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
-            self._links[1].wxyz = geometry.product(attitude, rotation / np.linalg.norm(rotation))
+            self._links[1].wxyz = product(attitude, rotation / np.linalg.norm(rotation))
         radius = geometry.cone_radius(self._reach_m, values.get(QW, nothing)[1]) if is_known else 0.0
         self._cone.visible = radius > 0.0
         if radius > 0.0:

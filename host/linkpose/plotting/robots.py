@@ -13,6 +13,7 @@ from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
+from linkpose.rotations import rotation_vectors
 from linkpose.sensors.devices import MAX_MICE
 from linkpose.sensors.measurements import Floats
 
@@ -216,9 +217,8 @@ def rotation(axes: Axes, sources: Sources) -> None:
     for track in sources.all:
         if not track.has(*CHAIN_ROTATION):
             continue
-        w, x, y, z = (track.values[q] for q in CHAIN_ROTATION)
-        vector = _rotation_vector(w, np.stack([x, y, z]))
-        for axis, value in zip("xyz", vector, strict=True):
+        vectors = np.degrees(rotation_vectors(np.column_stack([track.values[q] for q in CHAIN_ROTATION])))
+        for axis, value in zip("xyz", vectors.T, strict=True):
             style: dict[str, Any] = {"color": AXES_COLOURS[axis], "linewidth": 1.6}
             label = f"{track.label} {axis}"
             if not track.name:
@@ -227,12 +227,3 @@ def rotation(axes: Axes, sources: Sources) -> None:
     shade_unknown(axes, sources.tracks)
     finish(axes, "rotation of the joint (°)")
     legend_above(axes)
-
-
-def _rotation_vector(w: Floats, v: Floats) -> Floats:
-    """(3, N) in degrees, of the rotation by at most 180°."""
-    sign = np.where(w < 0, -1.0, 1.0)
-    length = np.linalg.norm(v, axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        factor = np.where(length > 0, 2 * np.arctan2(length, np.abs(w)) / length, 2.0)
-    return np.degrees(sign * v * factor)

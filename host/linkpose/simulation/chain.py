@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.rotations import of_matrices
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import CHAIN_JOINTS, Chain, Imu, Joint, Rig, Vector, to_vector
 from linkpose.simulation.link import LinkRun
@@ -128,7 +129,7 @@ class ChainRun(LinkRun):
         """Sensor 1 as a link's; R as a quaternion, the angle of a hinge, and the heights of both sensors."""
         link, relative = self.at(time_s), self.relative(time_s)
         columns = dict(super().truth_columns(time_s))
-        columns |= dict(zip(("qw", "qx", "qy", "qz"), quaternions(relative.rotation).T, strict=True))
+        columns |= dict(zip(("qw", "qx", "qy", "qz"), of_matrices(relative.rotation).T, strict=True))
         if self.joint == "hinge":
             columns["angle_deg"] = (np.degrees(relative.angle_rad) + 180.0) % 360.0 - 180.0
         below = link.tilt @ (self._d - self._r1) + self.second_link(time_s).tilt @ self._r2
@@ -141,22 +142,6 @@ def about(axis: Floats, angle_rad: Floats) -> Floats:
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     sine, cosine = np.sin(angle_rad)[:, None, None], np.cos(angle_rad)[:, None, None]
     return np.asarray(np.eye(3) + sine * cross + (1 - cosine) * (cross @ cross))
-
-
-def quaternions(rotation: Floats) -> Floats:
-    """Unit quaternions (N, 4) of rotation matrices (N, 3, 3); the scalar comes first and is not negative.
-
-    The largest of the four numbers follows from the diagonal, the others from it (S. W. Shepperd, 1978).
-    """
-    r = np.moveaxis(rotation, 0, 2)
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
-    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
-    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
-    xx, yy, zz = (1 + 2 * r[i, i] - trace for i in range(3))
-    rows = np.array([[1 + trace, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]])
-    q = rows[np.argmax([1 + trace, xx, yy, zz], axis=0), :, np.arange(len(rotation))]
-    q *= np.where(q[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(q)
 
 
 def _back(rotation: Floats, vectors: Floats) -> Floats:

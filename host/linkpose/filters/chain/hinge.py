@@ -13,9 +13,9 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import inner
+from linkpose.filters import _vector as vec
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
 from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
-from linkpose.filters.chain.stops import wrapped
 from linkpose.filters.chain.update import clear_row, expected_square, update
 
 # The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
@@ -144,7 +144,7 @@ def hinge_angle(s: Record) -> float:
     x = q[0] * r[1] - q[1] * r[0] - (q[2] * r[3] - q[3] * r[2])
     y = q[0] * r[2] - q[2] * r[0] - (q[3] * r[1] - q[1] * r[3])
     z = q[0] * r[3] - q[3] * r[0] - (q[1] * r[2] - q[2] * r[1])
-    return wrapped(2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w))
+    return vec.wrapped(2 * math.atan2(x * axis[0] + y * axis[1] + z * axis[2], w))
 
 
 @inner

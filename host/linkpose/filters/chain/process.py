@@ -21,7 +21,7 @@ from linkpose.filters.chain.motion import follow_rest, update_rest, update_veloc
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, R, Record, V
-from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop, wrapped
+from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop
 from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
 from linkpose.filters.frozen import is_frozen
 from linkpose.wire.messages import SampleFlags
@@ -320,12 +320,12 @@ def _report_angle(best: Record, states: Record, out: Record) -> None:
         s = states[i]
         if s.alive and s.has_axis > 0.0:
             weight = math.exp(s.odds)
-            turned = wrapped(hinge_angle(s) - first)
+            turned = vec.wrapped(hinge_angle(s) - first)
             weights += weight
             mean += weight * turned
             square += weight * (turned * turned + s.angle_std**2)
     mean /= weights
-    out.angle = wrapped(first + mean)
+    out.angle = vec.wrapped(first + mean)
     out.angle_std = min(math.sqrt(max(square / weights - mean * mean, 0.0)), math.pi)
 
 

@@ -13,13 +13,13 @@ Trans. Automatic Control 14(4), 1969.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from linkpose.filters.chain import ChainFilter
 from linkpose.filters.smoother import reversed_in_time, reversed_rig
+from linkpose.rotations import of_vectors, product, rotation_vectors, wrapped
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
 
@@ -65,9 +65,9 @@ def _combined(before: Any, after: Any) -> Any:
     known, other_known = (np.isfinite(each["q"]).all(axis=1) for each in (before, after))
     # Two rotations with unknown headings have no mean: the surer one stands.
     both = known & other_known & (np.maximum(before["rotation_std"], after["rotation_std"]) < _KNOWN_RAD)
-    apart = _logarithm(_product(before["q"] * [1, -1, -1, -1], after["q"]))[both]
+    apart = rotation_vectors(product(before["q"] * [1, -1, -1, -1], after["q"]))[both]
     gain = p[both] @ np.linalg.inv(p[both] + other[both])
-    out["q"][both] = _product(before["q"][both], _exponential(np.einsum("nij,nj->ni", gain, apart)))
+    out["q"][both] = product(before["q"][both], of_vectors(np.einsum("nij,nj->ni", gain, apart)))
     out["q"] *= np.where(out["q"][:, :1] < 0, -1, 1)
     left = np.trace(p[both] - gain @ p[both], axis1=1, axis2=2)
     least = _COMMON * np.minimum(before["rotation_std"], after["rotation_std"])[both] ** 2
@@ -100,9 +100,9 @@ def _combine_angles(out: Any, after: Any) -> None:
         fits = [np.sum(weight * np.exp(1j * (out["angle"][both] - sense * angle[both]))) for sense in (1, -1)]
         sense = 1 if abs(fits[0]) >= abs(fits[1]) else -1
         angle = sense * angle + np.angle(fits[0 if sense > 0 else 1])
-        angle[both] = out["angle"][both] - _wrapped(out["angle"][both] - angle[both])
+        angle[both] = out["angle"][both] - wrapped(out["angle"][both] - angle[both])
     _combine(out["angle"], out["angle_std"], angle, std)
-    out["angle"] = _wrapped(out["angle"])
+    out["angle"] = wrapped(out["angle"])
 
 
 def _combine(mean: Floats, std: Floats, other: Floats, other_std: Floats) -> None:
@@ -114,27 +114,3 @@ def _combine(mean: Floats, std: Floats, other: Floats, other_std: Floats) -> Non
     share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
     mean[both] = share * mean[both] + (1 - share) * other[both]
     std[both] = np.sqrt(np.maximum(share * before, _COMMON * np.minimum(before, after)))
-
-
-def _wrapped(angle: Floats) -> Floats:
-    return np.asarray(angle - 2 * math.pi * np.floor((angle + math.pi) / (2 * math.pi)))
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """Quaternions (N, 4) wxyz a b."""
-    w, v = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True), np.cross(a[:, 1:], b[:, 1:])
-    return np.hstack([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + v])
-
-
-def _logarithm(q: Floats) -> Floats:
-    """Rotation vectors (N, 3) of unit quaternions, rad."""
-    q = q * np.where(q[:, :1] < 0, -1, 1)
-    size = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
-    angle = 2 * np.arctan2(size, q[:, :1])
-    return np.asarray(q[:, 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0))
-
-
-def _exponential(v: Floats) -> Floats:
-    """Unit quaternions (N, 4) of rotation vectors."""
-    angle = np.linalg.norm(v, axis=1, keepdims=True)
-    return np.hstack([np.cos(angle / 2), v * 0.5 * np.sinc(angle / (2 * math.pi))])

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import inner
+from linkpose.filters import _vector as vec
 from linkpose.filters.chain.state import Record
 from linkpose.filters.chain.update import update
 
@@ -25,12 +26,6 @@ _SAME_RAD = 0.035
 _REPEATS = 4  # differences in a row that make a stop
 _STOP_RAD = 0.01  # σ of e: play, sampling, and the filter's lag at a turn
 _LESS_CERTAIN = 2.0  # ratio of standard deviations from which on a stop is used
-
-
-@inner
-def wrapped(angle: float) -> float:
-    """The angle within ±π."""
-    return float(angle - 2 * math.pi * math.floor((angle + math.pi) / (2 * math.pi)))
 
 
 @inner
@@ -49,7 +44,7 @@ def update_stop(s: Record, size: int, angle: float, q: Record) -> None:
 
     Each turning point is compared with the last one on its side.
     """
-    step = wrapped(angle - s.turn_angle)
+    step = vec.wrapped(angle - s.turn_angle)
     s.turn_angle += step
     outwards = 1.0 if s.turn_side == 1 else -1.0
     if outwards * (s.turn_angle - s.turn_farthest) >= 0.0:

@@ -1,0 +1,54 @@
+"""Angles and rotations as arrays. A quaternion is w, x, y, z along the last axis and has unit length."""
+
+from __future__ import annotations
+
+import math
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Angle = TypeVar("Angle", float, Floats)
+
+
+def wrapped(angle: Angle) -> Angle:
+    """The same direction (rad) in [−π, π)."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def product(a: Floats, b: Floats) -> Floats:
+    """The quaternions (..., 4) a b: first the rotation b, then a."""
+    scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
+
+
+def rotation_vectors(q: Floats) -> Floats:
+    """Rotation vectors (N, 3) in rad, of at most a half turn, of quaternions (N, 4)."""
+    q = q * np.where(q[:, :1] < 0, -1.0, 1.0)
+    size = np.linalg.norm(q[:, 1:], axis=1, keepdims=True)
+    per_size = 2 * np.arctan2(size, q[:, :1]) / np.maximum(size, 1e-12)
+    return np.asarray(q[:, 1:] * np.where(size > 1e-12, per_size, 2.0))
+
+
+def of_vectors(vectors: Floats) -> Floats:
+    """Quaternions (N, 4) of rotation vectors (N, 3) in rad."""
+    angle = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.hstack([np.cos(angle / 2), vectors * 0.5 * np.sinc(angle / (2 * math.pi))])
+
+
+def of_matrices(rotation: Floats) -> Floats:
+    """Quaternions (N, 4) of rotation matrices (N, 3, 3); w is not negative.
+
+    The largest of the four numbers follows from the diagonal, the others from it (S. W. Shepperd, 1978).
+    """
+    r = np.moveaxis(rotation, 0, 2)
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    xx, yy, zz = (1 + 2 * r[i, i] - trace for i in range(3))
+    rows = np.array([[1 + trace, wx, wy, wz], [wx, xx, xy, xz], [wy, xy, yy, yz], [wz, xz, yz, zz]])
+    q = rows[np.argmax([1 + trace, xx, yy, zz], axis=0), :, np.arange(len(rotation))]
+    q *= np.where(q[:, :1] < 0, -1.0, 1.0) / np.linalg.norm(q, axis=1, keepdims=True)
+    return np.asarray(q)
