@@ -219,22 +219,26 @@ def check_resumed(connected: Board, blocks: list) -> None:
     assert np.linalg.norm(accel, axis=1).mean() == pytest.approx(9.8, abs=1.0)
 
 
+class FirstAfterResets:
+    """Selects the first `left` messages of a kind once the board has no reset before it."""
+
+    def __init__(self, board: ScriptedBoard, kind: type[object], left: int) -> None:
+        self._board, self._kind, self.left = board, kind, left
+
+    def __call__(self, message: object) -> bool:
+        is_one = not self._board.resets and self.left > 0 and isinstance(message, self._kind)
+        self.left -= is_one
+        return is_one
+
+
 def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
     """Reset after 20 samples; each of the next resets comes between CONFIGURE and START, more often than is tried."""
     monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
-    board.resets, left = [20], 5
-
-    def again(message: object) -> bool:
-        nonlocal left
-        if not board.resets and left and isinstance(message, Start):
-            left -= 1
-            return True
-        return False
-
-    board.resets_at = again
+    board.resets = [20]
+    board.resets_at = again = FirstAfterResets(board, Start, 5)
     said, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
-    assert left == 0
+    assert again.left == 0
     assert any("was reset" in line for line in said)
 
 
@@ -243,19 +247,11 @@ def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
 ) -> None:
     """The ACK of CONFIGURE is lost five times, and three are tried: the board is waited for as after a cut cable."""
     monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
-    board.resets, left = [20], 5
-
-    def lost(message: object) -> bool:
-        nonlocal left
-        if not board.resets and left and isinstance(message, Configure):
-            left -= 1
-            return True
-        return False
-
-    board.lost = lost
+    board.resets = [20]
+    board.lost = lost = FirstAfterResets(board, Configure, 5)
     said, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
-    assert left == 0
+    assert lost.left == 0
     assert any("waiting for the board, Ctrl-C ends" in line for line in said)
     assert board.opened == 2
 
