@@ -1,13 +1,14 @@
-"""What the benchmarks share: taking the best of some runs, and printing rows."""
+"""What the benchmarks share: taking the best of some runs, the recordings of others, and printing rows."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 # Where the reports look for the recordings of others, which are no part of the project: beside the checkout.
 RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -40,3 +41,37 @@ def report(rows: Iterable[Row]) -> None:
             print(json.dumps({**row._asdict(), "ratio": ratio}))
         else:
             print(f"{row.bench:20} {row.ours_us:12.3f} us   {row.peer:12} {row.peer_us:12.3f} us   ratio {ratio:.4f}")
+
+
+def arguments(description: str) -> argparse.Namespace:
+    """The command line of the benches on recordings."""
+    parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=RECORDINGS)
+    parser.add_argument("--only", default="", help="only cases whose name contains this text")
+    parser.add_argument("--json", action="store_true")
+    return parser.parse_args()
+
+
+def print_rows(
+    sets: Mapping[str, Callable[[Path], Iterable[Any]]],
+    rows_of: Callable[[Any], Iterable[dict[str, object]]],
+    options: argparse.Namespace,
+) -> Iterator[dict[str, object]]:
+    """The rows of all cases of the sets that are there, each printed as soon as it is known."""
+    for name, read in sets.items():
+        if not (options.data / name).is_dir():
+            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
+            continue
+        for case in read(options.data / name):
+            for row in rows_of(case) if options.only in case.name else ():
+                print_row(row, options.json)
+                yield row
+
+
+def print_row(row: dict[str, object], as_json: bool) -> None:
+    """A row as JSON or as text."""
+    print(json.dumps(row) if as_json else _text(row), flush=True)
+
+
+def _text(row: dict[str, object]) -> str:
+    return "  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items())

@@ -21,12 +21,9 @@ without an estimate.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
-import json
 import math
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -35,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 import qmt
-from _report import RECORDINGS
+from _report import arguments, print_rows
 from real_data import ENCODER_DELAY_S, OMC_LATE_S, Pair, matrices, read_encoder, read_robot
 from vqf import VQF
 
@@ -282,24 +279,9 @@ def rows(case: Case) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
-    parser.add_argument("--only", default="", help="only pairs with this text in their name")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
+    options = arguments(__doc__)
     filters.warm_up(["chain"])
-    for name, read in SETS.items():
-        if not (options.data / name).is_dir():
-            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
-            continue
-        for case in read(options.data / name):
-            if options.only in case.name:
-                for row in rows(case):
-                    print(json.dumps(row) if options.json else _text(row), flush=True)
-
-
-def _text(row: dict[str, object]) -> str:
-    return "  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items())
+    list(print_rows(SETS, rows, options))
 
 
 if __name__ == "__main__":

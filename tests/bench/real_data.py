@@ -17,15 +17,12 @@ for each set and filter the geometric mean of the ratios to VQF, over all and ov
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from _report import RECORDINGS
+from _report import arguments, print_row, print_rows
 from scipy.io import loadmat
 from vqf import VQF, offlineVQF
 
@@ -287,25 +284,9 @@ def summary(found: list[dict[str, object]]) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    found: list[dict[str, object]] = []
-    for name, read in SETS.items():
-        if not (options.data / name).is_dir():
-            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
-            continue
-        for case in read(options.data / name):
-            for row in rows(case):
-                found.append(row)
-                print(json.dumps(row) if options.json else _text(row))
-    for row in summary(found):
-        print(json.dumps(row) if options.json else _text(row))
-
-
-def _text(row: dict[str, object]) -> str:
-    return "  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items())
+    options = arguments(__doc__)
+    for row in summary(list(print_rows(SETS, rows, options))):
+        print_row(row, options.json)
 
 
 if __name__ == "__main__":

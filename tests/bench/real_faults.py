@@ -10,16 +10,12 @@ a height one metre along (1, 1, 1) / √3. `diverged` marks a filter beyond 5° 
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from _report import RECORDINGS
+from _report import arguments, print_rows
 from numpy.typing import NDArray
 from real_data import SETS, Case, block_of, tilt_from, vqf_tilt
 
@@ -169,22 +165,7 @@ def rows(case: Case) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
-    parser.add_argument("--json", action="store_true")
-    parser.add_argument("--only", default="", help="Run only trials whose name contains this text.")
-    options = parser.parse_args()
-    for name, read in SETS.items():
-        if not (options.data / name).is_dir():
-            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
-            continue
-        for case in read(options.data / name):
-            for row in rows(case) if options.only in case.name else ():
-                print(json.dumps(row) if options.json else _text(row), flush=True)
-
-
-def _text(row: dict[str, object]) -> str:
-    return "  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in row.items())
+    list(print_rows(SETS, rows, arguments(__doc__)))
 
 
 if __name__ == "__main__":
