@@ -45,7 +45,7 @@ from linkpose.calibration.joint_constraint import (
     paired_stretches,
     pieces,
 )
-from linkpose.calibration.normal_equations import Sums, correlation
+from linkpose.calibration.normal_equations import Sums, correlation, huber, in_blocks
 from linkpose.calibration.rests import find_rests
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
@@ -60,7 +60,6 @@ _MOST_PASSES, _SETTLED_M = 10, 1e-4
 _MOST_PIECES = 75  # 10 minutes of a longer recording
 _FREE_PASSES = 2  # before the residuals are small enough to measure their correlation
 _HUBER_SIGMAS = 3.0
-_BLOCK_S = 1.0
 # Prior standard deviations: r_k of people and robots (m); data sheet of [MPU-6050]: ±20 °/s, ±50 mg, 3 %, 2 %.
 LEVER_STD_M = 0.5
 _PRIOR_STD = {J2S: LEVER_STD_M, GYRO_BIAS: 0.35, ACCEL_BIAS: 0.3, ACCEL_MATRIX: 0.017, GYRO_MATRIX: 0.017}
@@ -284,15 +283,10 @@ def _turned(piece: _Piece, unknowns: Floats, scale: float) -> _Turned:
     for _ in range(3):
         rotation = _rotation_between(one.gravity, two.gravity, weight)
         residual = one.gravity - two.gravity @ rotation.T
-        weight = _huber(residual, scale)
+        weight = huber(residual, _HUBER_SIGMAS * scale)
     jacobian = _eliminated(one, two, rotation, weight / scale**2)
     information = _information(one.gravity, two.gravity @ rotation.T, weight / scale**2)
     return _Turned(rotation, residual, jacobian, information, one.apart_s)
-
-
-def _huber(residual: Floats, scale: float) -> Floats:
-    """(M,) weights, up to 1."""
-    return np.asarray(np.minimum(1.0, _HUBER_SIGMAS * scale / np.maximum(np.linalg.norm(residual, axis=1), 1e-12)))
 
 
 def _rotation_between(to: Floats, of: Floats, weight: Floats) -> Floats:
@@ -327,13 +321,11 @@ def _information(one: Floats, two: Floats, weight: Floats) -> Floats:
 def _normal_equations(parts: Sequence[_Turned], scale: float) -> Sums:
     normals, gradients, residuals, number = [], [], [], 0.0
     for part in parts:
-        weight = _huber(part.residual, scale) / scale**2
+        weight = huber(part.residual, _HUBER_SIGMAS * scale) / scale**2
         number += float(weight.sum()) * scale**2
-        blocks = max(1, round(len(weight) * part.apart_s / _BLOCK_S))
-        for rows in np.array_split(np.arange(len(weight)), blocks):
-            j, w = part.jacobian[rows], weight[rows]
-            normals.append(np.einsum("n,nip,niq->pq", w, j, j))
-            gradients.append(-np.einsum("n,nip,ni->p", w, j, part.residual[rows]))
+        for normal, gradient in in_blocks(part.jacobian, weight, part.residual, len(weight) * part.apart_s):
+            normals.append(normal)
+            gradients.append(gradient)
         residuals.append(part.residual)
     return Sums(np.array(normals), np.array(gradients), np.concatenate(residuals), number)
 

@@ -40,7 +40,7 @@ from linkpose.calibration.joint_constraint import (
     pieces,
     stretches,
 )
-from linkpose.calibration.normal_equations import Sums, correlation
+from linkpose.calibration.normal_equations import Sums, correlation, huber, in_blocks
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.sensors.measurements import Floats
@@ -63,7 +63,6 @@ _FARTHEST_M = 5.0
 _SHORT_PIECES_S, _PIECE_S = (1.0, 1.0, 3.0, 3.0), 8.0
 _MOST_PASSES, _SETTLED_M = 20, 1e-5
 _HUBER_SIGMAS = 3.0
-_BLOCK_S = 1.0
 _GRAVITY_STD_M_S2 = 0.003  # of ‖γ‖ from piece to piece
 _LOCAL_GRAVITY = 0.0005  # share by which g differs from the standard's between 38° and 52° of latitude
 
@@ -301,11 +300,9 @@ def _normal_equations(parts: Sequence[Equations], scale: float) -> Sums:
         weight = weight / scale**2
         mean_jacobian = np.tensordot(weight / weight.sum(), jacobian, 1)
         centred = jacobian - mean_jacobian
-        blocks = max(1, round(len(gravity) * apart_s / _BLOCK_S))
-        for rows in np.array_split(np.arange(len(gravity)), blocks):
-            j, w = centred[rows], weight[rows]
-            block_normals.append(np.einsum("n,nip,niq->pq", w, j, j))
-            gradients.append(-np.einsum("n,nip,ni->p", w, j, residual[rows]))
+        for normal, gradient in in_blocks(centred, weight, residual, len(gravity) * apart_s):
+            block_normals.append(normal)
+            gradients.append(gradient)
         length = max(float(np.linalg.norm(mean)), 1e-9)
         row, known = mean / length @ mean_jacobian, 1 / (_GRAVITY_STD_M_S2**2 + 1 / weight.sum())
         block_normals.append(known * np.outer(row, row))
@@ -317,9 +314,7 @@ def _mean_gravity(gravity: Floats, scale: float) -> tuple[Floats, Floats, Floats
     """The robust mean (3,) of γ (M, 3) in a piece, the residuals (M, 3), and their weights (M,), up to 1."""
     mean = np.median(gravity, axis=0)
     for _ in range(5):
-        residual = gravity - mean
-        away = np.linalg.norm(residual, axis=1)
-        weight = np.minimum(1.0, _HUBER_SIGMAS * scale / np.maximum(away, 1e-12))
+        weight = huber(gravity - mean, _HUBER_SIGMAS * scale)
         mean = weight @ gravity / weight.sum()
     return mean, gravity - mean, weight
 

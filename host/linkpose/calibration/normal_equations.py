@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from linkpose.sensors.measurements import Floats
+
+_BLOCK_S = 1.0  # residuals further apart than this are taken for independent
 
 
 class Sums(NamedTuple):
@@ -16,6 +19,19 @@ class Sums(NamedTuple):
     gradients: Floats  # (B, U), downhill
     residual: Floats  # (M, 3) m/s²
     equations: float  # their number, weighted
+
+
+def huber(residual: Floats, limit: float) -> Floats:
+    """Weights (M,), up to 1, of residual vectors (M, 3): those longer than `limit` count by their length only."""
+    return np.asarray(np.minimum(1.0, limit / np.maximum(np.linalg.norm(residual, axis=1), 1e-12)))
+
+
+def in_blocks(jacobian: Floats, weight: Floats, residual: Floats, duration_s: float) -> Iterator[tuple[Floats, Floats]]:
+    """Normal matrix (U, U) and gradient (U,) of each block of the rows: (M, 3, U), (M,) and (M, 3)."""
+    blocks = max(1, round(duration_s / _BLOCK_S))
+    for rows in np.array_split(np.arange(len(weight)), blocks):
+        j, w = jacobian[rows], weight[rows]
+        yield np.einsum("n,nip,niq->pq", w, j, j), -np.einsum("n,nip,ni->p", w, j, residual[rows])
 
 
 def correlation(sums: Sums, information: Floats) -> float:

@@ -82,7 +82,14 @@ class JointInertialSmoother:
         return _combined(forward.process(block), after, *self.j2s_m)
 
 
+def share_of_first(variance: Floats, other: Floats) -> Floats:
+    """Weight (N,) of an estimate beside another by their inverse variances; ½ where both are exact."""
+    total = variance + other
+    return np.where(total > 0, other / np.maximum(total, 1e-300), 0.5)
+
+
 def reversed_rig(rig: Rig) -> Rig:
+    """The rig for a recording with time reversed: gyro bias and delay have the opposite sign."""
     x, y, z = rig.imu.gyro_bias_rad_s
     bias: Vector = (-x, -y, -z)
     return replace(rig, imu=replace(rig.imu, gyro_bias_rad_s=bias, delay_s=-rig.imu.known_delay_s))
@@ -127,7 +134,7 @@ def _combined(forward: Floats, backward: Floats, j2s_m: Floats, j2s_covariance: 
     forward = np.where(np.isnan(forward[:, _ROLL : _ROLL + 1]), backward, forward)
     backward = np.where(np.isnan(backward[:, _ROLL : _ROLL + 1]), forward, backward)
     before, after = forward[:, _STD] ** 2, backward[:, _STD] ** 2
-    share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
+    share = share_of_first(before, after)
     tilt = share[:, None] * _tilt(forward) + (1 - share[:, None]) * _tilt(backward)
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)
     common = np.einsum("ni,ij,nj->n", tilt, j2s_covariance, tilt)

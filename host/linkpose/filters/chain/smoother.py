@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from linkpose.filters.chain import ChainFilter
-from linkpose.filters.smoother import reversed_in_time, reversed_rig
+from linkpose.filters.smoother import reversed_in_time, reversed_rig, share_of_first
 from linkpose.rotations import of_vectors, product, rotation_vectors, wrapped
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
@@ -111,6 +111,6 @@ def _combine(mean: Floats, std: Floats, other: Floats, other_std: Floats) -> Non
     mean[only], std[only] = other[only], other_std[only]
     both = ~only & np.isfinite(other)
     before, after = np.square(std[both]), np.square(other_std[both])
-    share = np.where(before + after > 0, after / np.maximum(before + after, 1e-300), 0.5)
+    share = share_of_first(before, after)
     mean[both] = share * mean[both] + (1 - share) * other[both]
     std[both] = np.sqrt(np.maximum(share * before, _COMMON * np.minimum(before, after)))
