@@ -29,6 +29,13 @@ NOISES = {
     "acceleration_std": ("acceleration", 1.0),
 }  # fmt: skip
 FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
+
+
+def _default(noise: str) -> str:
+    """The last sentence of the help text of an option for one of NOISES."""
+    return f"{FROM_LOG} {NOISES[noise][1]:g}."
+
+
 LANDMARK_ERROR_TIME_S = 0.5
 # With fewer beacons a bias cannot be told from a place. On three public recordings of radio ranges (tests/bench) both
 # constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
@@ -144,23 +151,25 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     metavar="P|off",
     help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
 )
-@click.option("--range-std", type=POSITIVE, help=f"σ of a range (m). {FROM_LOG} 0.1.")
+@click.option("--range-std", type=POSITIVE, help=f"σ of a range (m). {_default('range_std')}")
 @click.option(
     "--range-growth",
     type=options.FiniteRange(min=0),
-    help=f"Growth k of the range's standard deviation with --noise affine (m/m). {FROM_LOG} 0.02.",
+    help=f"Growth k of the range's standard deviation with --noise affine (m/m). {_default('range_growth')}",
 )
 @click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
-@click.option("--bearing-std", type=POSITIVE, help=f"σ of a bearing (rad). {FROM_LOG} 0.05.")
+@click.option("--bearing-std", type=POSITIVE, help=f"σ of a bearing (rad). {_default('bearing_std')}")
 @click.option("--depth-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a depth (m).")
 @click.option("--attitude-std", type=POSITIVE, default=0.01, show_default=True, help="σ of a yaw reading (rad).")
-@click.option("--speed-std", type=POSITIVE, help=f"σ of one odometry sample's speed (m/s). {FROM_LOG} 0.1.")
-@click.option("--turn-std", type=POSITIVE, help=f"σ of one odometry sample's turn rate (rad/s). {FROM_LOG} 0.1.")
-@click.option("--velocity-std", type=POSITIVE, help=f"σ of one velocity sample on each axis (m/s). {FROM_LOG} 0.1.")
+@click.option("--speed-std", type=POSITIVE, help=f"σ of one odometry sample's speed (m/s). {_default('speed_std')}")
+@click.option("--turn-std", type=POSITIVE, help=f"σ of one odometry sample's turn rate (rad/s). {_default('turn_std')}")
+@click.option(
+    "--velocity-std", type=POSITIVE, help=f"σ of one velocity sample on each axis (m/s). {_default('velocity_std')}"
+)
 @click.option(
     "--acceleration-std",
     type=POSITIVE,
-    help=f"σ of the acceleration on each axis of a log without odometry (m/s²). {FROM_LOG} 1.",
+    help=f"σ of the acceleration on each axis of a log without odometry (m/s²). {_default('acceleration_std')}",
 )
 @click.option(
     "--error-time",
