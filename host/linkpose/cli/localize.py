@@ -29,18 +29,16 @@ NOISES = {
     "acceleration_std": ("acceleration", 1.0),
 }  # fmt: skip
 FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
-
-
-def _default(noise: str) -> str:
-    """The last sentence of the help text of an option for one of NOISES."""
-    return f"{FROM_LOG} {NOISES[noise][1]:g}."
-
-
 LANDMARK_ERROR_TIME_S = 0.5
 # With fewer beacons a bias cannot be told from a place. On three public recordings of radio ranges (tests/bench) both
 # constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
 BEACONS_FOR_CONSTANTS = 3
 POSITIVE = options.FiniteRange(min=0, min_open=True)
+
+
+def _default(noise: str) -> str:
+    """The last sentence of the help text of an option for one of NOISES."""
+    return f"{FROM_LOG} {NOISES[noise][1]:g}."
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
