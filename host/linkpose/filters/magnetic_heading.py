@@ -47,9 +47,8 @@ _GATE = 9.0  # χ² with one degree of freedom: three standard deviations
 # Difference of strength and vertical component from the reference (share of the field, and multiple of the residual).
 # At 4 % (2 µT), a disturbance along the field passes that turns the heading by no more than the gate lets pass.
 _FIELD_SHARE, _FIELD_RESIDUALS = 0.04, 3.0
-_FOREIGN_SHARE = (
-    0.5  # of a difference from the calibrated strength that counts as error; doubled, it holds half as well
-)
+# Share of a difference from the calibrated strength that counts as error. Doubled, the field holds half as well.
+_FOREIGN_SHARE = 0.5
 _PLAUSIBLE_SHARE = 0.5  # of the calibrated strength: beside steel it differs by this
 _LEAST_LEVEL_UT = 5.0  # horizontal field below which there is no heading
 # Windows on either side of a rejected one that are not used either: the field changed there, below the gates. Doubled,
