@@ -104,7 +104,7 @@ def process(
     s, q = states[0], parameters[0]
     for i in range(len(samples.time_s)):
         time_s, flags = samples.time_s[i], samples.flags[i]
-        accel, gyro = vec.load(samples.accel[i]), vec.load(samples.gyro[i])
+        accel, gyro = vec.row(samples.accel, i), vec.row(samples.gyro, i)
         dead = is_frozen(s.last_readings, time_s, accel, gyro)
         has_force, force = read_accel(accel, flags, imu)
         has_rate, rate = read_gyro(gyro, flags, imu)

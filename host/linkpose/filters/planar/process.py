@@ -20,7 +20,7 @@ from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, 
 _PATIENCE_S = 0.5
 # A change of velocity that only the mice show stays unconfirmed for at most so long (s), until mice and gyro agree on a
 # turn of so much (rad, within a share and a rate in rad/s), or until the velocity jumps back. The stated ± of the
-# position grows by the way that the robot went if the mice are wrong. Doubling the time doubles the ± after a collision
+# position grows by the distance to the position without this change. Doubling the time doubles the ± after a collision
 # on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and this much (m/s, eight
 # times the rounding of three mice): small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
 _JUMP_M_S2, _JUMP_M_S = 6.0, 0.04
@@ -174,7 +174,7 @@ def _correct(
 
 @inner
 def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
-    """Begin to doubt the mice when their velocity jumps from one reading to the next, and end it when it is back.
+    """A change of velocity is unconfirmed from a jump between two readings until the velocity jumps back.
 
     `before` is the filter's velocity before this reading.
     """
@@ -194,8 +194,8 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
 
 
 @inner
-def _doubt_way(state: Record, m: Record, dt: float) -> None:
-    """The way that the robot goes if the mice are wrong, as variance of the position along it."""
+def _add_unconfirmed_way(state: Record, m: Record, dt: float) -> None:
+    """Add the variance of an unconfirmed change: the distance between the position with it and without it, squared."""
     if not state.unconfirmed_s > 0.0:
         return
     turn = m.mean_rate - state.at.bias
@@ -250,7 +250,7 @@ def _step(
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
-    _doubt_way(state, m, dt)
+    _add_unconfirmed_way(state, m, dt)
     _watch_floor(state, m, q)
     _calibrate(state, m, mice, rig)
 
