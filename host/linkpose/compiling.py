@@ -43,6 +43,7 @@ _SOURCES = (
     "__init__.py",
     "compiling.py",
     "errors.py",
+    "rotations.py",
     "lean_compiler.py",
     "filters/**/*.py",
     "localization/**/*.py",
