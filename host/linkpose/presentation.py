@@ -22,8 +22,12 @@ class RowReader:
     """Splits rows of estimates by filter and quantity."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        self._of_filter = quantities.by_filter(columns)
-        self._at = {column: at for at, column in enumerate(columns)}
+        at = {column: place for place, column in enumerate(columns)}
+        nowhere = len(columns)  # of a σ without a column: `read` appends NaN
+        self._of_filter = {
+            name: [(q, at[c], at.get(quantities.std_column(c) or "", nowhere)) for q, c in found.items()]
+            for name, found in quantities.by_filter(columns).items()
+        }
 
     @property
     def filters(self) -> list[str]:
@@ -32,13 +36,9 @@ class RowReader:
 
     def read(self, estimates: Sequence[float]) -> Row:
         """One row of estimates (columns,)."""
-
-        def of(column: str) -> tuple[float, float]:
-            std = self._at.get(quantities.std_column(column) or "")
-            return estimates[self._at[column]], math.nan if std is None else estimates[std]
-
+        known = [*estimates, math.nan]
         return {
-            name: {quantity: of(column) for quantity, column in found.items()}
+            name: {quantity: (known[value], known[std]) for quantity, value, std in found}
             for name, found in self._of_filter.items()
         }
 

@@ -11,7 +11,7 @@ import numpy as np
 from linkpose import quantities
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
-from linkpose.presentation import Row, RowReader, best_filter
+from linkpose.presentation import Row, RowReader
 from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
@@ -34,6 +34,7 @@ class Drawing:
         self._rows = RowReader(columns)
         self._at = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
+        self._candidates = [(q, name) for q in _SHOWN_BY for name, of in self._of_filter.items() if q in of]
         self._reference_at = [
             (part.quantity, at)
             for column, at in self._at.items()
@@ -47,9 +48,8 @@ class Drawing:
 
     def best(self, row: Row) -> str | None:
         """The best filter with a value in this row; without any value, the best filter at all."""
-        found = [(q, name) for q in _SHOWN_BY if (name := best_filter(row, self._rows.filters, q)) is not None]
-        known = [name for q, name in found if math.isfinite(row[name][q][0])]
-        return next(iter(known + [name for _, name in found]), None)
+        known = (name for q, name in self._candidates if math.isfinite(row[name][q][0]))
+        return next(known, self._candidates[0][1] if self._candidates else None)
 
     def draw(self, newest: Floats, row: Row, name: str, history: History | Replay, j2s_m: Floats | None = None) -> None:
         """Draws the newest row as the filter `name` estimates it; `j2s_m` (3,) is J2S if it is being estimated."""

@@ -29,7 +29,7 @@ from linkpose.sensors.measurements import Floats
 if TYPE_CHECKING:
     import viser
 
-Nullable = list[float | None]
+Nullable = Floats | list[float | None]  # values of a chart; None is a gap
 
 BEST = "best"  # the choice that follows the best filter
 _BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
@@ -94,22 +94,25 @@ class Panel:
 
     def draw_charts(self, window: Floats, name: str) -> None:
         """Draws the rows (N, columns) of the last seconds as the filter `name` sees them."""
+        rows = with_gap_rows(window)
         for quantity, chart in self._charts.items():
             column = self._of_filter.get(name, {}).get(quantity)
             chart.visible = column is not None
             if column is not None:
-                self._send(chart, self._chart_data(window, quantity, column))
+                self._send(chart, self._chart_data(rows, quantity, column))
 
     @staticmethod
     def _send(chart: viser.GuiUplotHandle, data: tuple[Nullable, ...]) -> None:
-        """Gives a chart its data. viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null."""
+        """Gives a chart its data: arrays travel as binary, lists where there are gaps.
+
+        viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null.
+        """
         cast(Any, chart._impl.props).data = data
         chart._queue_update("data", data)
 
-    def _chart_data(self, window: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
+    def _chart_data(self, rows: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
         """Time, value − 2σ, value + 2σ, value, and the reference if there is one, with None in gaps."""
         scale = quantity.value.scale
-        rows = with_gap_rows(window)
         value = rows[:, self._columns[column]] * scale
         if quantity.period is not None:
             known = np.isfinite(value)
@@ -120,7 +123,7 @@ class Panel:
         data = [value - 2 * std, value + 2 * std, value]
         if quantity.column in self._columns:
             data.append(rows[:, self._columns[quantity.column]] * scale)
-        return (rows[:, 0].tolist(), *map(_nullable, data))
+        return (rows[:, 0].copy(), *map(_nullable, data))
 
     def draw_health(self, title: str, summary: str, working: Sequence[str], faults: Sequence[str]) -> None:
         """Shows which sensors work, in green, and each fault as a red line."""
@@ -172,15 +175,19 @@ def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
 def with_gap_rows(rows: Floats) -> Floats:
     """Rows (N, columns) by time, with a row of NaN inside each gap, which is longer than three usual intervals."""
     if len(rows) < 3:
-        return rows.copy()
+        return rows
     step = np.diff(rows[:, 0])
     at = np.flatnonzero(step > 3.0 * np.median(step))
+    if not len(at):
+        return rows
     between = np.full((len(at), rows.shape[1]), np.nan)
     between[:, 0] = 0.5 * (rows[at, 0] + rows[at + 1, 0])
     return np.insert(rows, at + 1, between, axis=0)
 
 
 def _nullable(values: Floats) -> Nullable:
+    if np.isfinite(values).all():
+        return values
     return [value if value == value else None for value in values.tolist()]
 
 

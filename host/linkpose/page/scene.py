@@ -26,9 +26,10 @@ Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)
 _ELLIPSES = 12  # along a path
-_PATH_INTERVAL = 10  # redraws of the scene between two of the path, which is larger
+_PATH_INTERVAL = 5  # redraws of the scene between two of the path, which is larger
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
+_CONE_CHANGE = 0.02  # share of a cone's radius that is not worth a message: a pixel or two
 _FLOOR_M = 0.002  # of lines over the ground, so that the ground does not hide parts of them
 
 
@@ -77,8 +78,7 @@ class LinkScene:
         size = 0.07 * length
         self._sensor = scene.add_box("/link/sensor", _ORANGE, (size, 0.75 * size, 0.3 * size))
         self._axes = scene.add_frame("/link/axes", axes_length=2.5 * size, axes_radius=0.07 * size)
-        self._cone = _add_cone(scene, "/link/cone")
-        self._length_m = 0.0
+        self._cone = Cone(scene, "/link/cone")
         self._drawn_j2s: Floats | None = None
         self.set_j2s(j2s_m)
         server.initial_camera.position = (1.15 * length, -1.75 * length, 1.0 * length)
@@ -94,11 +94,10 @@ class LinkScene:
         if self._drawn_j2s is not None and np.linalg.norm(j2s_m - self._drawn_j2s) < 1e-3:
             return
         self._drawn_j2s = j2s_m
-        self._length_m = float(np.linalg.norm(j2s_m))
-        turn = geometry.turn_z_to(j2s_m)
+        turn, length = geometry.turn_z_to(j2s_m), float(np.linalg.norm(j2s_m))
         for part in self._parts:
-            part.position, part.wxyz, part.scale = 0.5 * j2s_m, turn, (1.0, 1.0, self._length_m)
-        self._cone.wxyz = turn
+            part.position, part.wxyz, part.scale = 0.5 * j2s_m, turn, (1.0, 1.0, length)
+        self._cone.point_along(j2s_m)
         self._sensor.position = self._axes.position = j2s_m
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
@@ -108,10 +107,7 @@ class LinkScene:
         self._link.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
             self._link.wxyz = geometry.attitude(roll, pitch, yaw)
-        radius = geometry.cone_radius(self._length_m, max(roll_std, pitch_std)) if is_known else 0.0
-        self._cone.visible = radius > 0.0
-        if radius > 0.0:
-            self._cone.scale = (radius, radius, self._length_m)
+        self._cone.draw(max(roll_std, pitch_std) if is_known else math.nan)
         roll, pitch = (reference.get(q, math.nan) for q in (ROLL, PITCH))
         self._reference.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
@@ -233,8 +229,8 @@ class ChainScene:
             scene.add_frame(f"{name}/axes", axes_length=0.15 * size, axes_radius=0.005 * size, position=place)
         if j2s is not None:
             scene.add_icosphere("/joint/link1/fixed", 0.05 * size, _BLACK, position=end)
-        self._cone, self._reach_m = _add_cone(scene, "/joint/link2/cone"), float(np.linalg.norm(_BEYOND_SENSOR * r2))
-        self._cone.wxyz = geometry.turn_z_to(r2)
+        self._cone = Cone(scene, "/joint/link2/cone")
+        self._cone.point_along(_BEYOND_SENSOR * r2)
         server.initial_camera.position = (0.9 * size, -1.5 * size, 1.0 * size)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * size)
 
@@ -254,18 +250,30 @@ class ChainScene:
         self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
             self._links[1].wxyz = product(attitude, rotation / np.linalg.norm(rotation))
-        radius = geometry.cone_radius(self._reach_m, values.get(QW, nothing)[1]) if is_known else 0.0
-        self._cone.visible = radius > 0.0
-        if radius > 0.0:
-            self._cone.scale = (radius, radius, self._reach_m)
+        self._cone.draw(values.get(QW, nothing)[1] if is_known else math.nan)
 
 
-def _add_cone(scene: viser.SceneApi, name: str) -> viser.MeshHandle:
-    """A cone of ±2σ, hidden until it is scaled."""
-    vertices, faces = geometry.cone()
-    return scene.add_mesh_simple(
-        name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
-    )
+class Cone:
+    """A cone of ±2σ about an axis that starts at its parent's origin, hidden while σ is unknown."""
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        vertices, faces = geometry.cone()
+        self._mesh = scene.add_mesh_simple(
+            name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
+        )
+        self._length_m = self._radius_m = 0.0
+
+    def point_along(self, axis_m: Floats) -> None:
+        """Gives the cone an axis (3,)."""
+        self._mesh.wxyz, self._length_m = geometry.turn_z_to(axis_m), float(np.linalg.norm(axis_m))
+
+    def draw(self, std_deg: float) -> None:
+        """Opens the cone to ±2σ; NaN hides it."""
+        radius = geometry.cone_radius(self._length_m, std_deg)
+        self._mesh.visible = radius > 0.0
+        if abs(radius - self._radius_m) > _CONE_CHANGE * self._radius_m:
+            self._mesh.scale = (radius, radius, self._length_m)
+            self._radius_m = radius
 
 
 def scene_of(
