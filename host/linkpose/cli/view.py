@@ -228,7 +228,7 @@ class Screen:
         return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        """The joint's angles, the both heights (narrow screens drop the last ones), and the curve of the first angle."""
+        """The joint's angles, both heights (narrow screens drop the last ones), and the curve of the first angle."""
         values = self._row[name]
         parts = joint_texts(values)
         for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
