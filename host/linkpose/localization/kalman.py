@@ -55,7 +55,7 @@ class Measurement:
     """What a sensor read at one instant.
 
     `values` (m,) with covariance R (m, m); `parameters` is the model's table. The rows belong together in blocks of
-    `block`: a block is gated as one, with `block` degrees of freedom. `angles` says which rows are angles.
+    `block`: a block is gated as one, with `block` degrees of freedom. `angles` marks the rows that are angles.
     """
 
     model: int

@@ -40,7 +40,7 @@ LONGEST_S = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class IndoorErrors:
-    """Standard deviations. A beam's is sqrt(σ² + (k r)²); an outlier is an obstacle that the map does not know,
+    """Standard deviations. A beam's is sqrt(σ² + (k r)²); an outlier is an obstacle that is not in the map,
     somewhere before the wall.
     """
 
