@@ -10,7 +10,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import to_matrix, turn
-from linkpose.filters.chain.state import AXES, BA, BG, OF_SENSOR, START, R, Record, V
+from linkpose.filters.chain.state import BA, BG, OF_SENSOR, START, R, Record, V
 
 
 @inner
@@ -80,13 +80,13 @@ def apply_correction(s: Record, size: int, hinge: int, base: int) -> None:
             s.gyro_bias[k, i] += x[o + BG + i]
             s.accel_bias[k, i] += x[o + BA + i]
             s.lever[k, i] += x[o + R + i]
+        o = START + 3 * k
+        turn(s.start[k], x[o], x[o + 1], x[o + 2], 1.0)
     if hinge >= 0:
         for k in range(2):
-            o = hinge + START + 3 * k
-            turn(s.start[k], x[o], x[o + 1], x[o + 2], 1.0)
             axis, norm = s.axis[k], 1e-30
             for i in range(3):
-                axis[i] += x[hinge + AXES + 3 * k + i]
+                axis[i] += x[hinge + 3 * k + i]
                 norm += axis[i] * axis[i]
             for i in range(3):
                 axis[i] /= math.sqrt(norm)
