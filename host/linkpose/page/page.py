@@ -149,7 +149,7 @@ class Page:
 
     def _build_player(self, replay: Replay) -> None:
         """A slider over the time of the file, and "play"."""
-        start, end = replay.span_s
+        start, end = (round(time_s, 2) for time_s in replay.span_s)
         replay.seek(start)
         self._place_s = start
         self._slider: Any = self._server.gui.add_slider("time (s)", start, max(end, start + 0.01), 0.01, start)

@@ -29,8 +29,9 @@ _ELLIPSES = 12  # along a path
 _PATH_INTERVAL = 5  # redraws of the scene between two of the path, which is larger
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
+_ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
 _CONE_CHANGE = 0.02  # share of a cone's radius that is not worth a message: a pixel or two
-_FLOOR_M = 0.002  # of lines over the ground, so that the ground does not hide parts of them
+_FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does not hide parts of them
 
 
 class Scene(Protocol):
@@ -53,6 +54,34 @@ class Surroundings:
 
     grid: GridMap | None = None
     beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m), perhaps z
+    places: Sequence[Sequence[float]] = ()  # x, y (m) that the camera shows too, such as the corners of a path
+
+    @property
+    def centre_m(self) -> Floats:
+        """Centre (2,) of all that there is; a robot starts at the origin and heads along x."""
+        corners = self._all_corners()
+        return (corners.min(axis=0) + corners.max(axis=0)) / 2 if len(corners) else np.array([1.0, 0.0])
+
+    @property
+    def size_m(self) -> float:
+        """The larger side of all that there is."""
+        corners = self._all_corners()
+        return max(float(np.ptp(corners, axis=0).max()), 1.0) if len(corners) else 4.0
+
+    def _all_corners(self) -> Floats:
+        found = [*(place[:2] for place in self.beacons.values()), *self.places]
+        if self.grid is not None:
+            found += _corners(self.grid).tolist()
+        return np.array(found, dtype=float).reshape(-1, 2)
+
+
+def _corners(grid: GridMap) -> Floats:
+    """The corners (4, 2) of a map."""
+    _, left, low, turn = grid.geometry.tolist()
+    (wide, high), cos, sin = grid.size_m, math.cos(turn), math.sin(turn)
+    flat = np.array([(0.0, 0.0), (wide, 0.0), (0.0, high), (wide, high)])
+    corners: Floats = np.array([left, low]) + flat @ np.array([[cos, sin], [-sin, cos]])
+    return corners
 
 
 class LinkScene:
@@ -119,17 +148,25 @@ class RobotScene:
     """A robot in the plane: ground, map, beacons, pose, path, ±2σ ellipses along it, and the reference's path."""
 
     def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
-        self._scene = server.scene
-        _ground(self._scene, 20.0)
-        self._robot = self._scene.add_frame("/robot", axes_length=0.25, axes_radius=0.008, visible=False)
-        self._scene.add_box("/robot/body", _ORANGE, (0.24, 0.18, 0.06), position=(0.0, 0.0, 0.03))
-        self._scene.add_box("/robot/front", _BLACK, (0.03, 0.18, 0.062), position=(0.105, 0.0, 0.031))
-        self._draws = 0
-        centre, size = np.array([1.0, 0.0]), 4.0
-        if surroundings is not None:
-            centre, size = self._draw_surroundings(surroundings, centre, size)
-        server.initial_camera.position = (centre[0], centre[1] - 0.9 * size, size)
-        server.initial_camera.look_at = (centre[0], centre[1], 0.0)
+        self._scene, self._draws = server.scene, 0
+        around = surroundings or Surroundings()
+        (x, y), size = around.centre_m, around.size_m
+        self._floor_m = max(_FLOOR_M, 0.001 * size)
+        _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
+        self._draw_surroundings(around, size)
+        scale = max(1.0, size / _ROBOT_SHARE)  # a robot of 24 cm would be a dot on a floor of 100 m
+        self._robot = self._scene.add_frame(
+            "/robot", axes_length=0.25 * scale, axes_radius=0.008 * scale, visible=False
+        )  # fmt: skip
+        for name, colour, dimensions, at in (
+            ("body", _ORANGE, (0.24, 0.18, 0.06), (0.0, 0.0, 0.03)),
+            ("front", _BLACK, (0.03, 0.18, 0.062), (0.105, 0.0, 0.031)),
+        ):
+            self._scene.add_box(
+                f"/robot/{name}", colour, tuple(scale * np.array(dimensions)), position=scale * np.array(at)
+            )
+        server.initial_camera.position = (x, y - 0.5 * size, 0.75 * size)
+        server.initial_camera.look_at = (x, y, 0.0)
 
     @property
     def is_path_due(self) -> bool:
@@ -146,47 +183,36 @@ class RobotScene:
         if path is not None:
             self._draw_path(path)
 
-    def _draw_surroundings(self, around: Surroundings, centre: Floats, size: float) -> tuple[Floats, float]:
-        """Draws map and beacons. Returns the centre (2,) and the size (m) of what there is."""
+    def _draw_surroundings(self, around: Surroundings, size: float) -> None:
+        """Draws beacons, in proportion to the size (m) of the scene, and the map."""
         for name, place in around.beacons.items():
-            height = place[2] if len(place) > 2 else 0.0
-            self._scene.add_icosphere(f"/beacon/{name}", 0.15, _ORANGE, position=(place[0], place[1], height))
+            position = (place[0], place[1], place[2] if len(place) > 2 else 0.0)
+            self._scene.add_icosphere(f"/beacon/{name}", max(0.03, 0.012 * size), _ORANGE, position=position)
             self._scene.add_label(f"/beacon/{name}/label", name)
-        corners = [np.array(place[:2]) for place in around.beacons.values()]
-        if around.grid is not None:
-            _, left, low, turn = around.grid.geometry.tolist()
-            wide, high = around.grid.size_m
-            across = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-            middle = np.array([left, low]) + across @ np.array([wide, high]) / 2
-            # viser puts the first row of an image at its lowest y, as the map has it.
-            wxyz = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-            image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
-            self._scene.add_image(
-                "/map",
-                np.repeat(image, 3, axis=2),
-                wide,
-                high,
-                wxyz=wxyz,
-                position=(middle[0], middle[1], _FLOOR_M / 2),
-            )
-            corners += [
-                np.array([left, low]) + across @ np.array(c) for c in ((0, 0), (wide, 0), (0, high), (wide, high))
-            ]
-        if not corners:
-            return centre, size
-        low_corner, high_corner = np.min(corners, axis=0), np.max(corners, axis=0)
-        return (low_corner + high_corner) / 2, max(float(np.max(high_corner - low_corner)), 1.0)
+        if around.grid is None:
+            return
+        turn = float(around.grid.geometry[3])
+        middle = np.mean(_corners(around.grid), axis=0)
+        image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
+        # viser puts the first row of an image at its lowest y, as the map has it.
+        self._scene.add_image(
+            "/map",
+            np.repeat(image, 3, axis=2),
+            *around.grid.size_m,
+            wxyz=(math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)),
+            position=(middle[0], middle[1], -self._floor_m),
+        )
 
     def _draw_path(self, path: Floats) -> None:
         for name, columns, colour, width in (("/path", [0, 1], _BLUE, 3.0), ("/reference", [6, 7], _BLACK, 1.5)):
-            points = np.column_stack([path[:, columns], np.full(len(path), _FLOOR_M)])
+            points = np.column_stack([path[:, columns], np.full(len(path), self._floor_m)])
             self._lines(name, geometry.polyline(points), colour, width)
         known = path[np.isfinite(path[:, [0, 1, 3, 4]]).all(axis=1)]
         if len(known):
             at = np.linspace(0, len(known) - 1, min(_ELLIPSES, len(known))).astype(int)
             self._lines(
                 "/ellipses",
-                np.concatenate([geometry.ellipse(known[i], 2 * _FLOOR_M) for i in at]),
+                np.concatenate([geometry.ellipse(known[i], 2 * self._floor_m) for i in at]),
                 _GREY,
                 1.5,
             )
@@ -289,9 +315,9 @@ def scene_of(
     return LinkScene(server, None if j2s is None else np.array(j2s))
 
 
-def _ground(scene: viser.SceneApi, size_m: float) -> None:
+def _ground(scene: viser.SceneApi, size_m: float, centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
     cell = 10.0 ** math.floor(math.log10(size_m / 8))
     scene.add_grid(
         "/ground", size_m, size_m, cell_size=cell, section_size=5 * cell, cell_color=(232, 235, 238),
-        section_color=(205, 210, 215), plane_color=(246, 247, 249), plane_opacity=1.0,
+        section_color=(205, 210, 215), plane_color=(246, 247, 249), plane_opacity=1.0, position=centre_m,
     )  # fmt: skip
