@@ -12,7 +12,7 @@ from linkpose import quantities
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
 from linkpose.presentation import Row, RowReader
-from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.quantities import HEADING, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     import viser
 
     from linkpose.page.scene import Surroundings
-
-_SHOWN_BY = (QW, HEIGHT, HEADING, ROLL)  # the first that is known selects the best filter
 
 
 class Drawing:
@@ -34,13 +32,18 @@ class Drawing:
         self._rows = RowReader(columns)
         self._at = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
-        self._candidates = [(q, name) for q in _SHOWN_BY for name, of in self._of_filter.items() if q in of]
         self._reference_at = [
             (part.quantity, at)
             for column, at in self._at.items()
             if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
         ]
         self._scene = scene_of(server, self._of_filter.values(), rig, surroundings)
+        self._candidates = [(q, name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of]
+
+    @property
+    def charted(self) -> tuple[Quantity, ...]:
+        """The quantities that belong to what the scene shows."""
+        return self._scene.charted
 
     def read(self, newest: Floats) -> Row:
         """A row (columns,) by filter and quantity."""

@@ -130,8 +130,8 @@ class Page:
         server = self._server
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        self._panel = Panel(server, self._columns, self._redraw)
         self._drawing = Drawing(server, self._columns, rig, surroundings)
+        self._panel = Panel(server, self._columns, self._drawing.charted, self._redraw)
         if self._replay is not None:
             self._build_player(self._replay)
         elif self._on_mark is not None:

@@ -5,13 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
 from linkpose.page import geometry
 from linkpose.presentation import Row, best_filter
-from linkpose.quantities import CHAIN_ROTATION, HEADING, HEIGHT, PITCH, QW, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import (
+    ANGLE,
+    BALL_ANGLES,
+    CHAIN_ROTATION,
+    HEADING,
+    HEIGHT,
+    HEIGHT1,
+    HEIGHT2,
+    PITCH,
+    QW,
+    ROLL,
+    YAW,
+    Quantity,
+    X,
+    Y,
+)
 from linkpose.rotations import product
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
@@ -36,6 +51,9 @@ _FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does 
 
 class Scene(Protocol):
     """What the page draws in 3-D."""
+
+    charted: ClassVar[tuple[Quantity, ...]]  # that charts show, if a filter estimates them
+    shown_by: ClassVar[tuple[Quantity, ...]]  # the first of these with a value selects the best filter
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
         """Draws the newest row as the filter `name` estimates it.
@@ -90,6 +108,7 @@ class LinkScene:
     Without a known J2S only the attitude of the sensor is drawn, at the joint.
     """
 
+    charted, shown_by = (HEIGHT, ROLL, PITCH), (HEIGHT, ROLL)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, j2s_m: Floats | None) -> None:
@@ -146,6 +165,8 @@ class LinkScene:
 
 class RobotScene:
     """A robot in the plane: ground, map, beacons, pose, path, ±2σ ellipses along it, and the reference's path."""
+
+    charted, shown_by = (X, Y, HEADING), (HEADING,)
 
     def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
         self._scene, self._draws = server.scene, 0
@@ -231,6 +252,7 @@ class ChainScene:
     links. With a known J2S, the fixed joint stays in its place, otherwise the joint between the links does.
     """
 
+    charted, shown_by = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2), (QW,)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, rig: Rig) -> None:
