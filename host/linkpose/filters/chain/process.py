@@ -24,7 +24,7 @@ from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back,
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
 from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop
 from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
-from linkpose.filters.frozen import is_frozen
+from linkpose.filters.frozen import MEMORY, is_frozen
 from linkpose.wire.messages import SampleFlags
 
 _NEEDED = int(SampleFlags.IMU_VALID | SampleFlags.IMU2_VALID)
@@ -35,8 +35,8 @@ _CLIPPED = int(
     | SampleFlags.GYRO2_SATURATED
 )
 # Readings of a sensor at rest may repeat to the last bit (low-pass filter, little noise): below this rate of all axes
-# they do not show a frozen sensor.
-_RESTING_RAD_S = 0.05
+# they do not show a frozen sensor, unless they repeat for _LONGEST_REPEAT_S.
+_RESTING_RAD_S, _LONGEST_REPEAT_S = 0.05, 2.0
 _LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
 _UNKNOWN_HEADING = math.pi / math.sqrt(3.0)  # σ of a heading that is uniform all around (rad)
 
@@ -296,7 +296,9 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         if base >= 0:
-            out.height[k], out.height_std[k] = _height(best, k, size, base)
+            height, std = _height(best, k, size, base)
+            if std < q.unknown_m:
+                out.height[k], out.height_std[k] = height, std
     for k in range(2):
         for i in range(3):
             out.tilt[k, i] = best.rotation[k, 2, i]
@@ -401,7 +403,8 @@ def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, cali
         bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
         is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
-    return is_possible and not (frozen and turns)
+    frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
+    return is_possible and not frozen
 
 
 @inner

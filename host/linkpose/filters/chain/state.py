@@ -103,6 +103,7 @@ class ChainParameters(NamedTuple):
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
+    unknown_m: float = 0.1  # ditto, of a height: an unknown r_k alone makes it 0.3 m
     # Prior standard deviations.
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
