@@ -171,24 +171,6 @@ def test_the_same_seed_gives_the_same_files(linkpose, tmp_path, rig):
     assert texts[0] == texts[1] != texts[2]
 
 
-@pytest.mark.parametrize(("rig", "checks"), [("indoor", 0), ("underwater", 14)])
-def test_reproduce_prints_every_variant(linkpose, tmp_path, rig, checks):
-    picture = tmp_path / "variants.png"
-    result = linkpose("reproduce", rig, "--seeds", 1, "--json", "--plot", picture)
-    assert all(line.startswith("Compiling filters") for line in result.err.splitlines())
-    rows = [json.loads(line) for line in result.out.splitlines()]
-    assert [set(row) for row in rows[:checks]] == [{"check", "asked", "measured"}] * checks
-    variants = rows[checks:]
-    for row in variants:
-        assert {"filter", "noise", "correlation", "gate", "seeds", "position_rmse_m_mean"} <= set(row)
-        assert {"position_rmse_m_max", "heading_rmse_rad_mean"} <= set(row)
-        if row["gate"] is not None:
-            assert row["position_rmse_m_mean"] < 0.2
-    assert {row["filter"] for row in variants} == {"ekf", "ukf"}
-    assert {row["gate"] for row in variants} == {None, 0.997}
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
 def test_mice_as_odometry(indoor, linkpose, refused, tmp_path):
     """The truth's velocities as an estimate of mice: the log's own odometry is not needed."""
     log, grid, truth = indoor
