@@ -66,7 +66,7 @@ def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):
 
 
 def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
-    """What is told as a compiler at work is one: nothing is left to compile after it."""
+    """After the reported compilation nothing is left to compile."""
     log, grid, _ = indoor
     warm_up(["ekf", "ukf", "mcl", "scan-match"])
     read = read_carmen(log)
