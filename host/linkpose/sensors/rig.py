@@ -158,7 +158,12 @@ class Mouse:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """All of a rig.toml."""
+    """Sensor placement and calibration, the contents of a rig.toml. Every value has a default.
+
+    `joint` holds J2S (the vector from the joint centre to the sensor) in the first sensor's axes (m), `chain` the joint
+    between two links, `mouse` each mouse in the robot's frame (m, degrees). `imu`, `noise`, `mag` and `baro` are
+    calibrations of the sensors.
+    """
 
     joint: Joint = field(default_factory=Joint)
     imu: Imu = field(default_factory=Imu)

@@ -23,7 +23,7 @@ from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
 from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop
-from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
+from linkpose.filters.chain.update import add_linearization_errors, apply_correction, clear_row, expected_square
 from linkpose.filters.frozen import MEMORY, is_frozen
 from linkpose.wire.messages import SampleFlags
 
@@ -84,6 +84,10 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             s.up_spread[k] = 0.0
             for j in range(3):
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
+        s.moved_heading = 0.0
+        for k in range(2):
+            for j in range(3):
+                s.moved_axis[k, j] = 0.0
         s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
         s.play_square = q.first_play_rad**2
         clear_stops(s)
@@ -229,6 +233,8 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
             update_stop(s, size, hinge_angle(s), q)
             apply_correction(s, size, hinge, base)
         s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
+    if bank.spread:
+        add_linearization_errors(s, hinge, h, q)
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
