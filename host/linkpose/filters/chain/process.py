@@ -96,6 +96,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             _begin_start(s, bank.length)
     if bank.hinge < 0 and not bank.begun:
         set_frame(bank, states[0].rotation[0, 2])
+    bank.rests = int(not bank.begun)
     bank.begun, bank.spread, bank.best = 1, 0, 0
     if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
         _spread(bank, states, 0.0, gyro, q)
@@ -418,6 +419,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
     """One sample, `h` (s) after the last."""
     for k in range(2):
         follow_rest(bank, states[bank.best], k, gyro, accel, h, q)
+        if bank.still_s[k] == 0.0:
+            bank.rests = 0
     bank.since_update += h
     due = bank.since_update >= q.period_s
     for i in range(states.shape[0]):
@@ -428,6 +431,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
             s.span += h
             if due:
                 _update(s, bank, gyro, bank.since_update, q, noise)
+                if bank.rests and min(bank.still_s[0], bank.still_s[1]) > q.rest_s:
+                    _begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
     if due:
         bank.since_update = 0.0
         _select(bank, states, q)
