@@ -113,7 +113,7 @@ def corrected(nominal, change):
 
 
 def unconstrained(s):
-    """Scale the covariance so that the constraint ‖Z‖ = 1, which a dense update knows nothing of, does not apply."""
+    """Scale the covariance so that the constraint ‖Z‖ = 1, which a dense update ignores, does not apply."""
     s.covariance[:] += np.diag(np.repeat([1.0, 0.0], [3, SIZE - 3]))
 
 
