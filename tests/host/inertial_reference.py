@@ -7,15 +7,17 @@ states and compares a kernel with the reference to 1e-9.
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.linalg import expm
 
+from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._records import record_of
-from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, rest, update
+from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, report, rest, update
 from linkpose.filters.inertial.hypotheses import DATA_SHEET
-from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, V, Z, fresh_state
+from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, MG, PSI, SIZE, D, V, Z, fresh_state
 from linkpose.filters.joint_inertial import InertialParameters
 from linkpose.sensors.rig import Imu
 
@@ -111,7 +113,7 @@ def corrected(nominal, change):
 
 
 def unconstrained(s):
-    """Scale the covariance so that the constraint ‖Z‖ = 1, which a dense update knows nothing of, does not apply."""
+    """Scale the covariance so that the constraint ‖Z‖ = 1, which a dense update ignores, does not apply."""
     s.covariance[:] += np.diag(np.repeat([1.0, 0.0], [3, SIZE - 3]))
 
 
@@ -232,7 +234,7 @@ def check_the_heading(rng):
     off = 1e-6 * s.tilt
     _, true = random_state(rng)
     true.tilt[:], true.north[:] = s.tilt, s.north
-    propagate.rotate_attitude(true, tuple(off))
+    propagate.rotate_attitude(true, vec.turn_of(tuple(off)))
     s.nominal[PSI] = s.tilt @ off
     update.constrain_attitude(s)
     np.testing.assert_allclose(s.north, true.north, rtol=0, atol=1e-9)
@@ -252,6 +254,41 @@ def check_the_alignment_to_gravity(rng):
     np.testing.assert_allclose(s.covariance[Z:V, Z:V], expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[Z:V, BG:], lean @ p[:, BG:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[V:BG, V:BG], 0.5 * np.eye(3), rtol=0, atol=1e-9)
+
+
+def empty_row():
+    """A row of ESTIMATE; a record of NumPy has a method `std`."""
+    return SimpleNamespace(**{name: np.zeros(ESTIMATE[name].shape) for name in ESTIMATE.names})
+
+
+def check_the_reported_stds(rng):
+    """σ of each reported value, by finite differences of the value, and at a later attitude: those of that attitude."""
+    states, s = random_state(rng)
+    across = np.eye(SIZE)
+    across[Z:V, Z:V] -= np.outer(s.tilt, s.tilt)
+    s.covariance[:] = 1e-4 * across @ s.covariance @ across
+    s.time = s.turned_at = 1.0
+    later, begin = 0.3 * rng.standard_normal(3), states.copy()
+
+    def reported(change, rotation):
+        trial, row = begin.copy().view(np.recarray)[0], empty_row()
+        trial.nominal[:] += change
+        update.constrain_attitude(trial)
+        propagate.rotate_attitude(trial, vec.turn_of(tuple(rotation)))
+        report.report(trial, 1.0, IMU, row)
+        return row.value
+
+    small = 1e-6
+    for rotation, held in (np.zeros(3), 0), (later, 3):
+        gradient = np.array(
+            [(reported(small * e, rotation) - reported(-small * e, rotation)) / (2 * small) for e in np.eye(SIZE)]
+        ).T
+        propagate.rotate_attitude(s, vec.turn_of(tuple(rotation)))
+        row = empty_row()
+        report.report(s, 1.0, IMU, row)
+        expected = np.sqrt(np.diag(gradient @ begin[0].covariance @ gradient.T))
+        np.testing.assert_allclose(row.std[held:], expected[held:], rtol=1e-6)
+        s.span = 0.01  # from here on the covariance is that of an earlier sample
 
 
 if __name__ == "__main__":

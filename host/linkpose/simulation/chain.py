@@ -7,15 +7,17 @@ envelope: at rest at the start and at the end. Rotations R take vectors of senso
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
-from linkpose.rotations import of_matrices
+from linkpose.quantities import BALL_ANGLES
+from linkpose.rotations import of_matrices, swing_twist
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import CHAIN_JOINTS, Chain, Imu, Joint, Rig, Vector, to_vector
+from linkpose.sensors.rig import CHAIN_JOINTS, Chain, Imu, Joint, Rig, Vector, to_quaternion, to_vector
 from linkpose.simulation.link import LinkRun
 from linkpose.simulation.motion import HandMotion, Kinematics
 
@@ -26,10 +28,13 @@ J2S_M: Vector = (0.03, 0.06, -0.25)  # from the fixed joint to sensor 1, half-wa
 R1_M: Vector = (0.03, 0.06, 0.20)  # from the knee to sensor 1
 _R2_ALIGNED_M = np.array([0.02, 0.05, -0.15])  # from the knee to sensor 2, in sensor 1's axes while the leg is straight
 _AXIS1 = np.array([0.05, 1.0, 0.10])  # of the hinge, in sensor 1's axes: to the side, as a strap leaves it
+_LONG_AXIS = np.array([0.0, 0.0, 1.0])  # of link 1, in sensor 1's axes
 _STRAP = ((2, 0.45), (0, 0.2))  # how sensor 2 is turned on its link: about z, then about x (rad)
 _SWING1_RAD, _SWING2_RAD = 0.35, 0.4  # rms of the angles of link 1, and of link 2 relative to it: a brisk walk
 _RELATIVE_MOTION = 10  # stream of random numbers, apart from those of the link
 _RIG_STD_M, _RIG_STD_DEG = 0.002, 0.5  # that a rig file states of the mounting
+
+_BALL_COLUMNS = tuple(quantity.column for quantity in BALL_ANGLES)
 
 
 class Relative(NamedTuple):
@@ -81,16 +86,26 @@ class ChainRun(LinkRun):
     @property
     def rig(self) -> Rig:
         """What is known without a calibration of the chain: the fixed joint, and which joint the chain has."""
-        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=Chain(self.joint))
+        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=self._stated)
+
+    @property
+    def _stated(self) -> Chain:
+        """The kind of the joint, and the axes from which the angles of a ball joint count."""
+        if self.joint == "hinge":
+            return Chain(self.joint)
+        return Chain(self.joint, long_axis=to_vector(_LONG_AXIS), flexion_axis=to_vector(self._axes[0]))
 
     @property
     def calibrated_rig(self) -> Rig:
         """The rig file with the mounting of both sensors."""
         axis1 = self._axes[0]
-        chain = Chain(self.joint, to_vector(self._r1), _RIG_STD_M, to_vector(self._r2), _RIG_STD_M)
+        levers = to_vector(self._r1), _RIG_STD_M, to_vector(self._r2), _RIG_STD_M
+        neutral = to_quaternion(of_matrices(self._mount[None])[0])
+        stated = self._stated if self.joint == "hinge" else replace(self._stated, neutral=neutral)
+        chain = replace(stated, r1_m=levers[0], r1_std_m=levers[1], r2_m=levers[2], r2_std_m=levers[3])
         if self.joint == "hinge":
-            axes = to_vector(axis1), _RIG_STD_DEG, to_vector(self._mount.T @ axis1), _RIG_STD_DEG
-            chain = Chain(*(chain.joint, chain.r1_m, chain.r1_std_m, chain.r2_m, chain.r2_std_m), *axes)
+            chain = replace(chain, axis1=to_vector(axis1), axis1_std_deg=_RIG_STD_DEG)
+            chain = replace(chain, axis2=to_vector(self._mount.T @ axis1), axis2_std_deg=_RIG_STD_DEG)
         return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=chain)
 
     def relative(self, time_s: Floats) -> Relative:
@@ -130,10 +145,19 @@ class ChainRun(LinkRun):
         link, relative = self.at(time_s), self.relative(time_s)
         columns = dict(super().truth_columns(time_s))
         columns |= dict(zip(("qw", "qx", "qy", "qz"), of_matrices(relative.rotation).T, strict=True))
-        if self.joint == "hinge":
+        if self.joint == "ball":
+            columns |= dict(zip(_BALL_COLUMNS, np.degrees(self._ball_angles(relative)).T, strict=True))
+        else:
             columns["angle_deg"] = (np.degrees(relative.angle_rad) + 180.0) % 360.0 - 180.0
         below = link.tilt @ (self._d - self._r1) + self.second_link(time_s).tilt @ self._r2
         return columns | {"height1_m": link.height_m, "height2_m": below}
+
+    def _ball_angles(self, relative: Relative) -> Floats:
+        """(N, 3) flexion, abduction and axial rotation (rad) from the first pose, about the leg's own axes."""
+        flexion = self._axes[0] - (self._axes[0] @ _LONG_AXIS) * _LONG_AXIS
+        flexion /= np.linalg.norm(flexion)
+        axes = np.column_stack([flexion, np.cross(_LONG_AXIS, flexion), _LONG_AXIS])
+        return swing_twist(of_matrices(axes.T @ relative.rotation @ self._mount.T @ axes))
 
 
 def about(axis: Floats, angle_rad: Floats) -> Floats:

@@ -100,6 +100,9 @@ _FIELDS = np.dtype(
         ("mean_force", *_VECTOR),  # over the last tenth of a second (m/s²)
         ("mean_rate", *_VECTOR),  # rad/s
         ("unsteadiness", "f8"),  # mean square change of rate and tilt (rad²/s²)
+        # Reported until the covariance changes.
+        ("position_std", *_VECTOR),  # σ of height, x and y (m)
+        ("turn_covariance", "f8", (6,)),  # of the attitude error θ in n, xx xy xz yy yz zz (rad²)
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
