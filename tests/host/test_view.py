@@ -16,7 +16,7 @@ import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
-from linkpose.cli.view import Extremes, Screen
+from linkpose.cli.view import Extremes, Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
 from linkpose.presentation import aligned_length, angle_with_std, length_with_std
 from linkpose.sensors.devices import Sensors
@@ -210,6 +210,31 @@ def test_a_narrow_screen_drops_the_slow_columns_first() -> None:
     assert "sim://link" in wide and "difference from best" in wide
     assert "sim://link" not in narrow and "difference" not in narrow
     assert "IMU ok BARO ok" in narrow and "0 lost" in narrow and "±0.4 mm" in narrow
+
+
+def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> None:
+    """A barometer starts at once, a better filter later: its curve does not begin with the barometer's noise."""
+    screen = Screen("sim://link", ["joint", "baro"])
+    for at in range(100):
+        joint = 1.5 + 0.001 * at if at >= 50 else math.nan
+        screen.add(0.05 * at, {"joint": {quantities.HEIGHT: (joint, 0.01)}, "baro": {quantities.HEIGHT: (9.0, 0.3)}})
+    curve_lines = [line for line in screen.render(health(), 80, 24).plain.splitlines() if "┤" in line]
+    assert [float(line.split("┤")[0]) for line in (curve_lines[0], curve_lines[-1])] == pytest.approx(
+        [1.6, 1.55], abs=0.01
+    )
+    robot = Screen("sim://mice", ["tilt", "mice"])
+    pose = {quantities.X: (1.0, 0.01), quantities.Y: (2.0, 0.01), quantities.HEADING: (0.1, 0.01)}
+    robot.add(0.0, {"tilt": {quantities.HEIGHT: (math.nan, math.nan)}, "mice": pose})
+    shown = robot.render(health(), 80, 24).plain
+    assert "HEIGHT" not in shown and "x 1.000 m ±1.0 cm   y 2.000 m ±1.0 cm   heading +5.7° ±0.6°" in shown
+    assert all(len(line) <= 40 for line in robot.render(health(), 40, 24).plain.splitlines())
+    assert "heading +5.7° ±0.6°" in robot.render(health(), 40, 24).plain
+
+
+def test_the_final_table_fits() -> None:
+    summary = {"joint-inertial": (1.2, 1.65, 0.001), "baro": (0.9, 2.0, 0.3)}
+    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
+    assert final_table({}, 80) == []
 
 
 def test_the_next_filter_is_shown_with_its_own_curve() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -328,7 +329,7 @@ class _LiveRun:
         for remark in self._sink.dropped:
             self._console.report(remark)
         if self._console.shows_progress:
-            for line in final_table(self._extremes.summary()):
+            for line in final_table(self._extremes.summary(), shutil.get_terminal_size().columns):
                 self._console.report(line)
         _report_j2s(self._estimator, self._console)
         _report_mice(self._estimator, self._console)
