@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import FileFormatError
+from linkpose.inputs import open_binary
 from linkpose.recording import columns
 from linkpose.recording.ahead import ahead
-from linkpose.recording.chunks import open_binary
 from linkpose.recording.survey import Survey
 from linkpose.recording.table import TableFile, require
 from linkpose.recording.textfile import Part
