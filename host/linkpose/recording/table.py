@@ -175,9 +175,9 @@ def check_times(path: Path, time_s: Floats, first_line: int, before_s: float = -
         bad = np.flatnonzero(~(np.diff(time_s, prepend=before_s) >= 0) | np.isinf(time_s))
     if len(bad):
         row = int(bad[0])
-        what = f"runs backwards ({time_s[row]:.6f} s)"
-        if not np.isfinite(time_s[row]):
-            what = "is missing" if np.isnan(time_s[row]) else "is infinite"
+        what = "is missing" if np.isnan(time_s[row]) else f"runs backwards ({time_s[row]:.6f} s)"
+        if np.isinf(time_s[row]):
+            what = "is infinite"
         raise FileFormatError(
             path, f"{path}, line {first_line + row}: time_s {what}; remove the rows before or after it"
         )
