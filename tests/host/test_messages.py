@@ -216,7 +216,7 @@ PRODUCERS: list[Producer] = [
     lambda folder, _: read_table(written(folder / "a.csv", "a,b\n1,2\n")).require("time_s"),
     table("time_s,a\n,1\n"),
     table("time_s,a\n1,1\n0,1\n"),
-    recording(f"{IMU}\n0,{ROW}\n1e300,{ROW}\n"),
+    recording(f"{IMU}\n0,{ROW}\ninf,{ROW}\n"),
     recording(f"{IMU}\n1,{ROW}\n1,{ROW}\n"),
     table("time_s,a\n0,1e20\n"),
     table("# linkpose estimate 1\n# {}\ntime_s,a\n0,1\n", "recording"),

@@ -267,7 +267,6 @@ class _TableSource:
         previous: dict[str, float] = {}
         for part in self._file.parts(progress):
             time_s = part.columns["time_s"]
-            _check_finite(self._path, part)
             yield self._measurements(part, previous)
             previous = {name: float(column[-1]) for name, column in part.columns.items()}
             first_s, last_s = (time_s[0] if not self._rows else first_s), time_s[-1]
@@ -406,17 +405,6 @@ def _usual_step(time_s: Floats) -> float:
     """The usual interval between two samples (s)."""
     intervals = np.diff(time_s)
     return float(np.median(intervals[intervals > 0])) if np.any(intervals > 0) else 0.01
-
-
-def _check_finite(path: Path, part: Part) -> None:
-    """Raises FileFormatError when a time is not finite."""
-    time_s = part.columns["time_s"]
-    wrong = np.flatnonzero(~np.isfinite(time_s))
-    if len(wrong):
-        line = part.first_line + int(wrong[0])
-        raise FileFormatError(
-            path, f"{path}, line {line}: time_s is {time_s[wrong[0]]}; it must be a number of seconds", line
-        )
 
 
 # ---- raw captures ----

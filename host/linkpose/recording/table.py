@@ -175,9 +175,9 @@ def check_times(path: Path, time_s: Floats, first_line: int, before_s: float = -
         bad = np.flatnonzero(~(np.diff(time_s, prepend=before_s) >= 0) | np.isinf(time_s))
     if len(bad):
         row = int(bad[0])
-        what = "is missing" if np.isnan(time_s[row]) else f"runs backwards ({time_s[row]:.6f} s)"
-        if np.isinf(time_s[row]):
-            what = "is infinite"
-        raise FileFormatError(
-            path, f"{path}, line {first_line + row}: time_s {what}; remove the rows before or after it"
-        )
+        what = f"runs backwards ({time_s[row]:.6f} s); remove the rows before or after it"
+        if np.isnan(time_s[row]):
+            what = "is missing; remove the rows before or after it"
+        elif np.isinf(time_s[row]):
+            what = f"is {time_s[row]}; it must be a number of seconds"
+        raise FileFormatError(path, f"{path}, line {first_line + row}: time_s {what}", first_line + row)
