@@ -301,18 +301,18 @@ class StreamDecoder:
         is_sound = length >= 0 and crc_hqx(payload[:-2], _CRC_START) == payload[-2] | payload[-1] << 8
         if length < 0 or length > _LONGEST_BODY:
             self.corrupt.length += 1
-            self.misfit = (payload[0], length) if is_sound else self.misfit
         elif not is_sound:
             self.corrupt.crc += 1
         elif (unpack := self._unpack.get(payload[0] << 8 | length)) is None:
             self._refuse(payload)
         elif (message := unpack(payload)) is None:
             self.corrupt.length += 1
+        if is_sound and message is None:
+            self.misfit = payload[0], length
         return message
 
     def _refuse(self, payload: bytes) -> None:
         """Counts a sound frame of unknown type or of a length that its type does not have."""
-        self.misfit = payload[0], len(payload) - 3
         if payload[0] in self._types:
             self.corrupt.length += 1
         else:
