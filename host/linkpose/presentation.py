@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 # A row of estimates by filter: filter -> quantity -> (value, σ) in the column's unit; NaN where there is none.
 Row = dict[str, dict[Quantity, tuple[float, float]]]
 
+_JOINT_ANGLES = (quantities.ANGLE, *quantities.BALL_ANGLES)
 _STATES = ("being set up", "left out")  # that need no cure here
 
 
@@ -104,21 +105,13 @@ def angle_with_std(value_deg: float, std_deg: float) -> str:
 
 
 def joint_angle(values: Mapping[Quantity, tuple[float, float]]) -> tuple[float, float] | None:
-    """The angle (°) of a chain's joint and its σ: a hinge's, or the whole angle of a ball joint's rotation.
-
-    None of a filter that estimates no chain.
-    """
-    if quantities.ANGLE in values:
-        return values[quantities.ANGLE]
-    if quantities.QW not in values:
-        return None
-    w, std = values[quantities.QW]
-    return (math.degrees(2 * math.acos(min(abs(w), 1.0))) if math.isfinite(w) else math.nan), std
+    """The first angle (°) of a chain's joint and its σ; None of a filter that estimates no chain."""
+    return next((values[q] for q in _JOINT_ANGLES if q in values), None)
 
 
-def joint_name(values: Mapping[Quantity, tuple[float, float]]) -> str:
-    """What `joint_angle` is called: of a ball joint it depends on how the sensors are mounted."""
-    return quantities.ANGLE.label if quantities.ANGLE in values else quantities.ROTATION.label
+def joint_texts(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
+    """The angles of a chain's joint: that of a hinge, or flexion, abduction and axial rotation of a ball joint."""
+    return [f"{q.label} {angle_with_std(*values[q])}" for q in _JOINT_ANGLES if q in values]
 
 
 def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:

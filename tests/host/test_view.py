@@ -218,15 +218,15 @@ def test_a_chain_shows_its_joint_angle_with_its_deviation_and_curve() -> None:
         values = {quantities.ANGLE: (30 * math.sin(0.1 * at), 0.4), quantities.HEIGHT1: (0.25, 0.01)}
         screen.add(0.1 * at, {"joint-inertial": {quantities.HEIGHT: (0.2, 0.001)}, "chain": values})
     shown = screen.render(health(), 80, 24).plain
-    assert "joint angle   +26.0° ±0.4°   height 1 0.250 m ±1.0 cm" in shown and "HEIGHT over joint" in shown
+    assert "joint angle +26.0° ±0.4°   height 1 0.250 m ±1.0 cm" in shown and "HEIGHT over joint" in shown
     assert shown.splitlines()[2].strip().startswith("30.0")
     assert "height 1" not in screen.render(health(), 40, 24).plain
 
 
-def test_a_ball_joint_shows_its_rotation() -> None:
+def test_a_ball_joint_shows_its_three_angles() -> None:
     screen = Screen("sim://chain", ["chain"])
-    half = math.radians(42.0) / 2
-    screen.add(0.0, {"chain": dict.fromkeys(quantities.CHAIN_ROTATION, (math.cos(half), 0.9))})
-    assert "joint rotation   +42.0° ±0.9°" in screen.render(health(), 80, 24).plain
-    screen.add(0.1, {"chain": dict.fromkeys(quantities.CHAIN_ROTATION, (math.nan, 180.0))})
-    assert "joint rotation   not known yet" in screen.render(health(), 80, 24).plain
+    angles = zip(quantities.BALL_ANGLES, ((42.0, 0.9), (-3.0, 0.8), (math.nan, math.nan)), strict=True)
+    screen.add(0.0, {"chain": dict(angles) | {quantities.HEIGHT1: (0.2, 0.001)}})
+    line = "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°   axial rotation not known yet"
+    assert line in screen.render(health(), 80, 24).plain.splitlines()
+    assert "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°" in screen.render(health(), 60, 24).plain.splitlines()

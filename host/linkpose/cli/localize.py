@@ -30,8 +30,8 @@ NOISES = {
 }  # fmt: skip
 FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
 LANDMARK_ERROR_TIME_S = 0.5
-# With fewer beacons a bias cannot be told from a place. On three public recordings of radio ranges (tests/bench) both
-# constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
+# With fewer beacons a bias looks like a shift of position. On three public recordings of radio ranges (tests/bench),
+# both constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
 BEACONS_FOR_CONSTANTS = 3
 POSITIVE = options.FiniteRange(min=0, min_open=True)
 
@@ -419,9 +419,9 @@ def _require_measurements(log: Path, name: str, track: Track) -> None:
 
 
 def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float, float] | None) -> Settings:
-    from linkpose.localization.kalman import Transform
     from linkpose.localization.noise import RangeNoise
     from linkpose.localization.settings import Settings
+    from linkpose.localization.ukf import Transform
 
     scaled = given["transform"] == "scaled"
     if min(given["start_std"]) <= 0:

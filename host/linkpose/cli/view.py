@@ -21,11 +21,10 @@ from linkpose.presentation import (
     Exclusions,
     Row,
     RowReader,
-    angle_with_std,
     best_filter,
     fault_lines,
     joint_angle,
-    joint_name,
+    joint_texts,
     number_text,
     pose_text,
     signed_angle,
@@ -229,10 +228,9 @@ class Screen:
         return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        """The joint's angle, the heights of both sensors (narrow screens drop them), and the curve of the angle."""
+        """The joint's angles, both heights (narrow screens drop the last ones), and the curve of the first angle."""
         values = self._row[name]
-        angle = joint_angle(values) or (math.nan, math.nan)
-        parts = [f"{joint_name(values)}   {angle_with_std(*angle)}"]
+        parts = joint_texts(values)
         for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
             if quantity in values:
                 parts.append(f"height {number} {with_std(*values[quantity], 'm', 3)}")

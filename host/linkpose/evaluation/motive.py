@@ -22,6 +22,7 @@ from linkpose.evaluation.takes import Take, reference_of, take_of_markers
 from linkpose.inputs import read_bytes
 from linkpose.recording.delimited import to_utf8
 from linkpose.recording.table import Table, check_times
+from linkpose.rotations import matrices
 from linkpose.sensors.measurements import Floats
 
 _SIGNATURE = re.compile(rb'"?Format Version"?([,;\t])')
@@ -124,14 +125,8 @@ def _axes_of_body(path: Path, quaternion: Floats, up: str) -> Floats:
     size = np.linalg.norm(quaternion, axis=1)
     if np.nanmax(np.abs(size - 1), initial=0) > _QUATERNION_TOLERANCE:
         raise LinkposeError(f"{path}: the rotation of the rigid body is no unit quaternion: export it as Quaternion")
-    x, y, z, w = (quaternion / size[:, None]).T
-    body = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
-            [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
-            [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)  # the body's axes in the room
+    turned = matrices(np.roll(quaternion / size[:, None], 1, axis=1))
+    body = turned.transpose(0, 2, 1)  # the body's axes in the room
     return np.asarray(_SENSOR_IN_BODY[up] @ body)
 
 

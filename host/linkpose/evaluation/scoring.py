@@ -14,12 +14,12 @@ from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, CommonStart, Drift, Errors, errors_of, scored
 from linkpose.evaluation.series import Pair, Series, is_sparser, paired
 from linkpose.evaluation.statistics import Collector, Statistics
-from linkpose.quantities import ANGLE, CHAIN_ROTATION, HEIGHT, HEIGHT1, HEIGHT2, PITCH, ROLL, YAW, Quantity
+from linkpose.quantities import ANGLE, BALL_ANGLES, CHAIN_ROTATION, HEIGHT, HEIGHT1, HEIGHT2, PITCH, ROLL, YAW, Quantity
 from linkpose.recording.textfile import Part
 from linkpose.recording.thinned import Thinner
 from linkpose.sensors.measurements import Floats
 
-CHAIN = (ANGLE, *CHAIN_ROTATION, HEIGHT1, HEIGHT2)
+CHAIN = (ANGLE, *BALL_ANGLES, *CHAIN_ROTATION, HEIGHT1, HEIGHT2)
 LINK = (HEIGHT, ROLL, PITCH, YAW, *CHAIN)
 _FEWEST = 0.5  # share of a filter's rows that must have a reference
 

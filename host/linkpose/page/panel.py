@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from linkpose import quantities
-from linkpose.presentation import Row, angle_with_std, joint_angle, joint_name, pose_text, with_std
+from linkpose.presentation import Row, angle_with_std, joint_texts, pose_text, with_std
 from linkpose.quantities import (
     ANGLE,
+    BALL_ANGLES,
     HEADING,
     HEIGHT,
     HEIGHT1,
@@ -49,9 +50,9 @@ class Panel:
         self._health = gui.add_html("")
         self._headline = gui.add_html("")
         able = {quantity for of in self._of_filter.values() for quantity in of}
-        wanted = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
+        wanted: tuple[Quantity, ...] = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
         if {ANGLE, QW} & able:
-            wanted = (ANGLE, HEIGHT1, HEIGHT2)
+            wanted = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2)
         shown = [quantity for quantity in wanted if quantity in able]
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
@@ -136,12 +137,13 @@ class Panel:
     def draw_headline(self, row: Row, name: str) -> None:
         """Shows the newest values of the filter `name`."""
         values = row.get(name, {})
-        angle = joint_angle(values)
+        angles = joint_texts(values)
         if HEIGHT in values:
             first, lines = with_std(*values[HEIGHT], "m", 4), [_angles(values)]
             caption = "height over the joint"
-        elif angle is not None:
-            first, lines, caption = angle_with_std(*angle), [], joint_name(values)
+        elif angles:
+            first, *lines = angles
+            caption = "joint"
         elif HEADING in values:
             first, *lines = pose_text(values)
             caption = "place and heading"

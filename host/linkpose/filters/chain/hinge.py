@@ -15,7 +15,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
-from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
+from linkpose.filters.chain.state import OF_SENSOR, START, Floats, Record
 from linkpose.filters.chain.update import clear_row, expected_square, update
 
 # The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
@@ -78,7 +78,7 @@ def _begin_axes(s: Record, size: int, hinge: int, q: Record) -> None:
             for i in range(3):
                 s.axis[k, i] = -s.axis[k, i]
     for k in range(2):
-        o, axis = hinge + AXES + 3 * k, s.axis[k]
+        o, axis = hinge + 3 * k, s.axis[k]
         for i in range(3):
             for j in range(size):
                 p[o + i, j] = p[j, o + i] = 0.0
@@ -96,7 +96,7 @@ def _horizontal_variance(s: Record, size: int, hinge: int) -> float:
         clear_row(s)
         s.row[OF_SENSOR + 1 - row] = z if row == 0 else -z  # δ(R j) = δθ × R j
         for c in range(3):
-            s.row[hinge + AXES + 3 + c] = s.rotation[1, row, c]
+            s.row[hinge + 3 + c] = s.rotation[1, row, c]
         total += max(expected_square(s, size), 0.0)
     return total
 
@@ -123,8 +123,8 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
         s.row[2] *= heading_share
         s.row[OF_SENSOR + 2] *= heading_share
         for c in range(3):
-            s.row[hinge + AXES + c] = s.rotation[0, row, c]
-            s.row[hinge + AXES + 3 + c] = -s.rotation[1, row, c]
+            s.row[hinge + c] = s.rotation[0, row, c]
+            s.row[hinge + 3 + c] = -s.rotation[1, row, c]
         value = s.a[row] - s.b[row]
         found += value * value
         fit, share = update(s, size, -value, variance, q.huber)
@@ -158,5 +158,5 @@ def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
     clear_row(s)
     for i in range(3):
         s.row[i], s.row[OF_SENSOR + i] = -s.c[i], s.c[i]
-        s.row[hinge + START + i], s.row[hinge + START + 3 + i] = s.b[i], -s.b[i]
+        s.row[START + i], s.row[START + 3 + i] = s.b[i], -s.b[i]
     return math.sqrt(max(expected_square(s, size), 0.0))
