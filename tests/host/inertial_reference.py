@@ -149,21 +149,26 @@ def check_the_joint_constraint(rng):
     unconstrained(s)
     reading = s.gyro_bias + np.array([2.0, -1.5, 1.0])
     s.spread[:] = 1e3 * np.eye(3)
-    s.residual_square, s.reach_square = 0.01, 1.0
+    s.residual_square[:], s.reach_square, s.assumed = (0.01, 0.02, 0.03), 1.0, 0.0
     nominal, p, d, m = s.nominal.copy(), s.covariance.copy(), s.j2s.copy(), s.nominal[MG:D].reshape(3, 3)
     rate = (np.eye(3) - m) @ (reading - s.gyro_bias)
     h = np.zeros((3, SIZE))
     h[:, V:BG] = np.eye(3)
     h[:, BG:BA], h[:, MG:D] = -skew(d), -skew(d) @ by_matrix(reading - s.gyro_bias)
-    excited = np.array(joint_velocity.excited_part(s.spread, tuple(rate), IMU.gyro_variance))
+    interval, spread = 0.04, s.spread.copy()
+    joint_velocity.follow_spread(spread, tuple(rate), interval)
+    excited = np.array(joint_velocity.excited_part(spread, tuple(rate), IMU.gyro_variance))
     h[:, D:PSI] = -skew(excited)
     product = 0.5 * np.trace(p[BG:BA, BG:BA]) * np.trace(p[D:PSI, D:PSI])
-    share = max(0.01, Q.least_residual**2)
-    scalar = product + Q.velocity_floor_m_s**2 + share * (rate @ rate) * (d @ d)
-    noise = scalar * np.eye(3) + IMU.gyro_variance * skew(d) @ skew(d).T
+    floor, reach = Q.velocity_floor_m_s**2, (rate @ rate) * (d @ d)
+    lasting = 2.0 * Q.residual_correlation_s / interval - 1.0
+    excess = reach * (s.residual_square + lasting * (s.residual_square - Q.least_residual**2))
+    noise = (product + floor) * np.eye(3) + np.diag(excess) + IMU.gyro_variance * skew(d) @ skew(d).T
     noise += skew(rate - excited) @ p[D:PSI, D:PSI] @ skew(rate - excited).T
+    q = Q.copy()
+    q.residual_time_s = 1e15  # nothing is measured
     change, covariance = dense_update(p, h, noise, np.cross(rate, d) - s.velocity)
-    assert joint_velocity.update_joint_velocity(s, False, (0.0, 0.0, 0.0), tuple(reading), 0.0, IMU, Q)
+    assert joint_velocity.update_joint_velocity(s, False, (0.0, 0.0, 0.0), tuple(reading), interval, IMU, q)
     np.testing.assert_allclose(s.covariance, covariance, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.nominal, corrected(nominal, change), rtol=0, atol=1e-9)
 

@@ -68,6 +68,12 @@ def plus_diagonal(s: Sym, value: float) -> Sym:
 
 
 @inner
+def add_diagonal(s: Sym, v: Vec) -> Sym:
+    """S + diag(v)"""
+    return s[0] + v[0], s[1], s[2], s[3] + v[1], s[4], s[5] + v[2]
+
+
+@inner
 def add(a: Sym, scale: float, b: Sym) -> Sym:
     """a + scale · b"""
     return (

@@ -28,6 +28,7 @@ _POSITIVE = (
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
 CHAIN_JOINTS = ("ball", "hinge")
+FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 

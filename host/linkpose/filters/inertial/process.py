@@ -30,7 +30,7 @@ from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
 from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
-from linkpose.filters.inertial.joint_velocity import update_joint_velocity
+from linkpose.filters.inertial.joint_velocity import FIRST_REACH_M2_S2, measured_shares, update_joint_velocity
 from linkpose.filters.inertial.noise import follow_noise, start_noise, with_noise
 from linkpose.filters.inertial.propagate import (
     add_noise,
@@ -80,7 +80,6 @@ _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
-_FIRST_REACH_M2_S2 = 0.5  # mean square speed that the assumed share of the constraint's residual counts for
 _LOST, _LOST_M2_S2 = 0.5, 0.01
 # σ of what was learned grows by this factor then: after two or three losses in a row it is that of the start.
 _WIDEN = 3.0
@@ -151,7 +150,9 @@ def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
 @inner
 def _forget_motion(s: Record, q: Record) -> None:
     """What was measured of the motion is measured again: the constraint's residual, the excited directions, a rest."""
-    s.residual_square, s.reach_square, s.assumed = _FIRST_REACH_M2_S2 * q.first_residual**2, _FIRST_REACH_M2_S2, 1.0
+    s.reach_square, s.assumed = FIRST_REACH_M2_S2, 1.0
+    for i in range(3):
+        s.residual_square[i] = FIRST_REACH_M2_S2 * q.first_residual**2
     s.rest_s = 0.0
     for i in range(3):
         for j in range(3):
@@ -320,6 +321,12 @@ def _update(
 
 
 @inner
+def _mean_residual_square(s: Record) -> float:
+    """Mean over the axes (m²/s²)."""
+    return float(s.residual_square[0] + s.residual_square[1] + s.residual_square[2]) / 3.0
+
+
+@inner
 def _bias_walk(s: Record, q: Record) -> float:
     """Random walk of the gyro bias ((rad/s)/√s); more where the joint's constraint leaves over more than its floor.
 
@@ -329,8 +336,8 @@ def _bias_walk(s: Record, q: Record) -> float:
     """
     if not q.has_joint:
         return float(q.gyro_bias_walk_rad_s)
-    measured = s.residual_square - s.assumed * _FIRST_REACH_M2_S2 * q.first_residual**2
-    share = math.sqrt(max(measured / s.reach_square, q.least_residual**2)) / q.least_residual
+    x, y, z = measured_shares(s, q)
+    share = math.sqrt((x + y + z) / 3.0) / q.least_residual
     return float(min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s))
 
 
@@ -377,7 +384,7 @@ def _restart_if_lost(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: R
         and math.isfinite(s.nominal[V] + s.nominal[V + 1] + s.nominal[V + 2] + s.tilt[0])
         and math.isfinite(vec.trace(sub_covariance(s.covariance, V)) + vec.trace(sub_covariance(s.covariance, D)))
     )
-    lost = q.has_joint > 0.0 and s.residual_square > _LOST * max(s.reach_square, _LOST_M2_S2)
+    lost = q.has_joint > 0.0 and _mean_residual_square(s) > _LOST * max(s.reach_square, _LOST_M2_S2)
     if possible and not lost:
         return
     s.restarts += 1
