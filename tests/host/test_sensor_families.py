@@ -1,4 +1,4 @@
-"""Sensors: the data sheets' examples, and what HELLO may say of them."""
+"""Sensors: the data sheets' examples, and what HELLO may contain."""
 
 from __future__ import annotations
 

@@ -97,9 +97,9 @@ def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, t
         while not (path.exists() and path.read_bytes().count(b"\n") > 100):
             assert process.poll() is None
         served.call(served.uno.reset)
-        said = process.communicate(timeout=30)[1]
+        output = process.communicate(timeout=30)[1]
     assert process.returncode == 0
-    assert "was reset (external)" in said
+    assert "was reset (external)" in output
     table = read_table(path, "recording")
     assert table.closing is not None
     assert [gap["cause"] for gap in table.closing["gaps"]] == ["reset"]

@@ -91,7 +91,8 @@ def _imu_delay_s(metadata: dict[str, Any]) -> float | None:
 def load_recording(path: str | PathLike[str]) -> Recording:
     """Reads a recording as a whole: a CSV or Parquet file, or a raw capture (`.bin`).
 
-    Raises FileError, which names the file, the line and the reason, for anything else.
+    The result holds `measurements` (SI units, in the sensors' axes), the `rig` of the recording, and `remarks` on what
+    is wrong with the data. Raises FileError, which names the file, the line and the reason, for anything else.
     """
     file = RecordingFile(Path(path))
     measurements = file.load()

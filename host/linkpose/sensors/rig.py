@@ -28,6 +28,7 @@ _POSITIVE = (
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
 CHAIN_JOINTS = ("ball", "hinge")
+FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
@@ -157,7 +158,12 @@ class Mouse:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """All of a rig.toml."""
+    """Sensor placement and calibration, the contents of a rig.toml. Every value has a default.
+
+    `joint` holds J2S (the vector from the joint centre to the sensor) in the first sensor's axes (m), `chain` the joint
+    between two links, `mouse` each mouse in the robot's frame (m, degrees). `imu`, `noise`, `mag` and `baro` are
+    calibrations of the sensors.
+    """
 
     joint: Joint = field(default_factory=Joint)
     imu: Imu = field(default_factory=Imu)

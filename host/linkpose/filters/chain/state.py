@@ -2,9 +2,9 @@
 
 Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
 sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
-centre to the sensor in the sensor's axes. S_k are the R_k at the first sample, from which joint angles count. A hinge
-adds its axis j_k in either sensor's axes. A fixed first joint adds r_0, the vector from that joint to sensor 1. Errors
-of rotations are in n: R = exp([δθ×]) R̂.
+centre to the sensor in the sensor's axes. S_k are the R_k at the first sample, or at the end of a rest that begins
+there; joint angles count from them. A hinge adds its axis j_k in either sensor's axes. A fixed first joint adds r_0,
+the vector from that joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
 """
 
 from __future__ import annotations
@@ -130,6 +130,7 @@ class ChainParameters(NamedTuple):
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
+    unknown_m: float = 0.1  # ditto, of a height: an unknown r_k alone makes it 0.3 m
     # Prior standard deviations.
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
@@ -230,6 +231,7 @@ BANK = np.dtype(
         ("mean_gyro", "f8", (2, 3)),
         ("mean_accel", "f8", (2, 3)),
         ("still_s", "f8", 2),
+        ("rests", "i8"),  # whether both sensors have been at rest since the first sample
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
         ("new_accel", "f8", (2, 3)),
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
