@@ -64,9 +64,7 @@ def integrate(
     gyro_misfit, accel_misfit = s.level * q.gyro_misfit**2, s.level * q.accel_misfit**2
     s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * rate_square * _GYRO_MISFIT_S)
     s.rotation_variance[k] += (h * guess * _JERK_RAD_S3) ** 2
-    s.velocity_variance[k] += h * (
-        h * noise[1] * s.widening + s.level * q.accel_misfit**2 * s.accel_square[k] * _ACCEL_MISFIT_S
-    )
+    s.velocity_variance[k] += h * (h * noise[1] * s.widening + accel_misfit * s.accel_square[k] * _ACCEL_MISFIT_S)
     s.velocity_variance[k] += (h * guess * _JERK_M_S3) ** 2
     turning = (by * fz - bz * fy) ** 2 + (bz * fx - bx * fz) ** 2 + (bx * fy - by * fx) ** 2
     s.force_rate_square[k] += min(h / q.accel_scale_s, 1.0) * (turning - s.force_rate_square[k])

@@ -61,8 +61,8 @@ class ChainParameters(NamedTuple):
     # Acceleration noise grows up to `most_widening` times where innovations exceed their σ, by e in 1/widening_rate s.
     widening_rate: float = 1.0
     most_widening: float = 100.0
-    # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1 is the
-    # data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second, so the
+    # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1
+    # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second, so the
     # level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated leg
     # (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8 times
     # their error; at 0.01 throughout, σ of data-sheet sensors is a fifth of it.
