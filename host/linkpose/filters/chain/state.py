@@ -62,10 +62,10 @@ class ChainParameters(NamedTuple):
     widening_rate: float = 1.0
     most_widening: float = 100.0
     # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1
-    # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second, so the
-    # level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated leg
-    # (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8 times
-    # their error; at 0.01 throughout, σ of data-sheet sensors is a fifth of it.
+    # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second,
+    # so the level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated
+    # leg (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8
+    # times their error; at 0.01 throughout, σ of data-sheet sensors is a fifth of it.
     moving_mean_s: float = 0.5
     # That square, where σ is right: 0.1 to 0.3 for all of these. Doubled, σ of the hinge [D] 3-4 is 25 % smaller than
     # its error.
