@@ -102,6 +102,14 @@ class TooFewRows(LinkposeError):
         )
 
 
+class NoEstimate(LinkposeError):
+    """A filter's columns are empty wherever they could be compared. `quantities` are their names."""
+
+    def __init__(self, name: str, path: object, quantities: Sequence[str]) -> None:
+        self.filter, self.quantities = name, tuple(quantities)
+        super().__init__(f"{path}: {name} estimated no {' or '.join(quantities)}, so nothing of it can be compared")
+
+
 # ---- ports and boards ----
 
 
