@@ -11,6 +11,7 @@ import click
 from linkpose import __version__
 from linkpose.cli import options
 from linkpose.cli.live import Console
+from linkpose.cli.page import PageOptions
 from linkpose.errors import LinkposeError
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from linkpose.localization.settings import Settings
     from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
-    from linkpose.plotting import Scene
+    from linkpose.recording.table import Table
 
 # The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
 # value for streams, laser scans, and logs of fewer than 100 measurements.
@@ -233,8 +234,10 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
+@options.page
 @options.force
 @options.as_json
+@options.quiet
 def command(
     log: Path,
     map_path: Path | None,
@@ -244,16 +247,23 @@ def command(
     output: Path | None,
     picture: Path | None,
     truth_path: Path | None,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     force: bool,
     json_lines: bool,
+    quiet: bool,
     **settings: Any,
 ) -> None:
     """Estimate a robot's path from a LOG of odometry and measurements, and a map or beacons.
 
     LOG is a CARMEN log (ODOM, FLASER, ROBOTLASER1) or a CSV with one measurement a row: time_s,kind,a,b,c, where kind
     is odometry, range, bearing_range, depth, velocity, attitude or pose. With `-`, rows of the CSV are read from
-    standard input, and poses are written to standard output as they come.
+    standard input, and poses are written to standard output as they come. With --view, the path is then played in the
+    browser until Ctrl-C.
     """
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
     from linkpose.localization.carmen import is_carmen, read_carmen
@@ -266,8 +276,9 @@ def command(
     grid = load_map(map_path) if map_path else None
     beacons = read_beacons(beacons_path) if beacons_path else {}
     if str(log) == "-":
-        _stream(settings, filters, beacons)
+        _stream(settings, filters, beacons, page)
         return
+    console = Console(quiet, verbose=False)
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
         from linkpose.plotting import check_output
@@ -276,7 +287,7 @@ def command(
     carmen = is_carmen(log)
     read = read_carmen(log) if carmen else read_events(log)
     for remark in read.remarks:
-        click.echo(remark, err=True)
+        console.report(remark)
     events = read.events
     if odometry_path is not None:
         from linkpose.localization.odometry import with_mice_odometry
@@ -285,7 +296,7 @@ def command(
     has_scans = any(event.kind == "scan" for event in events)
     default: Method = "scan-match" if has_scans else "ekf"
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
-    settings["estimate"] = _estimated(settings["estimate"], events)
+    settings["estimate"] = _estimated(settings["estimate"], events, console)
     free = _free_noises(settings)
     chosen = {name: _settings(settings, name, read.start) for name in names}
     if not carmen:  # its units are defined, and poses a millisecond apart give any turn rate
@@ -293,16 +304,15 @@ def command(
     for method in names:
         check(events, method, chosen[method], grid, beacons, str(log))
     if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
-        click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
+        console.report("no two ranges of this log are of one instant: --correlation changes nothing")
     if _has_no_odometry(events):
-        click.echo(
+        console.report(
             "the log has no odometry: a constant-velocity model is used (--acceleration-std), "
-            "at the mean height of the beacons",
-            err=True,
+            "at the mean height of the beacons"
         )
-    Console(quiet=False, verbose=False).compile(names)
+    console.compile(names)
     if beacons and not has_scans:
-        chosen = _tuned(events, chosen, beacons, free, quiet=json_lines)
+        chosen = _tuned(events, chosen, beacons, free, console)
     tracks: dict[str, Track] = {
         method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
     }
@@ -312,41 +322,42 @@ def command(
     if output is not None:
         write_tracks(output, tracks, log, force)
     if picture is not None:
-        from linkpose.plotting import Scene
+        from linkpose import plotting
 
-        _draw(picture, tracks, log, [truth_path] if truth_path else [], Scene(grid, beacons), force)
+        figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], plotting.Scene(grid, beacons))
+        plotting.save(figure, picture, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
+    if has_page:
+        from linkpose.page.scene import Surroundings
+
+        page.play(_tables(tracks, log, truth_path), [], Surroundings(grid, beacons), console)
 
 
-def _draw(
-    picture: Path, tracks: dict[str, Track], log: Path, references: list[Path], scene: Scene, force: bool
-) -> None:
-    """Draws the paths as `plot` draws them from their file."""
+def _tables(tracks: dict[str, Track], log: Path, truth: Path | None) -> list[Table]:
+    """The paths and the truth as `plot` reads them from their files."""
     import tempfile
 
-    from linkpose import plotting
     from linkpose.evaluation.references import read_for_picture
 
     with tempfile.TemporaryDirectory() as folder:
-        estimates = Path(folder) / "path.csv"
+        estimates = Path(folder) / f"{log.stem}.csv"
         write_tracks(estimates, tracks, log, force=False)
-        tables = [read_for_picture(path, "z", lambda share: None) for path in (estimates, *references)]
-        figure, _ = plotting.plot_tables(tables, [], scene)
-        plotting.save(figure, picture, force)
+        paths = [estimates] if truth is None else [estimates, truth]
+        return [read_for_picture(path, "z", lambda share: None) for path in paths]
 
 
-def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:
+def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons, page: PageOptions) -> None:
     """Reads rows from standard input and writes a row of CSV for each."""
     import sys
 
     from linkpose.localization.stream import localize_stream
 
     name = filters[0] if filters else "ekf"
-    if len(filters) > 1 or name not in ("ekf", "ukf") or not beacons or settings["smooth"]:
-        raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth")
+    if len(filters) > 1 or name not in ("ekf", "ukf") or not beacons or settings["smooth"] or page.is_wanted:
+        raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth and no --view")
     if settings["estimate"] == ("none",):
         settings["estimate"] = ()
     _free_noises(settings)
@@ -362,7 +373,7 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
         sys.stdout.flush()
 
 
-def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
+def _estimated(words: tuple[str, ...], events: Log, console: Console) -> tuple[str, ...]:
     """The constants to estimate: as given, or scale and bias where the ranges to enough beacons determine them."""
     from linkpose.localization.events import Event
     from linkpose.localization.kalman import SUBMERSIBLE
@@ -373,7 +384,7 @@ def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
     beacons = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
     if len(beacons) < BEACONS_FOR_CONSTANTS or vehicle_of(kinds_of(events)) is SUBMERSIBLE:
         return ()
-    click.echo("scale error and bias of the ranges are estimated, too (--estimate none: not)", err=True)
+    console.report("scale error and bias of the ranges are estimated, too (--estimate none: not)")
     return ("scale", "bias")
 
 
@@ -388,7 +399,7 @@ def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _tuned(
-    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], quiet: bool
+    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], console: Console
 ) -> dict[Method, Settings]:
     """The settings of all filters with the free noises estimated from the log, and a line that reports them."""
     from linkpose.localization.tuning import described, tune
@@ -397,8 +408,7 @@ def _tuned(
     tuned = tune(events, first, beacons, free)
     if tuned is first:
         return chosen
-    if not quiet:
-        click.echo(f"noises estimated from the log: {described(tuned, events)}", err=True)
+    console.report(f"noises estimated from the log: {described(tuned, events)}")
     return dict.fromkeys(chosen, tuned)
 
 

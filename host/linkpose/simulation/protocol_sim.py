@@ -38,7 +38,7 @@ class Serial(serial.SerialBase):
         try:
             make_run, options = _parse(self.portstr or "")
         except LinkposeError as error:
-            raise serial.SerialException(f"{self.portstr}: {error}") from error
+            raise serial.SerialException(str(error)) from error
         self._speed, self._drift = options["speed"], 1 + 1e-6 * options["drift_ppm"]
         self._board = SimulatedBoard(make_run)
         self.rig = self._board.rig
