@@ -12,6 +12,7 @@ exact arc that joins them, valid from the first to the second.
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.inputs import open_binary
 from linkpose.localization.events import Event, Log, LogFile, Scan, count, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
@@ -50,10 +52,15 @@ class Reading:
     line: int = 0
 
 
+def _open(path: Path) -> io.TextIOWrapper:
+    """The log as text. Parameter lines of public logs hold Latin-1."""
+    return io.TextIOWrapper(open_binary(path, "the log"), "latin-1")
+
+
 def is_carmen(path: Path) -> bool:
     """Whether a file's first line that is no comment begins with a CARMEN keyword or another log's parameter line."""
     try:
-        with path.open(encoding="latin-1") as file:
+        with _open(path) as file:
             for text in itertools.islice(file, HEAD_LINES):
                 words = text[:LONGEST_HEAD].split(maxsplit=1)
                 if words and not text.startswith("#"):
@@ -73,7 +80,7 @@ def read_carmen(path: Path) -> LogFile:
     readings: list[Reading] = []
     remarks: list[str] = []
     try:
-        with path.open(encoding="latin-1") as file:  # parameter lines of public logs hold Latin-1
+        with _open(path) as file:
             for number, text in enumerate(file, 1):
                 words = text.split()
                 if words and words[0] in KEYWORDS:
@@ -208,7 +215,7 @@ class _Words:
         value = self.number(index)
         if value < 0 or not value.is_integer():
             raise LinkposeError(
-                f"{self.path} line {self.line}: {self.words[index]!r} is no number of readings; "
+                f"{self.path} line {self.line}: {self.words[index][:60]!r} is no number of readings; "
                 "correct or delete the line"
             )
         return int(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import math
 import os
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import ClassVar, Protocol, TypeVar
 
 from linkpose.errors import LinkposeError
+from linkpose.inputs import open_binary
 from linkpose.localization.linalg import Floats
 from linkpose.recording.csvfile import create, write_all
 
@@ -95,7 +97,7 @@ def read_events(path: Path) -> LogFile:
     out; `remarks` has the counts. Raises LinkposeError with file, line and cure for whatever cannot be a measurement.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with io.TextIOWrapper(open_binary(path, "the log"), "utf-8-sig", newline="") as file:
             events = list(stream_events(file, path))
     except UnicodeDecodeError as error:
         raise LinkposeError(
@@ -179,7 +181,7 @@ def _check_header(path: Path, line: int, row: list[str]) -> None:
 def _read_row(path: Path, line: int, row: list[str]) -> Event:
     kind = row[1].strip() if len(row) > 1 else ""
     if kind not in KINDS:
-        found = f"unknown kind {kind!r}" if kind else "the row is cut short"
+        found = f"unknown kind {kind[:60]!r}" if kind else "the row is cut short"
         raise LinkposeError(f"{path} line {line}: {found}; known kinds are {', '.join(KINDS)}")
     fields = KINDS[kind]
     cells = [cell.strip() for cell in row[2 : 2 + len(fields)]]
@@ -204,5 +206,5 @@ def read_number(cell: str, path: Path, line: int) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise LinkposeError(f"{path} line {line}: {cell.strip()!r} is not a number; correct or delete the row")
+        raise LinkposeError(f"{path} line {line}: {cell.strip()[:60]!r} is not a number; correct or delete the row")
     return value
