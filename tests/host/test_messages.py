@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import serial
 from cobs import cobs
+from message_producers import MORE
 from pty_board import PtyBoard
 
 from linkpose import errors, plotting
@@ -296,10 +297,14 @@ def pattern(message: str) -> str:
 
 
 def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    more = {message: produce for section in MORE.values() for message, produce in section.items()}
     shown = messages()
-    assert len(shown) == len(PRODUCERS) == len(set(shown))
+    first = len(shown) - len(more)
+    assert shown[first:] == list(more)
+    assert first == len(PRODUCERS)
+    producers = [*PRODUCERS, *(lambda folder, _, produce=produce: produce(folder) for produce in more.values())]
     found, kinds = [], set()
-    for number, (message, produce) in enumerate(zip(shown, PRODUCERS, strict=True)):
+    for number, (message, produce) in enumerate(zip(shown, producers, strict=True)):
         (folder := tmp_path / str(number)).mkdir()
         with monkeypatch.context() as patch, pytest.raises(LinkposeError) as raised:
             produce(folder, patch)
@@ -320,17 +325,18 @@ ELSEWHERE = {
 
 
 RAISED = ("FileFormatError", "LinkposeError", "FileError")
+# Parts of the program of which the page has all sentences.
+COMPLETE = [
+    "recording/*.py", "streams.py", "convert/*.py", "flashing/image.py",
+    *(f"localization/{name}.py" for name in ("carmen", "events", "maps", "noise", "plausibility", "tables", "ukf")),
+]  # fmt: skip
 
 
 def sentences() -> Iterator[str]:
     """The sentences of the errors in these parts of the program, `…` for what is put in."""
-    for path in [*(PACKAGE / "recording").glob("*.py"), PACKAGE / "streams.py", *(PACKAGE / "convert").glob("*.py")]:
+    for path in [path for part in COMPLETE for path in PACKAGE.glob(part)]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
-                "FileFormatError",
-                "LinkposeError",
-                "FileError",
-            ):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in RAISED:
                 yield from (text for argument in node.args if len(text := text_of(argument)) > 20)
 
 
