@@ -18,7 +18,7 @@ from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.view import Extremes, Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
-from linkpose.presentation import aligned_length, angle_with_std, length_with_std
+from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
 
@@ -117,6 +117,11 @@ def test_a_value_and_its_deviation_end_at_the_same_digit(std: float) -> None:
     assert len(angle.partition(".")[2]) == len(bound.partition(".")[2]) and float(bound) > 0
 
 
+def test_errors_in_a_row_end_at_the_same_digit() -> None:
+    assert same_digits(0.0486, 0.0172, 1.3, -5.07e-6) == ["0.0486", "0.0172", "1.3000", "0.0000"]
+    assert same_digits(123.4, 5.0) == ["123", "5"] and same_digits(0.0, 0.0) == ["0", "0"]
+
+
 def measurements(rows: int) -> lp.Measurements:
     noise = np.random.default_rng(1).normal(size=(rows, 6))
     force = np.array([0.0, 0.0, 9.80665]) + 0.04 * noise[:, :3]
@@ -174,6 +179,15 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
     assert len(data_rows(rows)) == len(data_rows(recording)) > 20
     closing = json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))
     assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
+
+
+def test_a_terminal_that_cannot_move_its_cursor_shows_a_line() -> None:
+    command = ["estimate", "--live", "--port", "sim://link?speed=0", "--filter", "tilt", "--duration", 2]
+    with Terminal(*command, kind="dumb") as terminal:
+        assert terminal.wait() == 0, terminal.text
+    assert "200 samples" in terminal.text and "lowest" in terminal.text
+    line = link_screen().line(health(imu={"state": "not answering"}))
+    assert line.startswith("25.0 s   IMU NOT ANSWERING: check VCC") and "HEIGHT" in line and len(line) <= 78
 
 
 def test_a_mark_before_the_first_sample_is_set_at_it() -> None:

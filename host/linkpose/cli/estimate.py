@@ -305,6 +305,8 @@ class _LiveRun:
             self._view.show(newest, lambda: self.health, self._compiling.progress)
         else:
             self._view.redraw(lambda: self.health, self._compiling.progress)
+        if not self._view.is_shown:
+            self._console.progress(lambda: self._compiling.progress or self._view.line(self.health))
         shown = newest if len(block) else newest[:0]
         show_newest(self._page, shown, lambda: self.health, self._estimator, self._compiling)
 

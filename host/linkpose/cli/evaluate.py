@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,8 +14,6 @@ from linkpose.errors import printable
 if TYPE_CHECKING:
     from linkpose.evaluation.scores import Evaluation
     from linkpose.evaluation.scoring import Score
-
-_MOST_DECIMALS = 6  # of an error, which has three digits otherwise
 
 
 @click.command("evaluate")
@@ -82,6 +79,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from linkpose.presentation import same_digits
     from linkpose.quantities import unit_text
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
@@ -94,8 +92,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
         for name, value in score.statistics().items():
             of = score.errors[name]
             unit = unit_text(of.unit)
-            decimals = max(0, min(_MOST_DECIMALS, 2 - math.floor(math.log10(value.rmse)))) if value.rmse > 0 else 0
-            figures = [f"{v:.{decimals}f}" for v in (value.rmse, value.mean, value.worst, value.p95)]
+            figures = same_digits(value.rmse, value.mean, value.worst, value.p95)
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]

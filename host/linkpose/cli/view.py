@@ -47,6 +47,7 @@ WIDEST = 78
 BLOCKS = 250  # of estimates whose extremes are found at once
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 LEAST_ANGLE_DEG = 5.0  # ditto, of a joint angle
+_FAULTS, _HEADLINE = 10, 8  # priorities of sections
 
 Points = deque[tuple[float, float]]  # time (s) and value
 
@@ -61,6 +62,7 @@ class View:
         self._live: Live | None = None
         self._size: tuple[int, int] = (0, 0)
         self._drawn_at = -math.inf
+        self._is_wanted = is_shown
         if is_shown:
             self._start()
 
@@ -68,9 +70,12 @@ class View:
         from rich.console import Console
         from rich.live import Live
 
+        console = Console(stderr=True)
+        if console.is_dumb_terminal:
+            return
         # Results go to stdout untouched: rich must not redirect it.
         self._live = Live(
-            console=Console(stderr=True), auto_refresh=False, transient=True, redirect_stdout=False,
+            console=console, auto_refresh=False, transient=True, redirect_stdout=False,
             redirect_stderr=False,
         )  # fmt: skip
         self._size = self._live.console.size
@@ -78,8 +83,12 @@ class View:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the view is on the screen."""
+        """Whether the view is on the screen. A terminal that cannot move its cursor (TERM=dumb) shows none."""
         return self._live is not None
+
+    def line(self, health: Health) -> str:
+        """The faults and the headline in one line, where the view is not on the screen."""
+        return self._screen.line(health)
 
     def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""
@@ -97,7 +106,7 @@ class View:
 
         `status` is a line on what is not ready yet, such as filters that are being compiled.
         """
-        if self._live is None:
+        if not self._is_wanted:
             return
         self._screen.add(float(estimates[0]), self._rows.read(estimates.tolist()))
         self.redraw(health, status)
@@ -189,6 +198,12 @@ class Screen:
         text.rstrip()
         return text
 
+    def line(self, health: Health) -> str:
+        """Time, faults and headlines, as far as they fit one line."""
+        sections = self._sections(health, WIDEST, "")
+        parts = [lines[0][0] for wanted in (_FAULTS, _HEADLINE) for priority, lines in sections if priority == wanted]
+        return "   ".join([f"{self._time_s:.1f} s", *parts])[:WIDEST]
+
     @staticmethod
     def _fit(sections: list[tuple[int, list[tuple[str, str]]]], height: int) -> list[tuple[str, str]]:
         """The lines of the sections; those of the lowest priority go first when there are too many."""
@@ -201,7 +216,7 @@ class Screen:
         """(priority, [(line, style), …]) from top to bottom."""
         faults = [(part, "bold red") for line in fault_lines(health) for part in textwrap.wrap(line, width)]
         faults += [(part, "bold red") for line in self._exclusions.lines() for part in textwrap.wrap(line, width)]
-        sections = [(9, [(self._head(health, width), "bold")]), (10, faults)]
+        sections = [(9, [(self._head(health, width), "bold")]), (_FAULTS, faults)]
         chain = next((name for name in self._filters if joint_angle(self._row.get(name, {})) is not None), None)
         link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
         if chain is not None:
@@ -216,12 +231,16 @@ class Screen:
     def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         points = self._heights.get(name, ())
         table = (5, self._height_table(name, width))
-        return [(8, [(self._headline(name, width), "")]), (6, _curve_lines(points, width, LEAST_HEIGHT_M)), table]
+        return [
+            (_HEADLINE, [(self._headline(name, width), "")]),
+            (6, _curve_lines(points, width, LEAST_HEIGHT_M)),
+            table,
+        ]
 
     def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         path = self._paths.get(name, ())
         lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
-        head = (8, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
+        head = (_HEADLINE, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
         return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
@@ -234,7 +253,7 @@ class Screen:
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
         lines = _curve_lines(self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
-        return [(8, [("   ".join(parts), "")]), (7, lines)]
+        return [(_HEADLINE, [("   ".join(parts), "")]), (7, lines)]
 
     def _head(self, health: Health, width: int) -> str:
         """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
