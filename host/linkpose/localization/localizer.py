@@ -159,7 +159,7 @@ class Localizer:
         self.last_control_s: float | None = None
         self.lately_rejected: dict[str, deque[bool]] = {}
         self.applied = self.rejected = self.widened = self.relocated = 0
-        self.rejected_ranges: set[tuple[float, str]] = set()
+        self.rejected_sightings: set[tuple[float, str]] = set()
         self.consistency = Consistency()
         self.relocator = Relocator(motion, self.sensors) if beacons else None
         self.is_replaced = False  # by the last measurement
@@ -208,6 +208,11 @@ class Localizer:
             self.history.correct(self.filter, self.known, self.is_replaced)
         return self._row()
 
+    def use(self, settings: Settings) -> None:
+        """Continues with other noises; what is estimated stays the same."""
+        self.settings = self.sensors.settings = settings
+        self.filter.noise_root = noise_root(settings, self.vehicle)
+
     def track(self, rows: Sequence[Row]) -> Track:
         """The path of all rows, with the counts so far. Raises LinkposeError for an estimate that is infinite."""
         state = np.array([row.state for row in rows])
@@ -225,7 +230,7 @@ class Localizer:
             np.array([row.covariance for row in rows]),
             self.applied,
             self.rejected,
-            frozenset(self.rejected_ranges),
+            frozenset(self.rejected_sightings),
             self.widened,
             self.relocated,
             self.consistency,
@@ -305,9 +310,11 @@ class Localizer:
             self.consistency.add(kind, block, float(d2))
             if isinstance(event, Event) and event.beacon:
                 self.consistency.add(f"{kind}:{event.beacon}", block, float(d2))
-        if kind == "range":
+        if kind in NAMED:
             rejected = [event for event, fits in zip(events, passed, strict=True) if not fits]
-            self.rejected_ranges.update((event.time_s, event.beacon) for event in rejected if isinstance(event, Event))
+            self.rejected_sightings.update(
+                (event.time_s, event.beacon) for event in rejected if isinstance(event, Event)
+            )
         lately = self.lately_rejected.setdefault(kind, deque(maxlen=PATIENCE))
         lately.append(2 * good <= len(passed))
         if len(lately) == PATIENCE and 2 * sum(lately) > PATIENCE:
