@@ -21,10 +21,10 @@ def main() -> None:
     wanted = get_core_dependencies()["tool-scons"].lstrip("~^=")
     digits = re.fullmatch(r"4\.(\d)(\d\d)(\d\d)\.\d+", wanted)
     if digits is None:
-        sys.exit(f"platformio wants tool-scons {wanted}, which does not read as an SCons version")
+        sys.exit(f"platformio requires tool-scons {wanted}, which does not read as an SCons version")
     scons = ".".join(str(int(number)) for number in digits.groups())
     if SCons.__version__ != scons:
-        sys.exit(f"platformio wants SCons {scons}, installed is {SCons.__version__}: pip install scons=={scons}")
+        sys.exit(f"platformio requires SCons {scons}, installed is {SCons.__version__}: pip install scons=={scons}")
 
     folder = Path(ProjectConfig.get_instance().get("platformio", "packages_dir")) / "tool-scons"
     folder.mkdir(parents=True, exist_ok=True)

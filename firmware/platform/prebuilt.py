@@ -21,7 +21,7 @@ ENVIRONMENT = "uno_distro"
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--check", action="store_true", help="only say whether it is stale")
+    parser.add_argument("--check", action="store_true", help="only check whether it is stale")
     check = parser.parse_args().check
     built = build()
     stale = not PREBUILT.is_file() or PREBUILT.read_bytes() != built

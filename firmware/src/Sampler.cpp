@@ -124,7 +124,7 @@ void Sampler::apply_commands() {
   self_test_due_ = kNoTest;
 }
 
-// Gives the bus to one driver after the other until none wants it. The magnetometer's reading belongs to this tick and
+// Gives the bus to one driver after the other until none needs it. The magnetometer's reading belongs to this tick and
 // comes first. The barometer comes last: its last request starts a
 // conversion, which no traffic may follow before the next tick. False when the bus is quiet.
 bool Sampler::requests_pending() {

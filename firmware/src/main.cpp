@@ -11,7 +11,7 @@
 #include "Mice.h"
 #include "Sampler.h"
 
-// In force until the host says otherwise: 100 Hz, 8 g, 1000 deg/s, DLPF 3, oversampling 1, 8 counts/mm, I2C at 400 kHz.
+// In force until the host sends others: 100 Hz, 8 g, 1000 deg/s, DLPF 3, oversampling 1, 8 counts/mm, I2C at 400 kHz.
 static constexpr wire::Configure kDefaults = {100, 8, 1000, 3, 1, 8, 400};
 
 static Mice mice(kDefaults.mouse_counts_per_mm);

@@ -115,7 +115,7 @@ class NotASerialPort(PortError):
 
 
 class PortBusy(PortError):
-    """Another program has the port open. `holder` names it where the system knows."""
+    """Another program has the port open. `holder` names it if the system reports it."""
 
     def __init__(self, port: str, holder: str | None = None) -> None:
         super().__init__(port, f"{port} is in use by {holder or 'another program'}. Close it and try again")

@@ -30,7 +30,7 @@ class Precompilation:
 
         One compiles the inertial filters, which share their steps and take longest. The other compiles the rest: first
         the last, which takes least, so that a first estimate appears soon; the writer of text after it. Filters that
-        need a second inertial sensor come next: who has connected two wants to see them.
+        need a second inertial sensor come next.
         """
         self._names = list(names)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}  # by name of a filter

@@ -19,7 +19,8 @@ from filterpy.kalman import UnscentedKalmanFilter
 from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD, FLASER_MAX_RANGE_M
 from linkpose.localization.grid import GridMap
-from linkpose.localization.kalman import UNICYCLE, KalmanFilter, Measurement, Transform
+from linkpose.localization.kalman import UNICYCLE, KalmanFilter, Measurement
+from linkpose.localization.ukf import Transform
 from linkpose.simulation.indoor import office_map
 
 POSE = np.array([50.0, 12.0, 0.3])
@@ -83,7 +84,7 @@ def beams_measurement(grid: GridMap) -> Measurement:
     table = np.zeros((BEAMS, 5))
     table[:, 0], table[:, 4] = BEAM_ANGLES_RAD, FLASER_MAX_RANGE_M
     ranges = np.empty(BEAMS)
-    models.predict(models.BEAMS, POSE, table, grid.blocked, grid.geometry, ranges)
+    models.predict(models.BEAMS, POSE, table, grid, ranges)
     return Measurement(models.BEAMS, ranges, SIGMA_M**2 * np.eye(BEAMS), table)
 
 

@@ -16,18 +16,17 @@ from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.kalman import (
     CONSTANT_VELOCITY,
     HOLONOMIC,
-    PLANAR_TWIST,
     SUBMERSIBLE,
     UNICYCLE,
     KalmanFilter,
     Measurement,
-    Transform,
 )
 from linkpose.localization.linalg import wrap_angle
 from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
 from linkpose.localization.odometry import with_mice_odometry
 from linkpose.localization.settings import Settings
+from linkpose.localization.ukf import Transform
 from linkpose.simulation.indoor import office_map
 from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, simulate_underwater
 
@@ -37,14 +36,13 @@ MOTIONS = {
     "unicycle": UNICYCLE,
     "holonomic": HOLONOMIC,
     "submersible": SUBMERSIBLE,
-    "planar_twist": PLANAR_TWIST,
 }
 
 
 def predicted(model, state, parameters, size, grid=None):
     grid = grid or no_map()
     out = np.empty(size)
-    models.predict(model, state, parameters, grid.blocked, grid.geometry, out)
+    models.predict(model, state, parameters, grid, out)
     return out
 
 
@@ -149,8 +147,6 @@ MEASUREMENTS = {
     "beacon_range": (models.BEACON_RANGE, [[4.0, 1, 2, 5, 7, 8], [0, 9, -1, -1, -1, 8]], 2),
     "landmark": (models.LANDMARK, [[4.0, 1, 7, 8], [-3, 2, -1, 8]], 4),
     "direct": (models.DIRECT, [[2.0, -1], [0, 1]], 2),
-    "mouse_velocity": (models.MOUSE_VELOCITY, [[0.1, 0.05], [-0.1, 0.2]], 4),
-    "rate_gyro": (models.RATE_GYRO, [[0.0, 0]], 1),
 }
 
 
@@ -159,7 +155,7 @@ def test_measurement_jacobians(name):
     model, table, size = MEASUREMENTS[name]
     state, table, grid = np.linspace(0.3, 1.2, 9), np.array(table), no_map()
     slopes = np.zeros((size, 9))
-    models.jacobian(model, state, table, grid.blocked, grid.geometry, slopes)
+    models.jacobian(model, state, table, grid, slopes)
     for j, unit in enumerate(np.eye(9) * 1e-6):
         slope = predicted(model, state + unit, table, size) - predicted(model, state - unit, table, size)
         assert slopes[:, j] == pytest.approx(slope / 2e-6, abs=1e-7)
@@ -172,28 +168,15 @@ def test_beam_slopes_of_a_plain_wall():
     grid = GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0]))
     slopes = np.zeros((1, 3))
     table = np.array([[0.0, 0, 0, 0, 80]])
-    models.jacobian(models.BEAMS, np.array([20.0, 10.0, 0.3]), table, grid.blocked, grid.geometry, slopes)
+    models.jacobian(models.BEAMS, np.array([20.0, 10.0, 0.3]), table, grid, slopes)
     assert slopes[0] == pytest.approx([-1 / math.cos(0.3), 0.0, 10 * math.tan(0.3) / math.cos(0.3)], rel=1e-3, abs=1e-9)
 
 
 def test_model_numbers_differ():
-    motions = [
-        models.UNICYCLE,
-        models.HOLONOMIC,
-        models.SUBMERSIBLE,
-        models.PLANAR_TWIST,
-        models.CONSTANT_VELOCITY,
-    ]
-    sensors = [
-        models.BEAMS,
-        models.BEACON_RANGE,
-        models.LANDMARK,
-        models.DIRECT,
-        models.MOUSE_VELOCITY,
-        models.RATE_GYRO,
-    ]
-    assert sorted(motions) == [0, 1, 2, 3, 4]
-    assert sorted(sensors) == [0, 1, 2, 3, 4, 5]
+    motions = [models.UNICYCLE, models.HOLONOMIC, models.SUBMERSIBLE, models.CONSTANT_VELOCITY]
+    sensors = [models.BEAMS, models.BEACON_RANGE, models.LANDMARK, models.DIRECT]
+    assert sorted(motions) == [0, 1, 2, 3]
+    assert sorted(sensors) == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])

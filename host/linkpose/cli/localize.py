@@ -443,9 +443,9 @@ def _require_measurements(log: Path, name: str, track: Track) -> None:
 
 
 def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float, float] | None) -> Settings:
-    from linkpose.localization.kalman import Transform
     from linkpose.localization.noise import RangeNoise
     from linkpose.localization.settings import Settings
+    from linkpose.localization.ukf import Transform
 
     scaled = given["transform"] == "scaled"
     if min(given["start_std"]) <= 0:

@@ -175,7 +175,7 @@ class Session:
     def _handshake(self) -> Hello:
         """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
         connection = self._connection
-        heard, refused = bytearray(), 0
+        received, refused = bytearray(), 0
         limit, ask_at = _TimeLimit(HANDSHAKE_TIMEOUT_S), 0.0
         while step_s := limit.step():
             if time.perf_counter() >= ask_at:
@@ -185,7 +185,7 @@ class Session:
             arrival = connection.receive(step_s)
             if arrival is None:
                 continue
-            heard += arrival.data[: 512 - len(heard)]
+            received += arrival.data[: 512 - len(received)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
                     raise _other_protocol(message)
@@ -195,10 +195,10 @@ class Session:
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        reason = _why_no_hello(bytes(heard), connection.decoder.corrupt)
+        reason = _why_no_hello(bytes(received), connection.decoder.corrupt)
         if refused:
             reason = "the board refuses every command, also the request for its version; its firmware is damaged"
-        raise NoFirmware(self.port, bytes(heard), reason)
+        raise NoFirmware(self.port, bytes(received), reason)
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
         """Waits for sensors that are being set up and returns the latest HELLO."""
@@ -287,12 +287,12 @@ class Session:
         self,
         kind: type[Answer],
         asked: str,
-        heard: Sequence[Message | OtherProtocol] = (),
+        received: Sequence[Message | OtherProtocol] = (),
         timeout_s: float = ANSWER_TIMEOUT_S,
     ) -> Answer:
-        """The answer of a kind, from what was `heard` already or from what arrives within the time."""
+        """The answer of a kind, from what was `received` already or from what arrives within the time."""
         arrivals = self._arrivals(timeout_s)
-        for messages in itertools.chain([heard], (arrival.messages for arrival in arrivals)):
+        for messages in itertools.chain([received], (arrival.messages for arrival in arrivals)):
             for answer in messages:
                 if isinstance(answer, kind):
                     return answer
@@ -472,8 +472,8 @@ class Session:
         if fault and fault.split()[0] not in self._clock_faults:
             self._clock_faults.add(fault.split()[0])
             self.notify(
-                f"{timeline.duration_s:.2f} s: the board's clock {fault}; the times from here on are doubtful. Replace "
-                "the board if it happens again"
+                f"{timeline.duration_s:.2f} s: the board's clock {fault}; the times from here on are unreliable. "
+                "Replace the board if it happens again"
             )
 
     def _ask_when_silent(self) -> None:
@@ -654,15 +654,15 @@ def _other_schema(hello: Hello) -> WrongFirmware:
     return WrongFirmware(text, True)
 
 
-def _why_no_hello(heard: bytes, corrupt: Corrupt) -> str:
+def _why_no_hello(received: bytes, corrupt: Corrupt) -> str:
     """What came instead of a HELLO, and what to do about it."""
-    if not heard:
+    if not received:
         return "the board is silent; it may never have had this firmware, or another port is the board's"
-    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in heard)
-    if printable > 0.8 * len(heard):
-        text = heard[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
+    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in received)
+    if printable > 0.8 * len(received):
+        text = received[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
         return f"another firmware answers: {text!r}"
-    if 0 in heard and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(heard) < 64:
+    if 0 in received and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(received) < 64:
         return "the board answers only in part; check the cable and try again"
     return (
         "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "

@@ -17,7 +17,7 @@ _FACTS = ("USED", "FRAMES", "RATE")  # of the groups POINT, ANALOG and ROTATION:
 
 
 class Damaged(Exception):
-    """The sizes in a C3D file contradict its length. The text says which."""
+    """The sizes in a C3D file contradict its length. The text names them."""
 
 
 def check_sizes(data: bytes) -> None:

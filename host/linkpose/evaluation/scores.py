@@ -44,7 +44,7 @@ class Evaluation:
     """The scores of all filters in a file, in its order."""
 
     scores: list[Score]
-    remarks: list[str]  # why the comparison itself may be doubtful
+    remarks: list[str]  # why the comparison itself may be unreliable
 
 
 def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_s: float | None = None) -> Evaluation:

@@ -14,11 +14,12 @@ import numpy as np
 from linkpose.experiments.variants import Progress, Variant, verdict
 from linkpose.localization.carmen import as_log
 from linkpose.localization.events import Log, Scan
-from linkpose.localization.kalman import FilterName, Transform
+from linkpose.localization.kalman import FilterName
 from linkpose.localization.localizer import localize
 from linkpose.localization.noise import NoiseModel, RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score
+from linkpose.localization.ukf import Transform
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
 
 FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")

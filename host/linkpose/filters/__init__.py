@@ -145,7 +145,7 @@ def _check_mice(rig: Rig, sensors: Sensors, mice: int) -> None:
             "the rig file lacks the positions of the mice; add one [[mouse]] table with x_m and y_m for each port"
         )
     if min(mice, len(rig.mouse)) == 1 and not sensors & Sensors.MPU6050:
-        raise CannotRun("one mouse cannot tell a turn without the MPU6050's rate: add a second mouse")
+        raise CannotRun("one mouse cannot measure a turn without the MPU-6050's rate: add a second mouse")
 
 
 def warm_up(names: Iterable[str] = NAMES) -> None:

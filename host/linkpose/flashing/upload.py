@@ -119,10 +119,10 @@ def _transfer(loader: Bootloader, image: Image, progress: Progress, report: Repo
 
 
 def _compare(address: int, expected: bytes, found: bytes) -> None:
-    for at, (want, got) in enumerate(zip(expected, found, strict=False), address):
-        if want != got:
+    for at, (written, read) in enumerate(zip(expected, found, strict=False), address):
+        if written != read:
             raise LinkposeError(
-                f"Verification failed: address {at:#06x} contains {got:#04x}, and {want:#04x} was written. The "
+                f"Verification failed: address {at:#06x} contains {read:#04x}, and {written:#04x} was written. The "
                 f"bootloader is intact but the firmware is wrong. First {AGAIN}; if it fails again, replace the board"
             )
 

@@ -28,7 +28,7 @@ from linkpose.presentation import counted
 
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams
-FLASER_MAX_RANGE_M = 80.0  # a SICK scanner's; the line does not say
+FLASER_MAX_RANGE_M = 80.0  # a SICK scanner's; the line does not contain it
 # Readings this near to the longest of the log are equal to it, and so many of them are no coincidence.
 SAME_RANGE_M, SHARED_READINGS = 0.005, 10
 FIRST_TIME_S = 60.0  # a log whose clock starts at 0 has its next line within this time
@@ -148,9 +148,7 @@ def format_reading(reading: Reading) -> str:
 
 
 def _arc(before: Pose, after: Pose, interval_s: float) -> tuple[float, float]:
-    """Forward speed and turn rate of the arc from one pose to the next; what the odometry says aside of the arc is left
-    out.
-    """
+    """Forward speed and turn rate of the arc from one pose to the next; the odometry's sideways motion is left out."""
     turn = wrap_angle(after[2] - before[2])
     middle = before[2] + 0.5 * turn
     chord = math.cos(middle) * (after[0] - before[0]) + math.sin(middle) * (after[1] - before[1])

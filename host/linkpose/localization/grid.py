@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,7 @@ from linkpose.localization.linalg import Floats
 FREE, OCCUPIED, UNKNOWN = 0, 1, 2
 
 
-@dataclass(frozen=True, slots=True)
-class GridMap:
+class GridMap(NamedTuple):
     """A map of free, occupied and unknown cells.
 
     `blocked[row, column]` is FREE (0) where a beam passes, OCCUPIED where it meets a wall, and UNKNOWN where nobody has

@@ -14,7 +14,8 @@ from linkpose.localization.ekf import ekf_step
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
 from linkpose.localization.linalg import Floats, lower_cholesky
-from linkpose.localization.ukf import ukf_step
+from linkpose.localization.steps import Correction, Gaussian, Prediction
+from linkpose.localization.ukf import Transform, ukf_step
 
 FilterName = Literal["ekf", "ukf"]
 Bools = NDArray[np.bool_]
@@ -47,9 +48,6 @@ UNICYCLE = Motion(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
 CONSTANT_VELOCITY = Motion(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 0, 2)
 HOLONOMIC = Motion(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
 SUBMERSIBLE = Motion(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
-PLANAR_TWIST = Motion(
-    models.PLANAR_TWIST, ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s", "gyro_bias_rad_s"), 0, 4
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +55,7 @@ class Measurement:
     """What a sensor read at one instant.
 
     `values` (m,) with covariance R (m, m); `parameters` is the model's table. The rows belong together in blocks of
-    `block`: a block is gated as one, with `block` degrees of freedom. `angles` says which rows are angles.
+    `block`: a block is gated as one, with `block` degrees of freedom. `angles` marks the rows that are angles.
     """
 
     model: int
@@ -66,29 +64,6 @@ class Measurement:
     parameters: Floats
     block: int = 1
     angles: tuple[bool, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Transform:
-    """The unscented transform: κ places the sigma points √(n_a + κ) standard deviations out. α and β scale it; 1 and 0
-    leave it plain.
-    """
-
-    alpha: float = 1.0
-    beta: float = 0.0
-    kappa: float = 0.0
-
-    def check(self) -> None:
-        """Raises LinkposeError for a transform without sigma points or with a covariance that can turn indefinite."""
-        if self.kappa < 0:
-            raise LinkposeError(
-                f"κ {self.kappa:g} gives the centre point a negative weight, and P may cease to be positive definite; "
-                "use 0 or more"
-            )
-        if not 0 < self.alpha <= 1:
-            raise LinkposeError(f"α {self.alpha:g} is not within 0 to 1; try 0.1")
-        if self.beta < 0:
-            raise LinkposeError(f"β {self.beta:g} is below 0; 2 is best for Gaussian errors")
 
 
 @dataclass(slots=True)
@@ -131,13 +106,9 @@ class KalmanFilter:
         blocks = len(measurement.values) // measurement.block
         d2 = np.empty(blocks)
         threshold = np.inf if self.gate is None or not blocks else chi_square_quantile(self.gate, measurement.block)
-        arguments = (
-            self.motion.model,
-            self.state,
-            self.covariance,
-            control,
-            root,
-            interval_s,
+        estimate = Gaussian(self.state, self.covariance)
+        prediction = Prediction(self.motion.model, control, root, interval_s)
+        correction = Correction(
             measurement.model,
             measurement.values,
             measurement.covariance,
@@ -145,16 +116,14 @@ class KalmanFilter:
             self._angles_of(measurement),
             threshold,
             d2,
-            self.grid.blocked,
-            self.grid.geometry,
         )
         # Readings of states are linear: at one instant both filters' corrections are equal, and the extended one also
         # works for a heading whose sigma points spread around the circle.
         is_linear = interval_s == 0.0 and measurement.model == models.DIRECT
         if self.name == "ekf" or is_linear:
-            sound = ekf_step(*arguments)
+            sound = ekf_step(estimate, prediction, correction, self.grid)
         else:
-            sound = ukf_step(*arguments, self.transform.alpha, self.transform.beta, self.transform.kappa)
+            sound = ukf_step(estimate, prediction, correction, self.grid, self.transform)
         if not sound:
             raise NotPositiveDefinite("covariance", f"the filter {self.name}")
         self.d2 = d2

@@ -3,91 +3,114 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
 from linkpose.localization.ekf import ekf_predict, ekf_step
-from linkpose.localization.linalg import Floats, product, product_transposed, subtract_from
+from linkpose.localization.grid import GridMap
+from linkpose.localization.linalg import Floats, add_to, product, product_transposed, subtract_from
 from linkpose.localization.models import jacobian, predict
+from linkpose.localization.steps import Correction, Gaussian, Prediction
+
+# Degrees of freedom of Student's t: 5 gives outliers of six standard deviations a fifth of their normal weight. 3
+# underestimates the noise of normal errors by a tenth, 30 follows the outliers.
+TAILS = 5.0
+
+
+class Rows(NamedTuple):
+    """A log as arrays; row k moves the state for `intervals_s[k]` and then corrects it with a measurement or nothing.
+
+    `controls` (N, c) act over the interval and their noises hold for `holds_s` (N, q). `sizes` (N,) counts the rows of
+    each measurement, 0 to 3, whose `values` are (N, 3) and whose model's `parameters` are (N, 3, 6). `is_angle`
+    (N, n + 3) is as in `Correction`. Rows with `is_direct` read states; rows with `counts` enter the likelihood.
+    """
+
+    intervals_s: Floats
+    controls: Floats
+    holds_s: Floats
+    models: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    values: Floats
+    parameters: Floats
+    is_angle: NDArray[np.bool_]
+    is_direct: NDArray[np.bool_]
+    counts: NDArray[np.bool_]
 
 
 @compiled
 def run_filter(
+    estimate: Gaussian,
     motion: int,
-    state: Floats,
-    covariance: Floats,
-    intervals: Floats,
-    controls: Floats,
-    holds: Floats,
     noise_root: Floats,
-    model: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    values: Floats,
+    rows: Rows,
     variances: Floats,
-    tables: Floats,
-    is_angle: NDArray[np.bool_],
-    counts: NDArray[np.bool_],
-    is_direct: NDArray[np.bool_],
     thresholds: Floats,
-    tails: float,
-    blocked: NDArray[np.uint8],
-    geometry: Floats,
+    grid: GridMap,
     innovations: Floats,
 ) -> float:
-    """Returns −ln likelihood of the measurements that count, with Student's t of `tails` degrees of freedom; infinite
-    where a covariance ceases to be positive definite. Fills `innovations` (N, 2) with ν_i / √S_ii.
+    """Returns −ln likelihood of the measurements that count, with Student's t of TAILS degrees of freedom; infinite
+    where the covariance ceases to be positive definite.
 
-    Row k: `intervals` (s) since the row before under `controls` (c,), whose noises hold for `holds` (q,) s; then a
-    measurement of `rows` rows with `values`, diagonal `variances`, parameters `tables`. `state` and `covariance` are
-    changed.
+    Changes `estimate` and fills `innovations` (N, 2) with ν_i / √S_ii. `motion` is the motion model's number,
+    `noise_root` (q, q) the lower Cholesky factor of Q, `variances` (N, 3) the diagonal of R, and `thresholds` (3,) the
+    gate for a measurement of one, two and three rows.
     """
-    n, q = state.shape[0], noise_root.shape[0]
+    q = noise_root.shape[0]
     root, d2, total = np.empty((q, q)), np.empty(1), 0.0
-    for k in range(intervals.shape[0]):
-        if intervals[k] > 0.0:
+    for k in range(rows.intervals_s.shape[0]):
+        interval = rows.intervals_s[k]
+        if interval > 0.0:
             for i in range(q):
                 for j in range(q):
-                    root[i, j] = noise_root[i, j] * math.sqrt(holds[k, i] / intervals[k])
-            ekf_predict(motion, state, covariance, controls[k], root, intervals[k])
-        m = rows[k]
+                    root[i, j] = noise_root[i, j] * math.sqrt(rows.holds_s[k, i] / interval)
+            ekf_predict(estimate, Prediction(motion, rows.controls[k], root, interval))
+        m = rows.sizes[k]
         if m == 0:
             continue
-        measured, table, spread = values[k][:m].copy(), tables[k][:m].copy(), np.zeros((m, m))
-        if counts[k]:
-            if not is_direct[k]:
-                table = tables[k][:1].copy()
-            residual, slopes = np.empty(m), np.zeros((m, n))
-            predict(model[k], state, table, blocked, geometry, residual)
-            jacobian(model[k], state, table, blocked, geometry, slopes)
-            subtract_from(measured, residual, is_angle[k], n)
-            spread = product(slopes, product_transposed(covariance, slopes))
-            total += _student(residual, spread, variances[k], tails)
-            for i in range(m):
-                innovations[k, i] = residual[i] / math.sqrt(spread[i, i] + variances[k, i])
         noise = np.zeros((m, m))
         for i in range(m):
             noise[i, i] = variances[k, i]
-        sound = ekf_step(
-            motion, state, covariance, controls[k], root, 0.0, model[k], measured, noise, table, is_angle[k],
-            thresholds[m - 1], d2, blocked, geometry,
+        size = m if rows.is_direct[k] else 1  # rows of the model's table
+        correction = Correction(
+            rows.models[k], rows.values[k][:m].copy(), noise, rows.parameters[k][:size].copy(), rows.is_angle[k],
+            thresholds[m - 1], d2,
         )  # fmt: skip
-        if not sound or not math.isfinite(state[0]):
+        if rows.counts[k]:
+            total += _cost(estimate, correction, grid, innovations[k])
+        still = Prediction(motion, rows.controls[k], root, 0.0)
+        if not ekf_step(estimate, still, correction, grid) or not math.isfinite(estimate.mean[0]):
             return math.inf
     return total
 
 
 @compiled
-def _student(residual: Floats, spread: Floats, variances: Floats, tails: float) -> float:
-    """−ln density, but for a constant, of one or two rows with the scale matrix `spread` + diag(`variances`)."""
-    a = spread[0, 0] + variances[0]
+def _cost(estimate: Gaussian, correction: Correction, grid: GridMap, innovations: Floats) -> float:
+    """−ln density of a measurement before it corrects; fills `innovations` (2,)."""
+    n, m = estimate.mean.shape[0], correction.values.shape[0]
+    residual, slopes = np.empty(m), np.zeros((m, n))
+    predict(correction.model, estimate.mean, correction.parameters, grid, residual)
+    jacobian(correction.model, estimate.mean, correction.parameters, grid, slopes)
+    subtract_from(correction.values, residual, correction.is_angle, n)
+    spread = product(slopes, product_transposed(estimate.covariance, slopes))
+    add_to(spread, correction.covariance)
+    for i in range(m):
+        innovations[i] = residual[i] / math.sqrt(spread[i, i])
+    return _student(residual, spread)
+
+
+@compiled
+def _student(residual: Floats, spread: Floats) -> float:
+    """−ln density, but for a constant, of one or two rows with this scale matrix."""
+    a = spread[0, 0]
     if residual.shape[0] == 1:
         determinant, d2, size = a, residual[0] * residual[0] / a, 1.0
     else:
-        b, c = spread[0, 1], spread[1, 1] + variances[1]
+        b, c = spread[0, 1], spread[1, 1]
         determinant, size = a * c - b * b, 2.0
         d2 = (
             c * residual[0] * residual[0] - 2.0 * b * residual[0] * residual[1] + a * residual[1] * residual[1]
         ) / determinant
-    return 0.5 * (tails + size) * math.log1p(d2 / tails) + 0.5 * math.log(determinant)
+    return 0.5 * (TAILS + size) * math.log1p(d2 / TAILS) + 0.5 * math.log(determinant)

@@ -22,7 +22,7 @@ def wrap_angle(angle: float) -> float:
 
 @compiled
 def subtract_from(measured: Floats, expected: Floats, is_angle: NDArray[np.bool_], first: int) -> None:
-    """expected ← measured − expected, in place, on the circle where `is_angle` says so, which is read from index
+    """expected ← measured − expected, in place, on the circle where `is_angle` is set, which is read from index
     `first` on.
     """
     for i in range(expected.shape[0]):

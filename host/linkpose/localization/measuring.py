@@ -17,8 +17,8 @@ from linkpose.localization.settings import CONSTANTS, ERROR_TIME_S, Settings
 from linkpose.localization.tables import Beacons
 from linkpose.localization.vehicle import vehicle_of
 
-# With fewer beacons a bias cannot be distinguished from a place. On three public recordings of radio ranges
-# (tests/bench) both constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
+# With fewer beacons a bias looks like a shift of position. On three public recordings of radio ranges (tests/bench),
+# both constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
 BEACONS_FOR_CONSTANTS = 3
 # A sighting that repeats the error of the one before counts as 1/MOST_REPEATS of an independent one at the least.
 MOST_REPEATS = 500.0

@@ -42,7 +42,7 @@ CERTAIN_M, CERTAIN_RAD = 0.15, 0.1
 SLIP, SLIP_LEAD = (0.3, 0.3, 0.3), 1.0
 NEARBY = 12  # starts of that fit
 # Weight of one scan when hypotheses are compared: its beams count as so many independent ones. Too many, and two
-# corridors that look alike are told apart by the map's errors.
+# the map's errors decide between corridors that look alike.
 COMPARED_BEAMS = 10.0
 NO_WALL = 0.1  # probability that a beam meets what the map does not have
 

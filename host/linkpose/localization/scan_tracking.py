@@ -27,9 +27,9 @@ CANDIDATE_STD = np.array([0.2, 0.2, 0.1])  # of a pose that the search found (m,
 # What this map and robot usually reach: the log-likelihood of a scan, and how far it falls below.
 # It follows better scans within RISE of them and worse ones within FALL: a lost robot must not become the usual.
 RISE, FALL = 20.0, 200.0
-# A scan that is so many usual falls (and at least so much) below the usual is doubtful, and bad. A doubtful one is
-# fitted again as after a slip; so many bad ones in a row make the pose doubtful.
-DOUBTFUL, BAD, LEAST_FALL = 1.5, 2.5, 1.0
+# A scan that is so many usual falls (and at least so much) below the usual is suspect, and bad. A suspect one is
+# fitted again as after a slip; so many bad ones in a row make the pose suspect.
+SUSPECT, BAD, LEAST_FALL = 1.5, 2.5, 1.0
 BAD_SCANS, MOST_BAD_SCANS = 3, 100  # a search that finds nothing better doubles the wait for the next one
 # A pose elsewhere must explain the scan by this much more (log-likelihood, see hypotheses.LEAD) to start a contest.
 BETTER = 2.5
@@ -82,7 +82,7 @@ class ScanTracker:
             return self._continue(self.contest, run, points)
         if not known:
             return self._open(run, points, [])
-        fit = self.matcher.correct(run, points, self._below(DOUBTFUL))
+        fit = self.matcher.correct(run, points, self._below(SUSPECT))
         self.was_known = True
         self.bad = self.bad + 1 if fit.log_likelihood < self._below(BAD) else 0
         if self.bad >= self.wait:
@@ -140,7 +140,7 @@ class ScanTracker:
     def _continue(self, contest: Contest, run: KalmanFilter, points: Floats) -> Result:
         fits = [
             # Only the tracked pose may have slipped; the others are compared where they are.
-            self.matcher.correct(h.filter, points, self._below(DOUBTFUL) if h.is_incumbent else -math.inf)
+            self.matcher.correct(h.filter, points, self._below(SUSPECT) if h.is_incumbent else -math.inf)
             for h in contest.hypotheses
         ]
         likelihoods = [fit.log_likelihood for fit in fits]

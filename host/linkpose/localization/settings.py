@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from linkpose.localization.kalman import Transform
 from linkpose.localization.noise import RangeNoise
+from linkpose.localization.ukf import Transform
 
 Pose = tuple[float, float, float]
 # What can be estimated beside the pose -> unit in the state's name, and its standard deviation at the start. Radio

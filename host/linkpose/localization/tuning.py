@@ -9,26 +9,23 @@ are no independent measurements: their correlation time is estimated from the au
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.localization.events import NAMED, Event, Log
 from linkpose.localization.gate import chi_square_quantile
-from linkpose.localization.likelihood import run_filter
+from linkpose.localization.likelihood import Rows, run_filter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import Localizer
 from linkpose.localization.settings import Settings
+from linkpose.localization.steps import Gaussian
 from linkpose.localization.tables import Beacons
 from linkpose.localization.vehicle import CONTROLS, control_holds, kinds_of, noise_root, vehicle_of
 
 # Fewer measurements do not determine four noises; more than MOST add time, not accuracy.
 FEWEST, MOST = 100, 1200
 MEAN_S = 0.2  # over which controls are averaged: a robot that turns by 1 rad/s goes 0.5 % less far on the chord
-# Degrees of freedom of Student's t: 5 gives outliers of six standard deviations a fifth of their normal weight. 3
-# underestimates the noise of normal errors by a tenth, 30 follows the outliers.
-TAILS = 5.0
 GATE = 0.999  # of the filter whose innovations count
 # Factors of the search, and the standard deviation (ln) of the prior of each noise around its default.
 FACTORS, PRIOR_LN = (3.0, 1.7, 1.25), 3.0
@@ -41,25 +38,6 @@ MOST_STEPS = 200  # sightings of one beacon between the two of a pair
 TUNABLE = ("range", "growth", "bearing", "speed", "turn", "velocity", "yaw", "acceleration", "error_time")
 PASSES = 3
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
-
-
-@dataclass(slots=True)
-class _Pass:
-    """A log as arrays, a row for each measurement or control, for `likelihood.run_filter`.
-
-    `values` (N, 3) has up to three rows of a measurement, `tables` (N, 3, 6) the parameters of its model, `controls`
-    (N, c) and `holds` (N, q) what holds until then.
-    """
-
-    intervals: Floats
-    controls: Floats
-    holds: Floats
-    model: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    values: Floats
-    tables: Floats
-    is_angle: NDArray[np.bool_]
-    events: list[Event]
 
 
 def tune(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Settings:
@@ -102,11 +80,11 @@ def _residual_statistics(log: Log, settings: Settings, beacons: Beacons) -> tupl
     medians: 1.5 means half as large again. Student's t, and a part of the log, let the noises be too small.
     """
     start = Localizer(log, "ekf", settings, None, beacons)
-    arrays = _arrays(log, start, None)
-    innovations = _run(arrays, settings, start)[1]
+    rows, events = _arrays(log, start, None)
+    innovations = _run(rows, events, settings, start)[1]
     size = [np.abs(column[column != 0.0]) for column in innovations.T]
     factors = [float(np.median(column)) / NORMAL_MEDIAN if len(column) else 1.0 for column in size]
-    return correlation_time(arrays.events, innovations), (factors[0], factors[1])
+    return correlation_time(events, innovations), (factors[0], factors[1])
 
 
 def _present(log: Log) -> set[str]:
@@ -159,11 +137,11 @@ def _most_likely(log: Log, first: Settings, default: Settings, beacons: Beacons,
         for name, value in logs.items():
             settings = _with(settings, name, math.exp(value))
         prior = 0.5 * sum((value / PRIOR_LN) ** 2 for value in logs.values())
-        return prior + _run(arrays, settings, start)[0]
+        return prior + _run(rows, events, settings, start)[0]
 
     prepared, hold_s = merged(log)
     start = Localizer(prepared, "ekf", default, None, beacons)
-    arrays = _arrays(prepared, start, hold_s)
+    rows, events = _arrays(prepared, start, hold_s)
     best = dict.fromkeys(names, 0.0)
     lowest = cost(best)
     for factor in FACTORS:
@@ -207,8 +185,8 @@ def merged(log: Log) -> tuple[Log, float | None]:
     return sorted([*others, *mean_controls], key=lambda event: event.time_s), float(np.median(holds))
 
 
-def _arrays(log: Log, start: Localizer, hold_s: float | None) -> _Pass:
-    """The arrays of a log; `start` is a localizer that has not processed anything."""
+def _arrays(log: Log, start: Localizer, hold_s: float | None) -> tuple[Rows, list[Event]]:
+    """A log as arrays, and the event of each row; `start` is a localizer that has not processed anything."""
     holds = control_holds(log, start.control_kind)
     motion, rows = start.filter.motion, []
     for i, event in enumerate(log):
@@ -228,55 +206,51 @@ def _arrays(log: Log, start: Localizer, hold_s: float | None) -> _Pass:
             model[i], values[i, :m] = measurement.model, measurement.values
             tables[i, : len(measurement.parameters), : measurement.parameters.shape[1]] = measurement.parameters
             angles[i, len(motion.states) : len(motion.states) + len(measurement.angles)] = measurement.angles
-    return _Pass(
-        np.diff(times, prepend=times[0]),
-        np.array([control for _, control, _, _ in rows]),
-        np.array([hold for _, _, hold, _ in rows]),
-        model,
-        size,
-        values,
-        tables,
-        angles,
-        [event for event, *_ in rows],
+    events = [event for event, *_ in rows]
+    named = np.isin([event.kind for event in events], NAMED)
+    arrays = Rows(
+        intervals_s=np.diff(times, prepend=times[0]),
+        controls=np.array([control for _, control, _, _ in rows]),
+        holds_s=np.array([hold for _, _, hold, _ in rows]),
+        models=model,
+        sizes=size,
+        values=values,
+        parameters=tables,
+        is_angle=angles,
+        is_direct=~named,
+        counts=named | np.array([event.kind == "attitude" for event in events]),
     )
+    return arrays, events
 
 
-def _run(arrays: _Pass, settings: Settings, start: Localizer) -> tuple[float, Floats]:
+def _run(rows: Rows, events: list[Event], settings: Settings, start: Localizer) -> tuple[float, Floats]:
     """−ln likelihood, and the normalised innovations (N, 2) of ranges and bearings; `start` is only read."""
-    variances = np.zeros((len(arrays.events), 3))
-    kinds = np.array([event.kind for event in arrays.events])
-    seen = np.isin(kinds, NAMED)
-    variances[seen, 0] = settings.ranges.variances(arrays.values[seen, 0], float(np.mean(arrays.values[seen, 0])))
-    variances[seen, 1] = settings.bearing_std_rad**2
+    innovations = np.zeros((len(events), 2))
+    cost = run_filter(
+        Gaussian(start.filter.state.copy(), start.filter.covariance.copy()),
+        start.filter.motion.model,
+        noise_root(settings, start.vehicle),
+        rows,
+        _variances(rows, events, settings),
+        np.array([chi_square_quantile(GATE, size) for size in (1, 2, 3)]),
+        start.filter.grid,
+        innovations,
+    )
+    innovations[rows.is_direct] = 0.0
+    return cost, innovations
+
+
+def _variances(rows: Rows, events: list[Event], settings: Settings) -> Floats:
+    """The diagonal (N, 3) of each row's R with these noises."""
+    variances, kinds = np.zeros((len(events), 3)), np.array([event.kind for event in events])
+    named = ~rows.is_direct
+    variances[named, 0] = settings.ranges.variances(rows.values[named, 0], float(np.mean(rows.values[named, 0])))
+    variances[named, 1] = settings.bearing_std_rad**2
     variances[kinds == "depth", 0] = settings.depth_std_m**2
     variances[kinds == "attitude", 0] = settings.attitude_std_rad**2
     far, turned = settings.start_std
     variances[kinds == "pose"] = (far**2, far**2, turned**2)
-    innovations = np.zeros((len(arrays.events), 2))
-    cost = run_filter(
-        start.filter.motion.model,
-        start.filter.state.copy(),
-        start.filter.covariance.copy(),
-        arrays.intervals,
-        arrays.controls,
-        arrays.holds,
-        noise_root(settings, start.vehicle),
-        arrays.model,
-        arrays.rows,
-        arrays.values,
-        variances,
-        arrays.tables,
-        arrays.is_angle,
-        seen | (kinds == "attitude"),
-        ~seen,
-        np.array([chi_square_quantile(GATE, rows) for rows in (1, 2, 3)]),
-        TAILS,
-        start.filter.grid.blocked,
-        start.filter.grid.geometry,
-        innovations,
-    )
-    innovations[~seen] = 0.0
-    return cost, innovations
+    return variances
 
 
 def correlation_time(events: list[Event], innovations: Floats) -> float:

@@ -11,12 +11,15 @@ ray-cast poses.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
+from linkpose.errors import LinkposeError
 from linkpose.localization.gate import gate_blocks
+from linkpose.localization.grid import GridMap
 from linkpose.localization.linalg import (
     Floats,
     add_to,
@@ -31,24 +34,46 @@ from linkpose.localization.linalg import (
     wrap_angle,
 )
 from linkpose.localization.models import predict, propagate
+from linkpose.localization.steps import Correction, Gaussian, Prediction
+
+
+class Transform(NamedTuple):
+    """The unscented transform: κ places the sigma points √(n_a + κ) standard deviations out. α and β scale it; 1 and 0
+    leave it plain.
+    """
+
+    alpha: float = 1.0
+    beta: float = 0.0
+    kappa: float = 0.0
+
+    def check(self) -> None:
+        """Raises LinkposeError for a transform without sigma points or with a covariance that can turn indefinite."""
+        if self.kappa < 0:
+            raise LinkposeError(
+                f"κ {self.kappa:g} gives the centre point a negative weight, and P may cease to be positive definite; "
+                "use 0 or more"
+            )
+        if not 0 < self.alpha <= 1:
+            raise LinkposeError(f"α {self.alpha:g} is not within 0 to 1; try 0.1")
+        if self.beta < 0:
+            raise LinkposeError(f"β {self.beta:g} is below 0; 2 is best for Gaussian errors")
 
 
 @compiled
-def _points(
-    motion: int, state: Floats, root: Floats, control: Floats, noise_root: Floats, interval: float, reach: float
-) -> Floats:
+def _points(mean: Floats, root: Floats, prediction: Prediction, reach: float) -> Floats:
     """(1) and (2): the propagated sigma points (1 + 2 (n + q), n); row 0 is the centre."""
-    n, q = state.shape[0], noise_root.shape[0]
+    model, control, noise_root, interval_s = prediction
+    n, q = mean.shape[0], noise_root.shape[0]
     points, start, noise = np.empty((1 + 2 * (n + q), n)), np.empty(n), np.empty(q)
     for point in range(points.shape[0]):
         column = (point - 1) // 2
         side = 0.0 if point == 0 else reach if point % 2 else -reach
         for i in range(n):
-            start[i] = state[i] + (side * root[i, column] if 0 <= column < n else 0.0)
+            start[i] = mean[i] + (side * root[i, column] if 0 <= column < n else 0.0)
         for i in range(q):
             noise[i] = side * noise_root[i, column - n] if column >= n else 0.0
-        if interval > 0.0:
-            propagate(motion, start, control, noise, interval, points[point])
+        if interval_s > 0.0:
+            propagate(model, start, control, noise, interval_s, points[point])
         else:
             for i in range(n):
                 points[point, i] = start[i]
@@ -98,34 +123,18 @@ def _assign(target: Floats, source: Floats) -> None:
 
 @compiled
 def ukf_step(
-    motion: int,
-    state: Floats,
-    covariance: Floats,
-    control: Floats,
-    noise_root: Floats,
-    interval: float,
-    model: int,
-    measured: Floats,
-    measurement_covariance: Floats,
-    parameters: Floats,
-    is_angle: NDArray[np.bool_],
-    threshold: float,
-    d2: Floats,
-    blocked: NDArray[np.uint8],
-    geometry: Floats,
-    alpha: float,
-    beta: float,
-    kappa: float,
+    estimate: Gaussian, prediction: Prediction, correction: Correction, grid: GridMap, transform: Transform
 ) -> bool:
-    """Propagates over `interval` and corrects with the measurement, both in place. False when P has ceased to be
-    positive definite.
+    """Predicts, then corrects `estimate` in place. False when the covariance has ceased to be positive definite.
 
     λ = α² (n_a + κ) − n_a; α = 1 and β = 0 make it the plain unscented transform. (12) is taken as Σ w (δx − K δz)(δx −
-    K δz)ᵀ + K R Kᵀ, equal to P̄ − K S Kᵀ but a sum of squares. `d2` and `threshold` as in `ekf_step`. No measurement: m
-    = 0.
+    K δz)ᵀ + K R Kᵀ, equal to P̄ − K S Kᵀ but a sum of squares.
     """
-    n, m = state.shape[0], measured.shape[0]
-    augmented = n + noise_root.shape[0] + m
+    mean, covariance = estimate
+    measured, noise, is_angle, d2 = correction.values, correction.covariance, correction.is_angle, correction.d2
+    alpha, beta, kappa = transform
+    n, m = mean.shape[0], measured.shape[0]
+    augmented = n + prediction.noise_root.shape[0] + m
     scale = alpha * alpha * (augmented + kappa)
     weight = 0.5 / scale
     centre = 1.0 - augmented / scale + 2.0 * m * weight  # with the points that move only the measurement noise
@@ -133,19 +142,19 @@ def ukf_step(
     root = np.zeros((n, n))
     if not lower_cholesky(covariance, root):
         return False
-    points = _points(motion, state, root, control, noise_root, interval, math.sqrt(scale))
+    points = _points(mean, root, prediction, math.sqrt(scale))
     images, innovation = np.empty((points.shape[0], m)), np.empty(m)
     for i in range(points.shape[0] if m else 0):
-        predict(model, points[i], parameters, blocked, geometry, images[i])
-    _deviations(points, weight, is_angle, 0, state)
+        predict(correction.model, points[i], correction.parameters, grid, images[i])
+    _deviations(points, weight, is_angle, 0, mean)
     _assign(covariance, _moment(points, points, centre_squares, weight))
     if m == 0:
         return True
     _deviations(images, weight, is_angle, n, innovation)
     subtract_from(measured, innovation, is_angle, n)
     spread = _moment(images, images, centre_squares, weight)
-    add_to(spread, measurement_covariance)
-    keep = gate_blocks(innovation, spread, m // d2.shape[0], threshold, d2)
+    add_to(spread, noise)
+    keep = gate_blocks(innovation, spread, m // d2.shape[0], correction.threshold, d2)
     if keep.shape[0] == 0:
         return True
     lower = np.empty((keep.shape[0], keep.shape[0]))
@@ -153,11 +162,10 @@ def ukf_step(
         return False
     kept_images = taken(images, np.arange(images.shape[0]), keep)
     gain = right_divide(_moment(points, kept_images, centre_squares, weight), lower)
-    shift(state, gain, innovation, keep, is_angle)
+    shift(mean, gain, innovation, keep, is_angle)
     rest = _rest(points, kept_images, gain)
-    noise = product_transposed(product(gain, taken(measurement_covariance, keep, keep)), gain)
     _assign(covariance, _moment(rest, rest, centre_squares, weight))
-    add_to(covariance, noise)
+    add_to(covariance, product_transposed(product(gain, taken(noise, keep, keep)), gain))
     return keep_positive_definite(covariance)
 
 

@@ -63,7 +63,7 @@ class Page:
             columns: of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; columns without a filter are a reference.
             rig: its J2S is the length and direction of the link in the scene.
             title: a line such as the port or the file.
-            host: address to listen at; any other than a loopback address opens the page to the network.
+            host: address of the server; any other than a loopback address opens the page to the network.
             port: TCP port; None: the first free one from 8080.
             on_mark: called with the time (s) of the newest row when the user presses "mark".
             replay: rows of a file to play, instead of `show`.
@@ -258,7 +258,7 @@ def free_port(host: str) -> int:
 
 
 def _try_to_bind(host: str, port: int) -> None:
-    """Raises OSError where a server could not listen there."""
+    """Raises OSError where a server could not open that port."""
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     with socket.socket(family, kind, protocol) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -282,5 +282,5 @@ def serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
             return None
 
     rich.reconfigure(quiet=True)  # the global console, with which viser prints; linkpose has its own
-    with own_requests_only(host):  # returns when the server listens
+    with own_requests_only(host):  # returns when the server accepts connections
         return Server(host, port, label="linkpose", verbose=False)

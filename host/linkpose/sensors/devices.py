@@ -177,7 +177,7 @@ def check_hello(hello: Hello) -> None:
     """Raises LinkposeError that names a value which no board has: nothing may be scaled by it."""
     if wrong := impossible(hello):
         raise LinkposeError(
-            f"the board's HELLO says {wrong}, which is impossible; its firmware is damaged or not linkpose's: "
+            f"the board's HELLO contains {wrong}, which is impossible; its firmware is damaged or not linkpose's: "
             "type `linkpose flash`"
         )
 

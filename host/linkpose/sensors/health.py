@@ -166,9 +166,9 @@ class SensorHealth:
 
     def _excuse(self, codes: Codes, time_s: Floats) -> Codes:
         """A sensor that is being set up gives no reading yet."""
-        heard = np.maximum.accumulate(codes != Cause.SILENT)
-        self._starting = not heard[-1] and bool(time_s[-1] < SET_UP_S)
-        return np.where((codes == Cause.SILENT) & ~heard & (time_s < SET_UP_S), np.int8(Cause.STARTING), codes)
+        answered = np.maximum.accumulate(codes != Cause.SILENT)
+        self._starting = not answered[-1] and bool(time_s[-1] < SET_UP_S)
+        return np.where((codes == Cause.SILENT) & ~answered & (time_s < SET_UP_S), np.int8(Cause.STARTING), codes)
 
     def _advance(self, code: int, first_s: float, last_s: float) -> list[Change]:
         cause = Cause(code)

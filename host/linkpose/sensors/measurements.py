@@ -37,7 +37,7 @@ class Measurements:
     pressure_Pa: Floats  # (N,) the last compensated pressure, repeated until the next
     baro_temp_degC: Floats  # (N,)
     baro_fresh: NDArray[np.bool_]  # (N,) True at the first sample that carries a new pressure
-    mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where flags say MICE_STALE
+    mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where MICE_STALE is set
     flags: NDArray[np.uint32]  # (N,) wire.messages.SampleFlags
     # A second inertial sensor and a magnetometer; NaN (and False) in all rows if there is none.
     accel2_m_s2: Floats = None  # type: ignore[assignment]  # (N, 3) as the first sensor's, in the second sensor's axes

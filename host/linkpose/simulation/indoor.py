@@ -40,7 +40,7 @@ LONGEST_S = 3600.0
 
 @dataclass(frozen=True, slots=True)
 class IndoorErrors:
-    """Standard deviations. A beam's is sqrt(σ² + (k r)²); an outlier is an obstacle that the map does not know,
+    """Standard deviations. A beam's is sqrt(σ² + (k r)²); an outlier is an obstacle that is not in the map,
     somewhere before the wall.
     """
 
@@ -169,7 +169,7 @@ def _scan(rng: np.random.Generator, errors: IndoorErrors, grid: GridMap, pose: F
     table = np.zeros((READINGS, 5))
     table[:, 0], table[:, 4] = flaser_angles(READINGS), FLASER_MAX_RANGE_M
     ranges = np.empty(READINGS)
-    beams.predict(pose, table, grid.blocked, grid.geometry, ranges)
+    beams.predict(pose, table, grid, ranges)
     silent = ranges >= FLASER_MAX_RANGE_M
     obstructed = rng.random(READINGS) < errors.outlier_fraction
     ranges = np.where(obstructed, ranges * rng.uniform(0.1, 0.9, READINGS), ranges)

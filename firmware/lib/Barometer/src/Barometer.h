@@ -1,4 +1,4 @@
-// The barometer, a BMP180 (or BMP085) or a BMP280, as a state machine without I/O: it returns the transaction it wants
+// The barometer, a BMP180 (or BMP085) or a BMP280, as a state machine without I/O: it returns the transaction that it needs
 // next and is given the result.
 //
 // Registers and conversion times: Bosch BST-BMP180-DS000, BST-BMP280-DS001. A BMP180 measures one temperature for every
@@ -29,7 +29,7 @@ class Barometer {
   bool present() const { return present_; }
   bool ever_found() const { return ever_found_; }
   bool settled() const { return present_ || tried_; }
-  // Answers with an id that this driver does not know.
+  // Answers with an id that this driver does not support.
   bool unsupported() const { return !present_ && id_ != 0 && family_ == kNone; }
   // Temperature and pressure were both measured since the sensor last answered, or before with the same calibration.
   bool valid() const { return present_ && pressure_known_; }

@@ -1,7 +1,7 @@
 // Takes the frames of the wire protocol (COBS, ended by 0x00, CRC-16 over type and body) apart, byte by byte.
 //
 // Needs no buffer for a whole frame: the CRC runs along, and only the first bytes of the body are kept. A frame of an
-// unknown type that is longer than any command of this version is therefore still told from a corrupt one.
+// unknown type that is longer than any command of this version is therefore still distinguished from a corrupt one.
 #pragma once
 #include <Crc16.h>
 #include <Messages.h>

@@ -1,6 +1,6 @@
 // Sleep until there is something to do, and the account of the time awake.
 //
-// An interrupt that gives the main loop work says so with signal_work(). Timer0 counts the time awake: it is stopped
+// An interrupt that gives the main loop work calls signal_work(). Timer0 counts the time awake: it is stopped
 // before each sleep, and every interrupt begins with note_wake(), which lets it go on. Both are one or two instructions,
 // as tens of thousands of interrupts a second wake the CPU when mice are polled.
 #pragma once

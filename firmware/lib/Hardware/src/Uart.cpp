@@ -27,7 +27,7 @@ volatile uint16_t overrun_count;
 
 inline void receive(uint8_t byte) {
   const bool end = byte == 0;
-  if (end && after_end) return;  // an empty frame says nothing
+  if (end && after_end) return;  // an empty frame carries nothing
   const bool full = static_cast<uint8_t>(received_head - received_tail) >= kReceived;
   const bool no_time = end && static_cast<uint8_t>(ends_head - ends_tail) >= kEnds;
   if (full || no_time) {

@@ -11,7 +11,7 @@ void begin();
 bool put(uint8_t type, const void* body, uint8_t size);
 uint32_t frames_dropped();
 
-// The next byte from the host. For a 0x00, the end of a frame, `t_us` tells when it arrived. False when there is none.
+// The next byte from the host. For a 0x00, the end of a frame, `t_us` is when it arrived. False when there is none.
 bool take(uint8_t& byte, uint32_t& t_us);
 uint16_t overruns();
 

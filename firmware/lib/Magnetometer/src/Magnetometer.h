@@ -1,4 +1,4 @@
-// The magnetometer of a GY-87 as a state machine without I/O: it returns the transaction it wants next and is given the
+// The magnetometer of a GY-87 as a state machine without I/O: it returns the transaction it needs next and is given the
 // result. It finds out which of three chips is fitted.
 //
 // The chip is behind the inertial sensor's auxiliary bus, which the inertial sensor's driver connects to the main bus

@@ -1,4 +1,4 @@
-// An inertial sensor of the MPU-6050's kind as a state machine without I/O: it returns the transaction it wants next and
+// An inertial sensor of the MPU-6050's kind as a state machine without I/O: it returns the transaction it needs next and
 // is given the result.
 //
 // Registers: InvenSense RM-MPU-6000A-00 and RM-MPU-6500A-00; start-up times: PS-MPU-6000A-00.

@@ -1,9 +1,9 @@
 """Two filters with different assumptions about the sensors, mixed by their probabilities.
 
-The filter is not told whether the sensors were calibrated, and the two hypotheses behave differently during start-up.
-Two filters therefore run in parallel, one with the errors that a calibration leaves and one with the data sheet's. A
-filter whose estimated sensor errors lie far outside its own prior becomes less probable: its likelihood is e^−χ²/2 of
-those errors. The estimate is the mean of both.
+Whether the sensors were calibrated is unknown, and the two hypotheses behave differently during start-up. Two filters
+therefore run in parallel, one with the errors that a calibration leaves and one with the data sheet's. A filter whose
+estimated sensor errors lie far outside its own prior becomes less probable: its likelihood is e^−χ²/2 of those
+errors. The estimate is the mean of both.
 
 Source: D. T. Magill, "Optimal adaptive estimation of sampled stochastic processes", IEEE Trans. Automatic Control
 10(4), 1965.

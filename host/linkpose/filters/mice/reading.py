@@ -151,7 +151,7 @@ def correct(state: Record, mice: Records, p: Record, finds_bias: bool) -> bool:
     if not is_known and math.isfinite(state.mean_rate):
         state.turn_rate = state.mean_rate - state.bias
     _fill_window(state, mice)
-    if is_gap and is_known:  # the velocity before a gap says little of the velocity after it
+    if is_gap and is_known:  # the velocity before a gap carries little information on the velocity after it
         state.reference, state.reference_rate = state.velocity, state.turn_rate
     if faults.exclude(state, mice, p.noise_m_s, p.mismatch):
         is_known = _fuse(state, mice, p)

@@ -7,10 +7,8 @@ takes functions as arguments cannot be cached on disk.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from linkpose.compiling import compiled
+from linkpose.localization.grid import GridMap
 from linkpose.localization.linalg import Floats
 from linkpose.localization.models import (
     beacon_range,
@@ -19,17 +17,13 @@ from linkpose.localization.models import (
     direct,
     holonomic,
     landmark,
-    mouse_velocity,
-    planar_twist,
-    rate_gyro,
     submersible,
     unicycle,
 )
 
-UNICYCLE, HOLONOMIC, SUBMERSIBLE, PLANAR_TWIST = unicycle.ID, holonomic.ID, submersible.ID, planar_twist.ID
+UNICYCLE, HOLONOMIC, SUBMERSIBLE = unicycle.ID, holonomic.ID, submersible.ID
 CONSTANT_VELOCITY = constant_velocity.ID
 BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
-MOUSE_VELOCITY, RATE_GYRO = mouse_velocity.ID, rate_gyro.ID
 
 
 @compiled
@@ -41,10 +35,8 @@ def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interv
         holonomic.propagate(state, control, noise, interval, out)
     elif motion == SUBMERSIBLE:
         submersible.propagate(state, control, noise, interval, out)
-    elif motion == CONSTANT_VELOCITY:
-        constant_velocity.propagate(state, control, noise, interval, out)
     else:
-        planar_twist.propagate(state, control, noise, interval, out)
+        constant_velocity.propagate(state, control, noise, interval, out)
 
 
 @compiled
@@ -58,45 +50,31 @@ def motion_jacobians(
         holonomic.jacobians(state, control, interval, by_state, by_noise)
     elif motion == SUBMERSIBLE:
         submersible.jacobians(state, control, interval, by_state, by_noise)
-    elif motion == CONSTANT_VELOCITY:
-        constant_velocity.jacobians(state, control, interval, by_state, by_noise)
     else:
-        planar_twist.jacobians(state, control, interval, by_state, by_noise)
+        constant_velocity.jacobians(state, control, interval, by_state, by_noise)
 
 
 @compiled
-def predict(
-    model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
-) -> None:
+def predict(model: int, state: Floats, parameters: Floats, grid: GridMap, out: Floats) -> None:
     """Fills `out` with the measurement that `state` leads to expect."""
     if model == BEAMS:
-        beams.predict(state, parameters, blocked, geometry, out)
+        beams.predict(state, parameters, grid, out)
     elif model == BEACON_RANGE:
         beacon_range.predict(state, parameters, out)
     elif model == LANDMARK:
         landmark.predict(state, parameters, out)
-    elif model == DIRECT:
-        direct.predict(state, parameters, out)
-    elif model == MOUSE_VELOCITY:
-        mouse_velocity.predict(state, parameters, out)
     else:
-        rate_gyro.predict(state, parameters, out)
+        direct.predict(state, parameters, out)
 
 
 @compiled
-def jacobian(
-    model: int, state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats
-) -> None:
+def jacobian(model: int, state: Floats, parameters: Floats, grid: GridMap, out: Floats) -> None:
     """Fills a zeroed matrix (m, n) with the slopes of `predict`."""
     if model == BEAMS:
-        beams.jacobian(state, parameters, blocked, geometry, out)
+        beams.jacobian(state, parameters, grid, out)
     elif model == BEACON_RANGE:
         beacon_range.jacobian(state, parameters, out)
     elif model == LANDMARK:
         landmark.jacobian(state, parameters, out)
-    elif model == DIRECT:
-        direct.jacobian(state, parameters, out)
-    elif model == MOUSE_VELOCITY:
-        mouse_velocity.jacobian(state, parameters, out)
     else:
-        rate_gyro.jacobian(state, parameters, out)
+        direct.jacobian(state, parameters, out)

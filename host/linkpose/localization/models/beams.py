@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.localization.grid import cast_ray
+from linkpose.localization.grid import GridMap, cast_ray
 from linkpose.localization.linalg import Floats
 
 ID = 0
@@ -24,30 +23,30 @@ EDGE = 20.0
 
 
 @compiled
-def predict(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
+def predict(state: Floats, parameters: Floats, grid: GridMap, out: Floats) -> None:
     """The ranges (m) from the pose (x, y, θ) that `state` starts with."""
     c, s = math.cos(state[2]), math.sin(state[2])
     for i in range(out.shape[0]):
         x = state[0] + c * parameters[i, 1] - s * parameters[i, 2]
         y = state[1] + s * parameters[i, 1] + c * parameters[i, 2]
         angle = state[2] + parameters[i, 3] + parameters[i, 0]
-        out[i] = cast_ray(blocked, geometry, x, y, angle, parameters[i, 4])
+        out[i] = cast_ray(grid.blocked, grid.geometry, x, y, angle, parameters[i, 4])
 
 
 @compiled
-def jacobian(state: Floats, parameters: Floats, blocked: NDArray[np.uint8], geometry: Floats, out: Floats) -> None:
+def jacobian(state: Floats, parameters: Floats, grid: GridMap, out: Floats) -> None:
     """Fills ∂h/∂state by central differences, since a map has no formula; at an edge by the difference on one side."""
     above, below, centre = np.empty(out.shape[0]), np.empty(out.shape[0]), np.empty(out.shape[0])
-    predict(state, parameters, blocked, geometry, centre)
+    predict(state, parameters, grid, centre)
     moved = np.empty(state.shape[0])
     for j in range(state.shape[0]):
         moved[j] = state[j]
     for j in range(3):
-        step = TURN_STEP if j == 2 else geometry[0]
+        step = TURN_STEP if j == 2 else grid.geometry[0]
         moved[j] = state[j] + step
-        predict(moved, parameters, blocked, geometry, above)
+        predict(moved, parameters, grid, above)
         moved[j] = state[j] - step
-        predict(moved, parameters, blocked, geometry, below)
+        predict(moved, parameters, grid, below)
         moved[j] = state[j]
         for i in range(out.shape[0]):
             forward, backward = above[i] - centre[i], centre[i] - below[i]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
-ID = 4
+ID = 2
 
 
 @compiled
