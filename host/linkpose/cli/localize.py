@@ -171,7 +171,20 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "--error-time",
     type=options.FiniteRange(min=0),
     help="Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
-    f"count less. {FROM_LOG} 0, and 0.5 for landmarks.",
+    "count less. Default: estimated for landmarks and in streams; with few measurements 0, and 0.5 for landmarks.",
+)
+@click.option(
+    "--drift-std",
+    type=options.FiniteRange(min=0),
+    help="σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose. "
+    f"{FROM_LOG} 0.",
+)
+@click.option(
+    "--drift-time",
+    type=POSITIVE,
+    default=10.0,
+    show_default=True,
+    help="Time for which this part persists (s); estimated with it.",
 )
 @click.option(
     "--motion-correlation",
@@ -408,7 +421,9 @@ def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
         given[option] = value if given[option] is None else given[option]
     if given["noise"] != "affine" and "growth" in free:
         free.remove("growth")
-    return (*free, "yaw", *(("error_time",) if given["error_time"] is None else ()))
+    free += [name for option, name in (("error_time", "error_time"), ("drift_std", "drift")) if given[option] is None]
+    given["drift_std"] = given["drift_std"] or 0.0
+    return (*free, "yaw")
 
 
 def _tuned(
@@ -476,6 +491,8 @@ def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float
         start_std=given["start_std"],
         acceleration_std_m_s2=given["acceleration_std"],
         error_time_s=given["error_time"],
+        drift_std_m=given["drift_std"],
+        drift_time_s=given["drift_time"],
         smooth=given["smooth"],
         particles=given["particles"],
         seed=given["seed"],

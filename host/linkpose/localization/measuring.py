@@ -13,7 +13,7 @@ from linkpose.localization.carmen import BEAM_ANGLES_RAD
 from linkpose.localization.events import Event, Scan
 from linkpose.localization.kalman import SUBMERSIBLE, Measurement, Motion
 from linkpose.localization.linalg import Floats
-from linkpose.localization.settings import CONSTANTS, ERROR_TIME_S, Settings
+from linkpose.localization.settings import CONSTANTS, DRIFT, ERROR_TIME_S, Settings
 from linkpose.localization.tables import Beacons
 from linkpose.localization.vehicle import vehicle_of
 
@@ -43,6 +43,11 @@ def constant_states(estimate: Sequence[str], beacons: Sequence[str]) -> tuple[st
     return tuple(names)
 
 
+def drift_state(beacon: str) -> str:
+    """The state that holds the drifting error of a beacon's ranges."""
+    return f"{DRIFT}_{_safe(beacon)}_m"
+
+
 def _safe(beacon: str) -> str:
     """A beacon's name as a part of a column's name."""
     return re.sub(r"\W", "_", beacon)
@@ -62,6 +67,12 @@ class Sensors:
             beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
         }
 
+        self._drifts = {beacon: self._index(drift_state(beacon)) for beacon in beacons}
+
+    def _index(self, state: str) -> int:
+        """Index of a state, or −1."""
+        return self.states.index(state) if state in self.states else -1
+
     def _constant(self, quantity: str, beacon: str) -> int:
         """Index of the state with this beacon's constant, or −1."""
         stem, unit, _ = CONSTANTS[quantity]
@@ -71,9 +82,11 @@ class Sensors:
         return -1
 
     def constants(self, beacon: str, state: Floats) -> tuple[float, float]:
-        """Scale error and bias (m) of a beacon's range in this state; 0 where they are not estimated."""
+        """Scale error, and bias with drift (m), of a beacon's range in this state; 0 where they are not estimated."""
         scale, bias = self._columns[beacon]
-        return float(state[scale]) if scale >= 0 else 0.0, float(state[bias]) if bias >= 0 else 0.0
+        drift = self._drifts[beacon]
+        offset = (float(state[bias]) if bias >= 0 else 0.0) + (float(state[drift]) if drift >= 0 else 0.0)
+        return float(state[scale]) if scale >= 0 else 0.0, offset
 
     def range_std(self, range_m: float) -> float:
         """Standard deviation (m) of one range."""
@@ -144,7 +157,10 @@ class Sensors:
         return Measurement(models.BEAMS, ranges, self.settings.ranges.covariance(ranges, float(ranges.mean())), table)
 
     def _ranges(self, events: list[Event]) -> Measurement:
-        rows = [[*self.beacons[event.beacon], self.height, *self._columns[event.beacon]] for event in events]
+        rows = [
+            [*self.beacons[name], self.height, *self._columns[name], self._drifts[name]]
+            for name in (event.beacon for event in events)
+        ]
         table = np.array(rows, dtype=np.float64)
         ranges = np.array([event.values[0] for event in events])
         means = [self._mean_range(event) for event in events]

@@ -45,7 +45,9 @@ class Stream:
         the beacons determine are estimated too. `report` receives a line when other noises are in use.
         """
         self.report = report
-        self.method, self.settings, self.beacons, self.free = method, settings, beacons, free
+        # States cannot be added to a filter under way: errors that drift have a correlation time only.
+        self.free = tuple(name for name in free if name != "drift")
+        self.method, self.settings, self.beacons = method, settings, beacons
         self.constants = constants
         self.run: Localizer | None = None
         self.late = self.negative = 0
