@@ -136,6 +136,8 @@ DISTURBANCE = Quantity(
 )
 EXCLUDED = Quantity("excluded", "", "mice left out", Shown("", 1.0, 0), Shown(""), "mice left out", decimals=0)
 ANGLE = _degrees("angle", "joint angle")
+FLEXION, ABDUCTION = _degrees("flexion", "flexion"), _degrees("abduction", "abduction")
+AXIAL_ROTATION = _degrees("axial_rotation", "axial rotation")
 QW, QX, QY, QZ = (_part_of_rotation(axis) for axis in "wxyz")
 # σ of the rotation of a chain's joint: the only uncertainty given for the quaternion.
 ROTATION = _degrees("rotation", "joint rotation")
@@ -155,11 +157,13 @@ _READINGS = (
 
 # In the order in which plots and tables present them.
 ALL: tuple[Quantity, ...] = (
-    HEIGHT, HEIGHT1, HEIGHT2, ANGLE, ROTATION, X, Y, Z, ROLL, PITCH, YAW, HEADING, VX, VY, VZ, WX, WY, WZ,
-    ROLL_RAD, PITCH_RAD, YAW_RAD, QW, QX, QY, QZ, EXCLUDED, DISTURBANCE, *_READINGS,
+    HEIGHT, HEIGHT1, HEIGHT2, ANGLE, FLEXION, ABDUCTION, AXIAL_ROTATION, ROTATION,
+    X, Y, Z, ROLL, PITCH, YAW, HEADING, VX, VY, VZ,
+    WX, WY, WZ, ROLL_RAD, PITCH_RAD, YAW_RAD, QW, QX, QY, QZ, EXCLUDED, DISTURBANCE, *_READINGS,
 )  # fmt: skip
 POSE = (X, Y, HEADING)  # of a robot in the plane
 CHAIN_ROTATION = (QW, QX, QY, QZ)
+BALL_ANGLES = (FLEXION, ABDUCTION, AXIAL_ROTATION)
 
 _VALUES = {quantity.column: quantity for quantity in ALL}
 _STDS = {quantity.std_column: quantity for quantity in reversed(ALL) if quantity not in CHAIN_ROTATION}

@@ -38,6 +38,31 @@ def of_vectors(vectors: Floats) -> Floats:
     return np.hstack([np.cos(angle / 2), vectors * 0.5 * np.sinc(angle / (2 * math.pi))])
 
 
+def matrices(q: Floats) -> Floats:
+    """Rotation matrices (N, 3, 3) of quaternions (N, 4)."""
+    w, x, y, z = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def swing_twist(q: Floats) -> Floats:
+    """Quaternions (N, 4) as swing · twist, the twist about z: the two components (rad) of the swing's rotation vector,
+    which lies in the xy plane, and the angle of the twist (rad), (N, 3).
+
+    Source: [Baerlocher2001], 3.
+    """
+    norm = np.hypot(q[:, 0], q[:, 3])
+    safe = np.where(norm > 1e-12, norm, 1.0)
+    twist = np.column_stack([np.where(norm > 1e-12, q[:, 0] / safe, 1.0), np.zeros((len(q), 2)), q[:, 3] / safe])
+    swing = product(q, twist * [1.0, 1.0, 1.0, -1.0])
+    angle = wrapped(2 * np.arctan2(twist[:, 3], twist[:, 0]))
+    return np.column_stack([rotation_vectors(swing)[:, :2], angle])
+
+
 def of_matrices(rotation: Floats) -> Floats:
     """Quaternions (N, 4) of rotation matrices (N, 3, 3); w is not negative.
 

@@ -70,7 +70,7 @@ def look(state: np.ndarray, grid: GridMap, steps: np.ndarray) -> np.ndarray:
 
 
 def seconds(step: Callable[[], object], repeats: int) -> float:
-    """The best of five means: what the machine does when nothing else wants it."""
+    """The best of five means: the machine's speed when it runs nothing else."""
     best = np.inf
     for _ in range(5):
         start = time.perf_counter()

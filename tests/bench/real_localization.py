@@ -4,7 +4,7 @@
 
 FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
 recording that is not there is named and left out. Each recording is run with the default options, smoothed, and with
-the options of a user who knows the sensors. Beside them run filterpy's extended Kalman filter, Monte-Carlo localisation
+options from the sensors' data sheets. Beside them run filterpy's extended Kalman filter, Monte-Carlo localisation
 (laser), and with --batch the batch optimum of GTSAM, which takes some minutes.
 """
 

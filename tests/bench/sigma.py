@@ -3,8 +3,8 @@
     python tests/bench/sigma.py [--seeds N] [--json]
 
 For calibrated sensors and for sensors within the data sheet, the share of errors within 2σ of each quantity over all
-runs, the worst run, the runs below 85 %, NEES and root mean square error. `joint-inertial` knows J2S and nothing of the
-sensors. Yaw, x and y are relative to the first sample.
+runs, the worst run, the runs below 85 %, NEES and root mean square error. `joint-inertial` has J2S, but no calibration
+of the sensors. Yaw, x and y are relative to the first sample.
 """
 
 from __future__ import annotations

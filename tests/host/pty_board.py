@@ -29,13 +29,13 @@ def link_run(settings: Configure) -> LinkRun:
 
 
 class PtyBoard:
-    """Serves a board at the symlink `path`. `spoil` may change what the board sends; `chatter` is said all the time."""
+    """Serves a board at the symlink `path`. `spoil` may change what the board sends; `chatter` is sent all the time."""
 
     def __init__(self, path: Path, spoil: Callable[[bytes], bytes] = lambda data: data, chatter: bytes = b"") -> None:
         self.path = path
         self.spoil = spoil
         self.chatter = chatter
-        self.heard = threading.Event()  # the host has sent something
+        self.received = threading.Event()  # the host has sent something
         self.streams = threading.Event()  # the board has sent samples
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -50,7 +50,7 @@ class PtyBoard:
     def plug(self, path: Path | None = None) -> None:
         """Switches a fresh board on and puts it at the path, or at another one from now on."""
         self.path = path or self.path
-        self.heard.clear()
+        self.received.clear()
         self._master, self._slave = os.openpty()
         tty.setraw(self._master)
         tty.setraw(self._slave)
@@ -72,7 +72,7 @@ class PtyBoard:
         os.close(self._master)
 
     def reset(self, says_hello: bool = True) -> None:
-        """The board starts anew at the same port, and says HELLO unless that gets lost."""
+        """The board starts anew at the same port, and sends HELLO unless that gets lost."""
         from linkpose.simulation import board as simulated
         from linkpose.wire.frames import encode
 
@@ -82,16 +82,16 @@ class PtyBoard:
 
     def _serve(self) -> None:
         while not self._stop.is_set():
-            heard = b""
+            received = b""
             if select.select([self._master], [], [], 0.004)[0]:
                 with contextlib.suppress(OSError):
-                    heard = os.read(self._master, 4096)
-                self.heard.set()
+                    received = os.read(self._master, 4096)
+                self.received.set()
             now_us = int((time.perf_counter() - self._began) * 1e6)
             streamed = self._board.advance(now_us)
-            said = streamed + self._board.receive(heard, now_us)
-            if said:
-                os.write(self._master, self.spoil(said))
+            sent = streamed + self._board.receive(received, now_us)
+            if sent:
+                os.write(self._master, self.spoil(sent))
             if streamed:
                 self.streams.set()
             if self.chatter:

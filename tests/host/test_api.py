@@ -1,4 +1,4 @@
-"""The Python face: what a program imports, what it gets, and what it is told when something is wrong."""
+"""The Python face: what a program imports, what it gets, and which errors it gets."""
 
 from __future__ import annotations
 

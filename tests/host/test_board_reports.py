@@ -69,11 +69,11 @@ def test_mice_that_are_being_set_up_are_waited_for(
     board: ScriptedBoard, states: list[tuple[DeviceState, ...]], wanted: int, waits: bool
 ) -> None:
     board.hello = hellos(*states)
-    said: list[str] = []
-    with Session(FAST, said.append) as session:
+    messages: list[str] = []
+    with Session(FAST, messages.append) as session:
         session.wait_for_mice(wanted)
         assert [m.state for m in session.hello.mice] == list(states[-1])
-    assert said == ["Waiting for the mice, which are being set up or have not been found yet"] * waits
+    assert messages == ["Waiting for the mice, which are being set up or have not been found yet"] * waits
 
 
 def test_a_mouse_that_never_comes_does_not_hold_up_the_recording(
@@ -91,9 +91,9 @@ def test_a_mouse_that_never_comes_does_not_hold_up_the_recording(
 def test_what_a_mouse_refused_is_reported(board: ScriptedBoard, linkpose: Callable) -> None:
     mice = tuple(mouse(OK, int(lack)) for lack in MouseLacks)
     board.hello = lambda hello: hello._replace(mice=mice[1:])
-    said = linkpose("info", "--port", FAST).err
+    output = linkpose("info", "--port", FAST).err
     for port, words in enumerate(("ENABLE", "200 reports/s", "runs at 8 counts/mm", "its resolution is assumed"), 1):
-        assert re.search(f"The mouse at port {port} .*{words}", said)
+        assert re.search(f"The mouse at port {port} .*{words}", output)
     board.hello = lambda hello: hello._replace(mice=mice[:1])
     assert "The mouse at port 1 refuses remote mode: it is read in stream mode" in linkpose("info", "--port", FAST).err
 
@@ -110,12 +110,12 @@ def test_a_mouse_that_overflows_early_is_reported_from_its_calibration(
     board: ScriptedBoard, poll_us: int, limit: str
 ) -> None:
     board.status = lambda status: status._replace(mice=tuple(mouse._replace(poll_us=poll_us) for mouse in status.mice))
-    said: list[str] = []
+    messages: list[str] = []
     rig = Rig(mouse=(Mouse(0.1, 0.0), Mouse(-0.1, 0.0, counts_per_m=20_000.0)))
-    with Board(FAST, notify=said.append, rig=rig) as connected:
+    with Board(FAST, notify=messages.append, rig=rig) as connected:
         for _ in connected.stream(2.5):
             pass
-    warned = [line for line in said if "overflow" in line]
+    warned = [line for line in messages if "overflow" in line]
     assert len(warned) == (poll_us > 7500)
     assert all(f"Mouse 2 counts 20000 per metre: above {limit} m/s" in line for line in warned)
 
@@ -126,12 +126,12 @@ def test_a_mouse_that_overflows_early_is_reported_from_its_calibration(
 @pytest.mark.parametrize(("millivolts", "warned"), [(4300, True), (4500, False), (0, False)])
 def test_a_low_supply_is_reported_once(board: ScriptedBoard, millivolts: int, warned: bool) -> None:
     board.status = lambda status: status._replace(vcc_mv=millivolts)
-    said: list[str] = []
-    with Session(FAST, said.append) as session:
+    messages: list[str] = []
+    with Session(FAST, messages.append) as session:
         for _ in session.stream(3.5):
             pass
     assert session.status is not None and session.status.vcc_mv == millivolts
-    assert [line for line in said if "supply" in line] == [
+    assert [line for line in messages if "supply" in line] == [
         "The supply of the board is 4.3 V (±10 %), below 4.5 V: mice or sensors may fail. Use a shorter USB cable or "
         "another port, or supply the mice separately"
     ] * warned
@@ -139,11 +139,13 @@ def test_a_low_supply_is_reported_once(board: ScriptedBoard, millivolts: int, wa
 
 def test_where_the_firmware_hung_is_reported(board: ScriptedBoard, linkpose: Callable) -> None:
     board.resets, board.cause, board.hung_at = [50], int(ResetCause.HUNG | ResetCause.WATCHDOG), 0x1234
-    said: list[str] = []
-    with Session(FAST, said.append) as session:
+    messages: list[str] = []
+    with Session(FAST, messages.append) as session:
         for _ in session.stream(1.5):
             pass
-    assert said[0] == ("the board was reset (the firmware hung at program counter 0x1234); going on, the gap is marked")
+    assert messages[0] == (
+        "the board was reset (the firmware hung at program counter 0x1234); going on, the gap is marked"
+    )
     assert "the firmware hung at program counter 0x1234" in linkpose("info", "--port", FAST).out
 
 
@@ -183,12 +185,12 @@ def test_another_program_at_the_same_socket_is_reported_once(
     """Nothing locks a socket:// port. Answers that this program has not asked for show the other one."""
     monkeypatch.setattr(session_module.random, "getrandbits", lambda bits: 1 << (bits - 1))
     board.inserted = [(50 + at, message) for at, message in enumerate(messages)]
-    said: list[str] = []
-    with Session(FAST, said.append) as session:
+    messages: list[str] = []
+    with Session(FAST, messages.append) as session:
         assert sum(map(len, session.stream(1.0))) == 100
     assert not board.inserted
     assert (
-        said
+        messages
         == [f"another program also sends commands to the board at {FAST}; close it, or the data will have gaps"]
         * reported
     )
@@ -201,10 +203,10 @@ WANTED = {"sample_rate_hz": 50, "accel_range_g": 16}
 
 
 def stream_through(board: ScriptedBoard, duration_s: float = 6.0) -> tuple[list[str], Board, list]:
-    said: list[str] = []
-    with Board("sim://link?speed=0", settings=WANTED, notify=said.append) as connected:
+    messages: list[str] = []
+    with Board("sim://link?speed=0", settings=WANTED, notify=messages.append) as connected:
         blocks = list(connected.stream(duration_s))
-    return said, connected, blocks
+    return messages, connected, blocks
 
 
 def check_resumed(connected: Board, blocks: list) -> None:
@@ -236,10 +238,10 @@ def test_a_second_reset_while_resuming_is_waited_for(board: ScriptedBoard, monke
     monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
     board.resets = [20]
     board.resets_at = again = FirstAfterResets(board, Start, 5)
-    said, connected, blocks = stream_through(board)
+    messages, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
     assert again.left == 0
-    assert any("was reset" in line for line in said)
+    assert any("was reset" in line for line in messages)
 
 
 def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
@@ -249,10 +251,10 @@ def test_acks_that_get_lost_while_resuming_do_not_end_the_recording(
     monkeypatch.setattr(session_module, "ANSWER_TIMEOUT_S", 0.2)
     board.resets = [20]
     board.lost = lost = FirstAfterResets(board, Configure, 5)
-    said, connected, blocks = stream_through(board)
+    messages, connected, blocks = stream_through(board)
     check_resumed(connected, blocks)
     assert lost.left == 0
-    assert any("waiting for the board, Ctrl-C ends" in line for line in said)
+    assert any("waiting for the board, Ctrl-C ends" in line for line in messages)
     assert board.opened == 2
 
 

@@ -1,4 +1,4 @@
-"""calibrate imu and calibrate joint: known sensors and levers are found again; what does not tell them is refused."""
+"""calibrate imu and calibrate joint: known sensors and levers are found again; insufficient data are refused."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_joint_from_a_sensor_that_was_never_calibrated():
 
 
 def test_the_sensors_errors_are_found_with_the_joint():
-    """Over what the rig file knows already; without them the gyro's bias alone would lean the tilt by degrees."""
+    """Over what the rig file contains already; without them the gyro's bias alone would lean the tilt by degrees."""
     run = LinkRun(1, 0, 60.0, errors="datasheet")
     errors, block = run.imu_errors, run.measurements()
     known = Imu(gyro_bias_rad_s=(0.1, -0.1, 0.05), accel_offset_m_s2=(0.1, 0.0, -0.2), accel_scale=(1.01, 0.99, 1.02))
@@ -310,19 +310,19 @@ def saved(path: Path, block: Measurements, accel_unit: float = 1.0) -> str:
 
 
 @pytest.mark.parametrize(
-    ("sides", "says"),
+    ("sides", "sentence"),
     [
         (SIX_SIDES[:1], "1 rest in 1 attitude\n"),
         (SIX_SIDES, "6 attitudes always fit; record more to get a residual"),
         (np.vstack([SIX_SIDES, np.ones((1, 3)) / np.sqrt(3)]), "residual 0.00"),
     ],
 )
-def test_a_residual_is_told_where_there_is_one(tmp_path, sides, says):
+def test_a_residual_is_reported_where_there_is_one(tmp_path, sides, sentence):
     path = saved(tmp_path / "r.csv", turned_over(sides).measurements)
     result = CliRunner().invoke(
         imu_command.command, [path, "--rig", str(tmp_path / "rig.toml")], catch_exceptions=False
     )
-    assert says in result.stdout
+    assert sentence in result.stdout
     assert ("residual" in result.stdout) == (len(sides) >= 6)
 
 
@@ -355,9 +355,9 @@ def test_a_sensor_that_is_not_calibrated_is_said_and_calibrated_on_request(tmp_p
     rec, truth, rig_file = tmp_path / "rec.csv", tmp_path / "truth.csv", tmp_path / "rig.toml"
     CliRunner().invoke(simulate_link.command, ["-o", str(rec), "--truth", str(truth), "--errors", "datasheet"])
     typed = [str(rec), "--rig", str(rig_file)]
-    told = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
-    assert "are not saved. Add --imu to save them." in told.stderr
-    assert "The rig file does not calibrate the sensor: add --imu" in told.stderr
+    result = CliRunner().invoke(joint_command.command, typed, catch_exceptions=False)
+    assert "are not saved. Add --imu to save them." in result.stderr
+    assert "The rig file does not calibrate the sensor: add --imu" in result.stderr
     assert Rig.load(rig_file).imu.gyro_bias_rad_s == (0.0, 0.0, 0.0)
     asked = CliRunner().invoke(joint_command.command, [*typed, "--imu", "--json"], catch_exceptions=False)
     assert "not saved" not in asked.stderr and "does not calibrate" not in asked.stderr

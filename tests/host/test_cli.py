@@ -97,25 +97,25 @@ def test_the_rig_files_j2s_is_used_and_a_wrong_key_is_named(linkpose, refused, t
         ("j2s_m = [", "is not a rig file"),
     ):
         rig.write_text(text)
-        said = refused("estimate", recording, "--rig", rig)
-        assert sentence in said and "rig.toml" in said
+        output = refused("estimate", recording, "--rig", rig)
+        assert sentence in output and "rig.toml" in output
 
 
 def test_estimates_do_not_replace_their_recording(linkpose, refused, tmp_path):
     recording = tmp_path / "r.csv"
     linkpose("record", recording, "--port", SIM, "--duration", 0.2)
     before = recording.read_bytes()
-    said = refused("estimate", recording, "-o", recording, "--force")
-    assert "is the recording that is read; name another file for the estimates" in said
+    output = refused("estimate", recording, "-o", recording, "--force")
+    assert "is the recording that is read; name another file for the estimates" in output
     assert recording.read_bytes() == before
 
 
 @pytest.mark.parametrize(
-    ("j2s", "says"),
+    ("j2s", "sentence"),
     [("1e9,0,0", "longer than 10 m"), ("0,900,40", "is in metres"), ("0,0,inf", "not finite"), ("1,2", "not three")],
 )
-def test_a_j2s_that_no_link_has_is_refused(refused, tmp_path, j2s, says):
-    assert says in refused("estimate", tmp_path / "r.csv", "--j2s", j2s)
+def test_a_j2s_that_no_link_has_is_refused(refused, tmp_path, j2s, sentence):
+    assert sentence in refused("estimate", tmp_path / "r.csv", "--j2s", j2s)
 
 
 def closing_line(path: Path) -> dict:
@@ -141,7 +141,7 @@ def test_j2s_auto_is_estimated_and_told_live_and_over_the_recording(linkpose, re
 
 
 def test_a_j2s_that_is_known_to_millimetres_is_refined(linkpose, refused, tmp_path):
-    """A ruler's error of 5 mm goes into the height, unless --j2s-std says that it may be there."""
+    """A ruler's error of 5 mm goes into the height, unless --j2s-std allows for it."""
     recording, truth, out = tmp_path / "r.csv", tmp_path / "truth.csv", tmp_path / "e.csv"
     link = ["link", "--j2s", "0.0,-0.05,0.6", "--duration", 30]
     linkpose("simulate", *link, "-o", recording, "--truth", truth)
@@ -257,8 +257,8 @@ def test_the_boards_settings_are_put_in_force_and_recorded(linkpose, refused, tm
     assert table.columns["accel_z_m_s2"][0] == pytest.approx(9.8, abs=0.5)
     done = linkpose("estimate", "--live", "--port", SIM, "--duration", 1, "--rate", 50, "-o", tmp_path / "e.csv")
     assert done.status == 0 and len(read_table(tmp_path / "e.csv")) == 50
-    said = refused("record", "--port", SIM, "--rate", 77)
-    assert "not a rate of the board" in said and "50, 64, 80, 100, 125" in said
+    output = refused("record", "--port", SIM, "--rate", 77)
+    assert "not a rate of the board" in output and "50, 64, 80, 100, 125" in output
     assert "--live" in refused("estimate", out, "--rate", 50)
 
 

@@ -189,8 +189,8 @@ def test_code_of_other_arguments_is_not_taken(tmp_path):
     floats.write_bytes(integers.read_bytes())
     integers.write_bytes(kept)
     for hits in (0, 2):
-        said = run(code, HOST, NUMBA_CACHE_DIR=tmp_path)
-        assert said.startswith("7.0 6 Counter(") and said.count(": 1") == hits
+        output = run(code, HOST, NUMBA_CACHE_DIR=tmp_path)
+        assert output.startswith("7.0 6 Counter(") and output.count(": 1") == hits
 
 
 def test_a_full_disk_costs_no_more_than_the_compiling(tmp_path):

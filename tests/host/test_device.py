@@ -18,7 +18,7 @@ from serial.tools import list_ports_common
 from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
-from linkpose.errors import CannotWrite
+from linkpose.errors import BoardError, CannotWrite
 from linkpose.recorder import Recorder
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
@@ -37,7 +37,7 @@ def impatient(monkeypatch):
 
 
 def stranger(path: Path, chatter: bytes) -> PtyBoard:
-    """A port at which no board answers; what is said there is said again and again."""
+    """A port at which no board answers; `chatter` is sent again and again."""
     return PtyBoard(path, spoil=lambda data: b"", chatter=chatter)
 
 
@@ -61,25 +61,26 @@ def framed(payload: bytes) -> bytes:
         (random.Random(3).randbytes(60), "only noise was received"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
         (encode(Nak(Command.GET_INFO, NakReason.UNKNOWN_COMMAND)), "the board refuses every command"),
+        (framed(b"\x01\x02" + bytes(100)), "a frame of type 0x01 with 101 bytes arrived intact"),
         (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
         (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
-    ids=["silence", "text", "noise", "wrong baud", "refusals", "older board", "newer board"],
+    ids=["silence", "text", "noise", "wrong baud", "refusals", "five mice", "older board", "newer board"],
 )
 @pytest.mark.parametrize("command", ["record", "info", "estimate --live"])
 def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, sentence, command):
     out = [tmp_path / "r.csv"] if command == "record" else []
     with stranger(tmp_path / "port", chatter):
-        said = refused(*command.split(), "--port", tmp_path / "port", *out)
-    assert sentence in said
+        output = refused(*command.split(), "--port", tmp_path / "port", *out)
+    assert sentence in output
     assert not (tmp_path / "r.csv").exists()
 
 
 def test_a_raw_capture_of_another_protocol_is_named(refused, tmp_path):
     capture = tmp_path / "old.bin"
     capture.write_bytes(b"\0" + framed(bytes([1, 1, 4]) + OLD_HELLO[3:]) + framed(bytes([2]) + bytes(30)))
-    said = refused("estimate", capture, "-o", tmp_path / "e.csv")
-    assert "protocol 1.4" in said
+    output = refused("estimate", capture, "-o", tmp_path / "e.csv")
+    assert "protocol 1.4" in output
     assert not (tmp_path / "e.csv").exists()
 
 
@@ -134,14 +135,14 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
-    said: list[str] = []
+    messages: list[str] = []
     waiting = list(happenings)
-    with Session(str(port), said.append) as session, Recorder(session, out, Rig(), False) as recorder:
+    with Session(str(port), messages.append) as session, Recorder(session, out, Rig(), False) as recorder:
         behind = None
         for placements in session.stream():
             recorder.convert(placements)
             timeline = session.timeline
-            if waiting and waiting[0][0](said, timeline.samples):
+            if waiting and waiting[0][0](messages, timeline.samples):
                 waiting.pop(0)[1]()
             if behind is None and timeline.gaps and not waiting:
                 behind = timeline.samples
@@ -149,7 +150,7 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
                 break
         recorder.close("interrupted")
     assert not waiting
-    return said, session
+    return messages, session
 
 
 def samples(count: int):
@@ -159,7 +160,7 @@ def samples(count: int):
 
 def said_that(words: str):
     """The condition that a message contains these words."""
-    return lambda said, _number: any(words in line for line in said)
+    return lambda messages, _number: any(words in line for line in messages)
 
 
 def check_one_gap(out: Path, cause: str) -> None:
@@ -180,10 +181,10 @@ def check_one_gap(out: Path, cause: str) -> None:
 
 def test_a_pulled_cable_is_waited_for_and_the_gap_is_marked(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        said, session = record_through(
+        messages, session = record_through(
             tmp_path / "port", tmp_path / "r.csv", (samples(50), board.pull), (said_that("disappeared"), board.plug)
         )
-    assert "disappeared" in said[0] and "is back" in said[1]
+    assert "disappeared" in messages[0] and "is back" in messages[1]
     assert len(session.health().gaps) == 1
     check_one_gap(tmp_path / "r.csv", "cable")
 
@@ -210,14 +211,14 @@ def test_a_board_that_returns_under_another_name_is_found(tmp_path, monkeypatch,
     usb = UsbPorts(monkeypatch)
     with PtyBoard(tmp_path / "ttyACM0") as board:
         usb.boards.append((board, number))
-        said, session = record_through(
+        messages, session = record_through(
             tmp_path / "ttyACM0",
             tmp_path / "r.csv",
             (samples(20), board.pull),
             (said_that("disappeared"), lambda: board.plug(tmp_path / "ttyACM1")),
             after=20,
         )
-    assert f"the board is back at {tmp_path / 'ttyACM1'}" in said[1]
+    assert f"the board is back at {tmp_path / 'ttyACM1'}" in messages[1]
     assert session.port == str(tmp_path / "ttyACM1")
     check_one_gap(tmp_path / "r.csv", "cable")
 
@@ -232,15 +233,15 @@ def test_another_board_at_the_old_name_is_not_opened(tmp_path, monkeypatch):
             other.plug(tmp_path / "ttyACM0")
             board.plug(tmp_path / "ttyACM1")
 
-        said, session = record_through(
+        messages, session = record_through(
             tmp_path / "ttyACM0",
             tmp_path / "r.csv",
             (samples(20), board.pull),
             (said_that("disappeared"), swap),
             after=20,
         )
-        assert not other.heard.is_set()
-    assert session.port == str(tmp_path / "ttyACM1"), said
+        assert not other.received.is_set()
+    assert session.port == str(tmp_path / "ttyACM1"), messages
 
 
 def test_an_obstacle_at_the_port_is_reported_once(tmp_path, monkeypatch):
@@ -252,7 +253,7 @@ def test_an_obstacle_at_the_port_is_reported_once(tmp_path, monkeypatch):
 
     monkeypatch.setattr(ports, "holder", busy)
     with PtyBoard(tmp_path / "port") as board:
-        said, _ = record_through(
+        messages, _ = record_through(
             tmp_path / "port",
             tmp_path / "r.csv",
             (samples(20), board.pull),
@@ -260,7 +261,7 @@ def test_an_obstacle_at_the_port_is_reported_once(tmp_path, monkeypatch):
             after=20,
         )
     assert len(attempts) == 6
-    assert sum("is in use by modem-manager (process 7). Close it" in line for line in said) == 1
+    assert sum("is in use by modem-manager (process 7). Close it" in line for line in messages) == 1
 
 
 def test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts(tmp_path, linkpose):
@@ -281,41 +282,41 @@ def test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing
 
 def test_a_reset_board_goes_on_with_the_settings_of_before(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", (samples(40), board.reset))
-    assert "was reset (power on)" in said[0]
+        messages, _ = record_through(tmp_path / "port", tmp_path / "r.csv", (samples(40), board.reset))
+    assert "was reset (power on)" in messages[0]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
 def test_a_reset_whose_hello_is_lost_is_noticed(tmp_path):
     with PtyBoard(tmp_path / "port") as board:
         reset = (samples(30), lambda: board.reset(says_hello=False))
-        said, _ = record_through(tmp_path / "port", tmp_path / "r.csv", reset)
-    assert "no sample for 1.5 s" in said[0] and "was reset" in said[1]
+        messages, _ = record_through(tmp_path / "port", tmp_path / "r.csv", reset)
+    assert "no sample for 1.5 s" in messages[0] and "was reset" in messages[1]
     check_one_gap(tmp_path / "r.csv", "reset")
 
 
 def test_a_suspended_program_does_not_report_a_silent_board(tmp_path):
     """After SIGSTOP the clock has run on, but nothing was waited for."""
-    said: list[str] = []
+    messages: list[str] = []
     ahead_s = 0.0
     clock = types.SimpleNamespace(perf_counter=lambda: time.perf_counter() + ahead_s, sleep=time.sleep)
     port = tmp_path / "port"
-    with PtyBoard(port), Session(str(port), said.append) as session, pytest.MonkeyPatch.context() as patch:
+    with PtyBoard(port), Session(str(port), messages.append) as session, pytest.MonkeyPatch.context() as patch:
         patch.setattr(session_module, "time", clock)
         for _ in session.stream():
             ahead_s += 10.0
             if session.timeline.samples > 40:
                 break
-    assert not said
+    assert not messages
 
 
 def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
     with stranger(tmp_path / "port", b"") as board:
-        pull = threading.Thread(target=lambda: (board.heard.wait(), board.pull()))
+        pull = threading.Thread(target=lambda: (board.received.wait(), board.pull()))
         pull.start()
-        said = refused("info", "--port", tmp_path / "port")
+        output = refused("info", "--port", tmp_path / "port")
         pull.join()
-    assert "is gone" in said and "check the cable" in said
+    assert "is gone" in output and "check the cable" in output
 
 
 def test_a_board_that_returns_silent_is_waited_for_to_the_end(impatient, monkeypatch, tmp_path, linkpose):
@@ -435,19 +436,19 @@ class SpoiledSamples:
 
 def lines_of(port: Path, words: str, most: int = 400) -> list[str]:
     """Messages of a session up to the first with these words."""
-    said: list[str] = []
-    with Session(str(port), said.append) as session:
+    messages: list[str] = []
+    with Session(str(port), messages.append) as session:
         for _ in session.stream():
-            if any(words in line for line in said) or session.timeline.samples > most:
+            if any(words in line for line in messages) or session.timeline.samples > most:
                 break
-    return said
+    return messages
 
 
 def test_a_stream_that_turns_to_noise_is_reported(tmp_path):
     noise = random.Random(1).randbytes(30)
     with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, lambda message, count: noise)):
-        said = lines_of(tmp_path / "port", "noise")
-    assert re.fullmatch(r"no sample for 1.5 s, only \d+ bytes of noise; asking the board", said[0])
+        messages = lines_of(tmp_path / "port", "noise")
+    assert re.fullmatch(r"no sample for 1.5 s, only \d+ bytes of noise; asking the board", messages[0])
 
 
 @pytest.mark.parametrize(
@@ -460,8 +461,8 @@ def test_a_stream_that_turns_to_noise_is_reported(tmp_path):
 )
 def test_a_board_clock_that_stands_still_or_jumps_is_reported_once(tmp_path, change, words):
     with PtyBoard(tmp_path / "port", spoil=SpoiledSamples(20, change)):
-        said = lines_of(tmp_path / "port", words)
-    assert sum(words in line for line in said) == 1
+        messages = lines_of(tmp_path / "port", words)
+    assert sum(words in line for line in messages) == 1
 
 
 def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
@@ -481,6 +482,13 @@ def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
             if session.timeline.samples > 10 and not changed.is_set():
                 changed.set()
                 board.reset(says_hello=False)
+
+
+def test_a_board_that_starts_and_sends_no_sample_is_a_failure(tmp_path):
+    board = PtyBoard(tmp_path / "port", spoil=SpoiledSamples(0, lambda message, count: b""))
+    refusal = pytest.raises(BoardError, match="accepted START, but no sample arrived")
+    with board, Session(str(tmp_path / "port"), print) as session, refusal:
+        assert not any(session.stream(0.1))
 
 
 def test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+from linkpose.cli.cures import sentence
 from linkpose.cli.evaluate import command
 from linkpose.cli.plot import command as plot
 from linkpose.errors import LinkposeError
@@ -48,7 +49,7 @@ def rmse(score):
 
 
 def complaints(*paths):
-    """What is said on stderr."""
+    """The messages on stderr."""
     return CliRunner().invoke(command, [*paths, "--json"], catch_exceptions=False).stderr
 
 
@@ -195,7 +196,7 @@ def test_the_table_for_people(tmp_path, reference):
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "says"),
+    ("ours", "theirs", "sentence"),
     [
         ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,temperature\n0,1\n", "is no reference"),
         ("time_s,joint_height_m\n0,1\n1,2\n", "time_s,roll_deg\n0,1\n1,2\n", "no filter in"),
@@ -208,12 +209,26 @@ def test_the_table_for_people(tmp_path, reference):
         ("# linkpose recording 1\n# {}\ntime_s,seq\n0,1\n1,2\n", "time_s,height_m\n0,1\n", "linkpose estimate"),
     ],
 )
-def test_files_that_do_not_fit_are_refused_by_name(tmp_path, ours, theirs, says):
+def test_files_that_do_not_fit_are_refused_by_name(tmp_path, ours, theirs, sentence):
     (tmp_path / "ours.csv").write_text(ours)
     (tmp_path / "theirs.csv").write_text(theirs)
-    with pytest.raises(LinkposeError, match=says) as error:
+    with pytest.raises(LinkposeError, match=sentence) as error:
         scores(str(tmp_path / "ours.csv"), str(tmp_path / "theirs.csv"))
     assert str(tmp_path) in str(error.value)
+
+
+def test_a_filter_without_an_estimate_is_named(tmp_path):
+    """J2S of a link that turns about one axis: the filter has no height, and its columns are empty."""
+    ours, theirs = tmp_path / "ours.csv", tmp_path / "theirs.csv"
+    heights = [(0.1 * at, 1 + 0.1 * np.sin(0.3 * at)) for at in range(60)]
+    theirs.write_text("time_s,height_m\n" + "".join(f"{t:.1f},{height:.4f}\n" for t, height in heights))
+    ours.write_text("time_s,joint_height_m,tilt_height_m\n" + "".join(f"{t:.1f},,\n" for t, _ in heights))
+    shown = CliRunner().invoke(command, [str(ours), str(theirs)])
+    assert "joint estimated no height" in str(shown.exception) and "--j2s auto" in sentence(shown.exception)
+    rows = "".join(f"{t:.1f},,{height:.4f}\n" for t, height in heights)
+    ours.write_text("time_s,joint_height_m,tilt_height_m\n" + rows)
+    shown = CliRunner().invoke(command, [str(ours), str(theirs)])
+    assert shown.exit_code == 0 and "joint estimated no height" in shown.stderr and "tilt" in shown.stdout
 
 
 # ---- OptiTrack Motive ----
@@ -315,8 +330,8 @@ def test_motive_exports_in_another_frame_are_doubted(tmp_path):
     assert complaints(path, take) == ""
     result = CliRunner().invoke(command, [path, take, "--up", "z"], catch_exceptions=False)
     assert "try the other axis with --up" in result.stderr
-    said = complaints(path, edited(take, with_markers_swapped))
-    assert "widest angle is at marker 2" in said and "check the order of the markers" in said
+    output = complaints(path, edited(take, with_markers_swapped))
+    assert "widest angle is at marker 2" in output and "check the order of the markers" in output
 
 
 def swinging(angle_x, angle_y):

@@ -65,15 +65,19 @@ def _chain(joint: str, seed: int = 0) -> tuple[lp.Measurements, np.ndarray, np.n
     return measured, relative[1:-1], np.degrees(angle[1:-1] - angle[1])
 
 
-def _error_deg(estimates: lp.Estimates, truth: np.ndarray) -> np.ndarray:
-    """Angle between the estimated and the true rotation; NaN where not known."""
-    w, x, y, z = (estimates[f"chain_q{axis}"] for axis in "wxyz")
+def _matrices(w: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Rotation matrices (N, 3, 3) of unit quaternions, each part (N,)."""
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    found = np.moveaxis(np.array(rows), 2, 0)
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _error_deg(estimates: lp.Estimates, truth: np.ndarray) -> np.ndarray:
+    """Angle between the estimated and the true rotation; NaN where not known."""
+    found = _matrices(*(estimates[f"chain_q{axis}"] for axis in "wxyz"))
     return np.degrees(np.arccos(np.clip((np.einsum("nij,nij->n", found, truth) - 1) / 2, -1, 1)))
 
 
@@ -86,6 +90,21 @@ def test_unknown_mounting_the_rotation_is_found_and_its_std_holds(joint: str) ->
     assert np.sqrt(np.mean(error**2)) < 1.0
     assert np.mean(error < 2 * std) > 0.9
     assert std.max() < 5.0  # and the heading has been found
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 7.0])  # at rest, and in fast motion
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_hinge_converges_from_any_start_and_its_std_covers_the_error_meanwhile(seed: int, begin_s: float) -> None:
+    run = ChainRun("hinge", seed, 30.0)
+    measured = run.measurements()
+    truth = run.truth_columns(measured.time_s)
+    rotation = _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz")))
+    use = measured.time_s >= begin_s
+    estimates = lp.estimate(measured[use], filters=["chain"], joint="hinge")
+    error, std = _error_deg(estimates, rotation[use]), estimates["chain_rotation_std_deg"]
+    known, late = np.isfinite(error), measured.time_s[use] > begin_s + 15
+    assert np.mean(error[known] < 2 * std[known]) > 0.9
+    assert np.sqrt(np.mean(error[late] ** 2)) < 0.4
 
 
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
@@ -115,6 +134,33 @@ def test_at_rest_the_heading_is_not_reported() -> None:
     estimates = lp.estimate(measured, filters=["chain"])
     assert np.isnan(estimates["chain_qw"]).all()
     assert estimates["chain_rotation_std_deg"].min() > 57
+
+
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_at_rest_from_the_start_only_what_rest_shows_is_reported(joint: str) -> None:
+    run, rng = ChainRun(joint, 0, 4.0), np.random.default_rng(0)
+    measured, at = run.measurements(), rng.integers(0, 40, 1000)  # of 0.4 s without motion
+    rest = lp.Measurements.from_imu(
+        np.arange(1000) / 100, measured.accel_m_s2[at], measured.gyro_rad_s[at],
+        accel2_m_s2=measured.accel2_m_s2[at], gyro2_rad_s=measured.gyro2_rad_s[at],
+    )  # fmt: skip
+    unknown = lp.estimate(rest, filters=["chain"], rig=run.rig)
+    known = {name for name in unknown.columns if np.isfinite(unknown[name]).any()}
+    # J2S and tilt give the height of sensor 1; σ of the rotation states that it is unknown.
+    assert known == {"time_s", "chain_rotation_std_deg", "chain_height1_m", "chain_height1_std_m"}
+    given = lp.estimate(rest, filters=["chain"], rig=run.calibrated_rig)
+    assert np.abs(given["chain_height2_m"] - run.truth_columns(np.zeros(1))["height2_m"]).max() < 0.01
+
+
+def test_a_second_sensor_that_is_frozen_at_rest_gives_nothing() -> None:
+    measured = _chain("hinge")[0][:1500]
+    held = (np.broadcast_to(of[0], of.shape) for of in (measured.accel2_m_s2, 0.0 * measured.gyro2_rad_s))
+    accel2, gyro2 = held
+    frozen = lp.Measurements.from_imu(
+        measured.time_s, measured.accel_m_s2, measured.gyro_rad_s, accel2_m_s2=accel2, gyro2_rad_s=gyro2
+    )
+    found = ChainFilter(Rig(chain=Chain("hinge"))).process(frozen)
+    assert np.isnan(found[measured.time_s > 2.1]).all()
 
 
 def test_a_long_gap_blanks_and_keeps_the_mounting() -> None:

@@ -192,7 +192,7 @@ def test_an_overflowed_count_is_not_used():
 def test_counts_that_come_late_from_a_mouse_that_had_to_repeat_a_packet_harm_nothing(missing):
     run, block = recorded(1)
     counts, late = block.mice_counts, block.mice_counts.copy()
-    for k in range(1500, 2000, 100):  # said again at the next sample; what moved meanwhile comes with the one after
+    for k in range(1500, 2000, 100):  # repeated at the next sample; what moved meanwhile comes with the one after
         late[k, 1] = missing
         if missing == 0.0:
             late[k + 1, 1], late[k + 2, 1] = counts[k, 1], counts[k + 1, 1] + counts[k + 2, 1]
@@ -225,8 +225,8 @@ def test_between_two_readings_the_velocity_stands_and_the_pose_goes_on(ticks):
     out = MiceFilter(Rig(mouse=mice)).process(block)[ticks:]
     np.testing.assert_allclose(out[:, VELOCITY], np.tile([0.5, 0.0, 0.0], (len(out), 1)), atol=1e-9)
     np.testing.assert_allclose(out[:, POSE][:, 0], 0.5 * block.time_s[ticks:], atol=1e-9)
-    doubt = out[:, STD][: len(out) // ticks * ticks].reshape(-1, ticks, 3)
-    assert (np.diff(doubt, axis=1) > 0).all()
+    std = out[:, STD][: len(out) // ticks * ticks].reshape(-1, ticks, 3)
+    assert (np.diff(std, axis=1) > 0).all()
     assert (out[:, EXCLUDED] == 0).all()
 
 

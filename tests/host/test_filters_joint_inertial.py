@@ -62,7 +62,7 @@ def test_j2s_is_found_from_nothing():
 @pytest.mark.parametrize("test", [1, 2, 3])
 @pytest.mark.parametrize("errors", ["calibrated", "datasheet"])
 def test_its_standard_deviation_is_true(test, errors):
-    """Normalised estimation error squared of the height, mean over the runs; nobody says which sensors these are.
+    """Normalised estimation error squared of the height, mean over the runs; the filter is given no sensor errors.
 
     The simulated calibrated gyro has no error of its scale, for which σ allows.
     """
@@ -158,7 +158,7 @@ def test_the_heading_since_the_start_and_its_standard_deviation(errors, most_deg
 
 
 def test_scale_and_alignment_of_the_sensors_are_found():
-    """Errors of 3 % that the filter is not told of cost no more than a third of what it would be off by them."""
+    """Errors of 3 % that no option declares cost no more than a third of what it would be off by them."""
     run = LinkRun(3, 0, errors="datasheet")
     f = JointInertialFilter(run.rig)
     f.process(run.measurements())
@@ -321,7 +321,7 @@ def test_readings_that_are_held_are_read_once(slot):
 
 
 def test_a_plane_motion_does_not_lean_the_link_out_of_its_plane():
-    """A pendulum whose gyro reads 2 % across its axis: nothing tells the accelerometer's bias along it."""
+    """A pendulum whose gyro reads 2 % across its axis: nothing shows the accelerometer's bias along it."""
     time_s = np.arange(0, 120, 0.01)
     angle, rate, slope = 0.6 * np.sin(6 * time_s), 3.6 * np.cos(6 * time_s), -21.6 * np.sin(6 * time_s)
     d = np.array([0.0, 0.0, -0.3])

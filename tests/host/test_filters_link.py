@@ -56,7 +56,7 @@ def test_static_tilt(name, roll, pitch):
     assert estimate[-1, 2:4] == pytest.approx([roll, pitch], abs=1e-6)
     assert estimate[-1, 0] == pytest.approx(tilt @ [0.2, -0.1, 1.0], abs=1e-9)
     assert estimate[-1, 1] > 0
-    if name in INERTIAL:  # with a bias that is unknown, the first second knows less than the first sample
+    if name in INERTIAL:  # with a bias that is unknown, the first second is less certain than the first sample
         assert estimate[-1, 1] < estimate[0, 1]
 
 
@@ -73,7 +73,7 @@ def test_pure_rotation_at_a_constant_rate(name):
 
 
 def test_joint_sees_through_a_constant_centripetal_acceleration():
-    """Turning about the vertical at 3 rad/s, 1 m off: the accelerometer leans by 43°, the constraint knows why."""
+    """Turning about the vertical at 3 rad/s, 1 m off: the accelerometer leans by 43°, the constraint explains it."""
     t, rate = np.arange(3000) / 100, 3.0
     force = np.tile([-(rate**2), 0, STANDARD_GRAVITY], (3000, 1))
     block = measurements(t, force, np.tile([0, 0, rate], (3000, 1)))
@@ -384,7 +384,7 @@ def test_a_stamp_that_is_no_time_is_passed_by(name, stamp):
 @pytest.mark.parametrize("lost", ["accel_m_s2", "gyro_rad_s"])
 @pytest.mark.parametrize("name", ["joint-inertial", OURS])
 def test_half_a_sample_does_not_end_a_gap(name, lost, gap_s):
-    """After it one sensor is half a second late; the rate that comes does not tell where the sensor has turned to."""
+    """After it one sensor is half a second late; the next rate does not show how far the sensor has turned."""
     run, block = recorded(1, 0)
     values, time_s = getattr(block, lost).copy(), block.time_s.copy()
     values[3000:3050] = np.nan
@@ -424,7 +424,7 @@ def test_joint_at_other_rates(rate_hz):
     assert 100 * np.sqrt(np.mean((estimate[:, 0] - run.truth().height_m) ** 2)) < 1.5
 
 
-# ---- what cannot run says why ----
+# ---- what cannot run reports why ----
 
 
 def test_without_j2s_the_reason_and_the_cure_are_named():

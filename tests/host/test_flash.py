@@ -1,4 +1,4 @@
-"""`linkpose flash` up to the bootloader: which images it refuses, which port it takes, and what each failure says.
+"""`linkpose flash` up to the bootloader: which images it refuses, which port it takes, and each failure's sentence.
 
 The upload itself is tested with real bootloaders on the emulated board, in tests/virtual_uno/test_bootloader.py.
 """
@@ -120,9 +120,9 @@ def test_an_image_that_must_not_be_written_is_refused(
 ) -> None:
     path = tmp_path / "a.hex"
     path.write_text(text)
-    said = refused("flash", "--port", port, "--hex", path)
-    assert sentence in said
-    assert "nothing was written" in said
+    output = refused("flash", "--port", port, "--hex", path)
+    assert sentence in output
+    assert "nothing was written" in output
     assert not uploaded
 
 
@@ -141,8 +141,8 @@ def test_a_line_missing_from_the_firmware_is_noticed(
 
 
 def test_an_image_that_is_not_there(refused: Refused, tmp_path: Path, port: str) -> None:
-    said = refused("flash", "--port", port, "--hex", tmp_path / "none.hex")
-    assert "none.hex: No such file" in said
+    output = refused("flash", "--port", port, "--hex", tmp_path / "none.hex")
+    assert "none.hex: No such file" in output
 
 
 def test_one_image_at_a_time(refused: Refused) -> None:
@@ -171,9 +171,9 @@ def test_the_board_must_be_the_only_one(
     refused: Refused, monkeypatch: pytest.MonkeyPatch, found: list[object], sentence: str
 ) -> None:
     monkeypatch.setattr(ports.list_ports, "comports", lambda: found)
-    said = refused("flash", "--prebuilt")
-    assert sentence in said
-    assert "sim://" not in said
+    output = refused("flash", "--prebuilt")
+    assert sentence in output
+    assert "sim://" not in output
 
 
 def test_a_port_that_cannot_be_opened_is_said_before_anything_is_built(

@@ -41,8 +41,8 @@ class OtherFirmware:
     def begun(self) -> bool:
         return self._begun.is_set()
 
-    def __call__(self, said: bytes) -> bytes:
-        return said.replace(OURS, self._hello) if self._begun.is_set() else said
+    def __call__(self, sent: bytes) -> bytes:
+        return sent.replace(OURS, self._hello) if self._begun.is_set() else sent
 
 
 def arguments(command: str, port: Path, out: Path) -> list[str]:
@@ -65,9 +65,9 @@ def test_another_schema_at_the_start(
     firmware = OtherFirmware(schema_crc=1, **release)
     firmware.begin()
     with PtyBoard(tmp_path / "port", spoil=firmware):
-        said = refused(*arguments(command, tmp_path / "port", tmp_path / "out.csv"))
-    assert named in said
-    assert f"type `{cure}`" in said
+        output = refused(*arguments(command, tmp_path / "port", tmp_path / "out.csv"))
+    assert named in output
+    assert f"type `{cure}`" in output
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -84,10 +84,10 @@ def test_another_minor_version_is_told_and_goes_on(
     firmware.begin()
     with PtyBoard(tmp_path / "port", spoil=firmware):
         command = arguments("record {out} --duration 0.1", tmp_path / "port", tmp_path / "out.csv")
-        status, _, said = linkpose(*command)
+        status, _, output = linkpose(*command)
     assert status == 0
-    assert f"the board uses protocol 2.{minor}, this linkpose 2.5" in said
-    assert f"the {older} should be updated" in said
+    assert f"the board uses protocol 2.{minor}, this linkpose 2.5" in output
+    assert f"the {older} should be updated" in output
 
 
 def pull_and_plug(board: PtyBoard) -> None:

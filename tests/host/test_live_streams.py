@@ -25,11 +25,11 @@ ROW = {"time_s": 0.25, "tilt_height_m": 1.5, "tilt_height_std_m": 0.125, "tilt_r
 
 @pytest.fixture
 def receiver():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
-        listening.bind(("127.0.0.1", 0))
-        listening.settimeout(20)
-        yield listening
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 21)
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(20)
+        yield receiver
 
 
 def test_every_live_estimate_arrives_with_its_sigma(receiver):
@@ -117,9 +117,9 @@ class FoxgloveClient:
 
 
 def free_port() -> int:
-    with socket.socket() as listening:
-        listening.bind(("127.0.0.1", 0))
-        return int(listening.getsockname()[1])
+    with socket.socket() as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        return int(receiver.getsockname()[1])
 
 
 def test_foxglove_receives_values_with_their_time():

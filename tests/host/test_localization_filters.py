@@ -294,7 +294,7 @@ def test_transform_that_cannot_work_is_refused(transform):
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_consistency_and_outliers_underwater(name):
-    """Every outlier is found, few good ranges are refused, and the errors are as large as the filter says they are."""
+    """Every outlier is found, few good ranges are refused, and the errors are as large as the filter's σ states."""
     nees, found, injected, refused, good = [], 0, 0, 0, 0
     for seed in range(3):
         errors = UnderwaterErrors(correlation_m=0.0, outliers=20)

@@ -237,6 +237,7 @@ PRODUCERS: list[Producer] = [
     # evaluation
     scored(rows(ESTIMATE), rows("time_s,height_m,roll_deg,pitch_deg", 3.0)),
     scored("time_s,tilt_height_m\n0,1\n1,1\n", "time_s,height_m\n5,1\n6,1\n"),
+    scored("time_s,joint_height_m\n0,\n1,\n", "time_s,height_m\n0,1\n1,1\n"),
     scored(f"# linkpose recording 1\n# {{}}\n{IMU}\n0,{ROW}\n", rows("time_s,height_m")),
     scored(rows("time_s,length_m"), rows("time_s,height_m")),
     scored(rows(ESTIMATE), rows("time_s,length_m")),

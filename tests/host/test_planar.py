@@ -1,4 +1,4 @@
-"""planar-ekf and planar-ukf: the robot's pose from mice and gyro, honest about its doubt, live as replayed."""
+"""planar-ekf and planar-ukf: the robot's pose from mice and gyro, with a true σ, live as replayed."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_missing_values_only_widen_the_doubt(name):
     counts[1000:1050] = math.nan
     filter_ = filters.create(name, run.rig)
     out = filter_.process(replace(block, mice_counts=counts))
-    assert np.isfinite(out).all() and filter_.rejected == 51  # the first counts after it cover who knows what
+    assert np.isfinite(out).all() and filter_.rejected == 51  # the first counts after it cover an unknown motion
     assert (np.diff(out[1001:1049, 9:11], axis=0) > 0).all() and (out[1100, 9:11] < out[1049, 9:11]).all()
 
 
@@ -184,7 +184,7 @@ def test_mice_that_agree_against_the_gyro_are_all_distrusted(kind):
 @BOTH
 @pytest.mark.parametrize("seed", [3, 5])
 def test_a_lift_on_a_straight_widens_the_stated_position(name, seed):
-    """All mice stop at once while gyro and motion go straight on: nothing shows the way, and the ± must say so."""
+    """All mice stop at once while gyro and motion go straight on: nothing shows the way, and the ± must grow."""
     run = MiceRun(seed, 40.0, 100.0)
     block = run.measurements()
     truth = np.column_stack(list(run.at(block.time_s).columns().values())[1:])

@@ -179,7 +179,22 @@ def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
     assert drawn(figure.axes[1])[0] == "chain 1 ° rms"
 
 
-def test_a_ball_joint_is_drawn_as_a_rotation_vector(tmp_path):
+def test_a_ball_joint_has_a_panel_for_each_angle_with_its_truth(tmp_path):
+    t = np.arange(300) / 100
+    names = ("flexion", "abduction", "axial_rotation")
+    truth = {"time_s": t, **{f"{name}_deg": 20 * np.sin(t + k) for k, name in enumerate(names)}}
+    estimate = {"time_s": t}
+    for name in names:
+        estimate |= {f"chain_{name}_deg": truth[f"{name}_deg"] + 1, f"chain_{name}_std_deg": np.ones(300)}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", truth, "truth"))
+    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["flexion (°)", "abduction (°)", "axial rotation (°)"]
+    for axes, name in zip(figure.axes, names, strict=True):
+        assert np.allclose(axes.lines[1].get_ydata(), truth[f"{name}_deg"])
+    assert all(len(axes.collections) == 1 for axes in figure.axes)  # ±2σ
+
+
+def test_rotations_without_angles_are_drawn_as_rotation_vectors(tmp_path):
     t = np.arange(300) / 100
     half = np.radians(20 * np.sin(t)) / 2
     columns = {"time_s": t, "chain_qw": -np.cos(half), "chain_qx": 0 * t, "chain_qy": 0 * t, "chain_qz": -np.sin(half)}

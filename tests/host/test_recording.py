@@ -234,9 +234,9 @@ BAD_FILES = {
 @pytest.mark.parametrize("name", BAD_FILES)
 def test_bad_files_are_named_with_line_and_cure(name, recording, refused):
     change, sentence = BAD_FILES[name]
-    said = refused("estimate", edited(recording, change))
-    assert sentence in said
-    assert str(recording) in said
+    output = refused("estimate", edited(recording, change))
+    assert sentence in output
+    assert str(recording) in output
 
 
 def test_absent_and_unreadable_files(refused, tmp_path):
@@ -267,7 +267,7 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
 
 
 @pytest.mark.parametrize(
-    ("first", "last", "factor", "says"),
+    ("first", "last", "factor", "sentence"),
     [
         ("accel_x_m_s2", "accel_z_m_s2", 1 / 9.80665, "is it in g? multiply it by 9.80665"),
         ("accel_x_m_s2", "accel_z_m_s2", 1000 / 9.80665, "thousandths of g? multiply it by 0.00980665"),
@@ -278,7 +278,7 @@ def test_a_recording_cut_anywhere_gives_its_whole_rows(tmp_path_factory, cut):
         ("pressure_Pa", "pressure_Pa", 0.001, "is it in kPa? multiply it by 1000"),
     ],
 )
-def test_values_in_another_unit_are_noticed(recording, first, last, factor, says):
+def test_values_in_another_unit_are_noticed(recording, first, last, factor, sentence):
     def scaled(lines):
         names = lines[2].strip().split(",")
         scale = np.ones(len(names))
@@ -288,7 +288,7 @@ def test_values_in_another_unit_are_noticed(recording, first, last, factor, says
 
     assert load_recording(recording).remarks == []
     (remark,) = load_recording(edited(recording, scaled)).remarks
-    assert says in remark and str(recording) in remark
+    assert sentence in remark and str(recording) in remark
 
 
 @pytest.mark.parametrize(

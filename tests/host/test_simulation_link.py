@@ -133,7 +133,7 @@ def test_data_sheets_example_turned_round():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "sentence"),
     [
         ({"test": 4}, "Test 4"),
         ({"duration_s": 0.5}, "0.5 s"),
@@ -143,8 +143,8 @@ def test_data_sheets_example_turned_round():
         ({"seed": -1}, "seed"),
     ],
 )
-def test_what_cannot_be_is_refused(arguments, says):
-    with pytest.raises(LinkposeError, match=says):
+def test_what_cannot_be_is_refused(arguments, sentence):
+    with pytest.raises(LinkposeError, match=sentence):
         LinkRun(**arguments)
 
 

@@ -28,7 +28,7 @@ ATMEGABOOT = BootloaderImage(_FOLDER / "atmega" / "ATmegaBOOT_168_atmega328.hex"
 _RESET_HANDLING = "MCUSR = 0;\n  if (!(ch & _BV(EXTRF))) appStart();"  # of Optiboot 4.4
 _TO_R2 = 'asm volatile ("mov r2, %0" :: "r" (ch));'
 OPTIBOOT_RESETS = {
-    # Optiboot 4.4: the firmware starts after any reset but that of the pin, and cannot tell why.
+    # Optiboot 4.4: the firmware starts after any reset but that of the pin, and does not have its cause.
     "4.4": _RESET_HANDLING,
     # Optiboot 4.6 to 6.2: the same, and r2 holds what MCUSR was.
     "6.2": f"MCUSR = 0; {_TO_R2}\n  if (ch & (_BV(WDRF) | _BV(BORF) | _BV(PORF))) appStart();",

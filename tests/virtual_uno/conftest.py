@@ -35,7 +35,7 @@ def firmware_hex() -> Path:
         "PLATFORMIO_NO_ANSI": "true",
     }
     pio = str(Path(sys.executable).with_name("pio"))
-    with (HERE / "conftest.py").open() as lock:  # several test processes may want it at once
+    with (HERE / "conftest.py").open() as lock:  # several test processes may need it at once
         fcntl.flock(lock, fcntl.LOCK_EX)
         for command in ([sys.executable, "firmware/platform/make_core.py"], [pio, "run", "-s", "-e", "uno_distro"]):
             built = subprocess.run(command, cwd=ROOT, env={**settings, **os.environ}, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""The firmware's figures, measured on the emulated board from pins, bus and line, not from what it says of itself.
+"""The firmware's figures, measured on the emulated board from pins, bus and line, not from what it reports of itself.
 
     python tests/virtual_uno/figures.py [--hex FILE] [--minutes 10] [--json]
 

@@ -254,7 +254,7 @@ void probe_transmitter() {
   print("usart_empty_interrupts", buffer_empties);
 }
 
-// Asks for bytes with '?', lets them pile up, and tells what it finds.
+// Asks for bytes with '?', lets them pile up, and reports what it finds.
 void probe_receiver() {
   put('?');
   _delay_ms(2);

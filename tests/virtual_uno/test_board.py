@@ -309,7 +309,7 @@ def test_imu_reads_begin_at_a_fixed_distance_from_the_tick(board: MakeBoard) -> 
 
 @pytest.mark.parametrize("oversampling", [0, 1])
 def test_barometer_converts_in_the_quiet_gap(board: MakeBoard, oversampling: int) -> None:
-    """No traffic during a conversion, nine pressures to a temperature, every one told once by baro_count."""
+    """No traffic during a conversion, nine pressures to a temperature, every one counted once by baro_count."""
     link = board(bmp180={"disturbancePa": 1000.0})
     link.uno.baro.feed([0], [[100_000.0, 25.0]])
     link.boot()
@@ -366,7 +366,7 @@ def test_highest_rate_without_mice(board: MakeBoard) -> None:
 
 
 def test_resources(board: MakeBoard) -> None:
-    """What the firmware says of its load and stack is what is seen from outside."""
+    """The load and stack that the firmware reports are those seen from outside."""
     link = board()
     link.start()
     link.run_ms(1000)

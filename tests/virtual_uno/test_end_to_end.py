@@ -97,9 +97,9 @@ def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, t
         while not (path.exists() and path.read_bytes().count(b"\n") > 100):
             assert process.poll() is None
         served.call(served.uno.reset)
-        said = process.communicate(timeout=30)[1]
+        output = process.communicate(timeout=30)[1]
     assert process.returncode == 0
-    assert "was reset (external)" in said
+    assert "was reset (external)" in output
     table = read_table(path, "recording")
     assert table.closing is not None
     assert [gap["cause"] for gap in table.closing["gaps"]] == ["reset"]
@@ -137,16 +137,16 @@ def test_the_angle_of_a_chain_from_two_sensors_on_one_board(board: Callable[...,
     feed = RigFeed(uno, run)
     path, estimate = tmp_path / "r.csv", tmp_path / "e.csv"
     with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
-        done = linkpose("record", path, "--port", server.link, "--duration", 16, "--json")
+        done = linkpose("record", path, "--port", server.link, "--duration", 11, "--json")
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
     assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
     done = linkpose("estimate", path, "-o", estimate, "--filter", "chain", "--joint", "hinge")
     assert done.returncode == 0, done.stderr
     found = read_table(estimate, "estimate").columns
-    late = found["time_s"] > 12  # from a start in motion, the heading takes about ten seconds
+    late = found["time_s"] > 7
     time_s, angle, std = (found[name][late] for name in ("time_s", "chain_angle_deg", "chain_angle_std_deg"))
     shifts = np.arange(0.0, 3.0, 0.01)  # the rig moved since the board's reset
     errors = [angle - run.truth_columns(time_s + shift)["angle_deg"] for shift in shifts]
     error = min((e - e.mean() for e in errors), key=rms)  # counted from the first sample, which may be in motion
-    assert rms(error) < 1.5 < 5.0 < np.ptp(angle) and (std < 3.0).all()
+    assert rms(error) < 1.0 < 5.0 < np.ptp(angle) and (std < 5.0).all()

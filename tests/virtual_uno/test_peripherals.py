@@ -42,7 +42,7 @@ def probed(probe_hex: Path) -> Iterator[Probed]:
         while "\nend 0\n" not in text and uno.time_s < 2:
             uno.run_ms(0.1)
             text += uno.take_received().decode()
-            if text.count("?") > asked:  # it waits for 2 ms with nothing to say
+            if text.count("?") > asked:  # it waits for 2 ms with nothing to send
                 asked += 1
                 # First four bytes, one more than the receiver holds; then one at a rate that is not the board's.
                 uno.set_line(baud=None if asked == 1 else 115200)

@@ -287,7 +287,7 @@ def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "sentence"),
     [
         (["--hex", "no.hex"], "no.hex"),
         (["--hex", __file__], "line 1 of the program is not Intel HEX"),
@@ -297,9 +297,11 @@ def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -
         (["--mice", "1", "--mouse", "2:clockHz=10000"], "names no mouse: the board has 1"),
     ],
 )
-def test_the_command_says_what_is_wrong(firmware_hex: Path, tmp_path: Path, arguments: list[str], says: str) -> None:
+def test_the_command_says_what_is_wrong(
+    firmware_hex: Path, tmp_path: Path, arguments: list[str], sentence: str
+) -> None:
     command = [sys.executable, str(SERVE), "--hex", str(firmware_hex), "--link", str(tmp_path / "port")]
     done = subprocess.run([*command, "--duration", "1", *arguments], capture_output=True, text=True)
     assert done.returncode == 1
-    assert says in done.stderr
+    assert sentence in done.stderr
     assert "Traceback" not in done.stderr

@@ -63,7 +63,7 @@ def test_mpu6050_holds_at_the_ends_of_its_range(asleep: MakeBoard) -> None:
 
 
 def test_mpu6050_samples_at_its_rate(asleep: MakeBoard) -> None:
-    """With SMPLRT_DIV 9 a new sample comes every 10 ms; the data-ready bit tells once of each."""
+    """With SMPLRT_DIV 9 a new sample comes every 10 ms; the data-ready bit is set once for each."""
     uno = asleep()
     time_s = np.arange(0, 1, 0.001)
     uno.imu.feed(time_s, np.column_stack([time_s, np.zeros((len(time_s), 6))]))
@@ -101,7 +101,7 @@ def test_mpu6050_sleeps_resets_and_loses_its_settings_with_its_power(asleep: Mak
 
 
 def test_mpu6050_self_test_response_fits_its_trim(asleep: MakeBoard) -> None:
-    """Register map 4.1: the response is within 14 % of what the trim codes say."""
+    """Register map 4.1: the response is within 14 % of the trim codes' value."""
     uno = asleep(mpu6050={"gyroTrim": [14, 15, 16], "accelTrim": [13, 14, 17], "selfTestError": 0.05})
     uno.imu.feed([0], [[0, 0, 1, 0, 0, 0, 25]])
     plain = np.array(burst(awake(uno, accel_config=0x10)))

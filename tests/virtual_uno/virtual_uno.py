@@ -25,7 +25,7 @@ EVENT = np.dtype([("cycle", "<f8"), ("kind", "U16"), ("value", "<i8")])
 
 
 class VirtualUnoError(Exception):
-    """The emulated board cannot run; one sentence that says what to type."""
+    """The emulated board cannot run; one sentence that states what to type."""
 
 
 class Faults(NamedTuple):
@@ -234,7 +234,7 @@ class VirtualUno:
         self._emulator.give_back()
 
     def request(self, op: str, **arguments: Any) -> dict[str, Any]:
-        """One operation of emulator/server.js. Raises VirtualUnoError with what the emulator said."""
+        """One operation of emulator/server.js. Raises VirtualUnoError with the emulator's message."""
         return self._emulator.request({"op": op, **arguments})
 
     # --- time ---

@@ -51,7 +51,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.rotations import of_matrices, rotation_vectors
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import Chain, Rig, Vector, to_vector
+from linkpose.sensors.rig import Rig, Vector, to_vector
 
 Kind = Literal["ball", "hinge"]
 
@@ -165,7 +165,8 @@ def with_calibration(rig: Rig, found: ChainCalibration) -> Rig:
     """The rig with the mounting; a kind that the motion does not show, and everything else, stay as they were."""
     kind = found.joint or rig.chain.joint
     (r1, r2), (std1, std2) = found.levers_m, map(_std_of, found.std_m)
-    chain = Chain(kind, to_vector(r1, 5), std1, to_vector(r2, 5), std2)
+    chain = replace(rig.chain, joint=kind, r1_m=to_vector(r1, 5), r1_std_m=std1, r2_m=to_vector(r2, 5), r2_std_m=std2)
+    chain = replace(chain, axis1=None, axis2=None)
     if kind == "hinge" and found.axes is not None:
         (axis1, axis2), (std1_deg, std2_deg) = found.axes, np.round(found.motion.std_deg, 3).tolist()
         chain = replace(chain, axis1=to_vector(axis1, 5), axis1_std_deg=std1_deg)

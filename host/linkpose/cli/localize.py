@@ -12,6 +12,7 @@ import click
 
 from linkpose.cli import options
 from linkpose.cli.live import Console, ending_well
+from linkpose.cli.page import PageOptions
 from linkpose.errors import LinkposeError
 from linkpose.presentation import counted
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from linkpose.localization.settings import Settings
     from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
-    from linkpose.plotting import Scene
+    from linkpose.recording.table import Table
 
 # The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
 # value for streams, laser scans, and logs of fewer than 100 measurements.
@@ -244,8 +245,10 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
+@options.page
 @options.force
 @options.as_json
+@options.quiet
 def command(
     log: Path,
     map_path: Path | None,
@@ -255,16 +258,23 @@ def command(
     output: Path | None,
     picture: Path | None,
     truth_path: Path | None,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     force: bool,
     json_lines: bool,
+    quiet: bool,
     **settings: Any,
 ) -> None:
     """Estimate a robot's path from a LOG of odometry and measurements, and a map or beacons.
 
     LOG is a CARMEN log (ODOM, FLASER, ROBOTLASER1) or a CSV with one measurement a row: time_s,kind,a,b,c, where kind
     is odometry, range, bearing_range, depth, velocity, attitude or pose. With `-`, rows of the CSV are read from
-    standard input, and poses are written to standard output as they come.
+    standard input, and poses are written to standard output as they come. With --view, the path is then played in the
+    browser until Ctrl-C.
     """
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
     from linkpose.localization.localizer import check, localize, most_at_once
@@ -273,17 +283,12 @@ def command(
     from linkpose.localization.plausibility import check_units
     from linkpose.localization.tables import read_beacons, read_truth, score_track
 
+    console = Console(quiet, verbose=False)
     if str(log) == "-":
-        named: dict[str, object] = {
-            "--map": map_path,
-            "--odometry": odometry_path,
-            "--plot": picture,
-            "--truth": truth_path,
-        }
-        named |= {"--json": json_lines or None, "-o": output if str(output) != "-" else None}
-        if unused := [option for option, value in named.items() if value is not None]:
-            raise click.UsageError(f"a stream from standard input does not use {', '.join(unused)}; leave it out")
-        _stream(settings, filters, read_beacons(beacons_path) if beacons_path else {})
+        given: dict[str, object] = {"--map": map_path, "--odometry": odometry_path, "--plot": picture}
+        given |= {"--truth": truth_path, "--json": json_lines or None, "--view": has_page or None}
+        _refuse_in_stream(given | {"-o": None if str(output) == "-" else output})
+        _stream(settings, filters, read_beacons(beacons_path) if beacons_path else {}, console)
         return
     grid = load_map(map_path) if map_path else None
     beacons = read_beacons(beacons_path) if beacons_path else {}
@@ -294,7 +299,7 @@ def command(
         check_output(picture, force)
     read = read_log(log)
     for remark in read.remarks:
-        click.echo(remark, err=True)
+        console.report(remark)
     events = read.events
     if odometry_path is not None:
         from linkpose.localization.odometry import with_mice_odometry
@@ -303,7 +308,7 @@ def command(
     has_scans = any(event.kind == "scan" for event in events)
     default: Method = "scan-match" if has_scans else "ekf"
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
-    settings["estimate"] = _estimated(settings["estimate"], events)
+    settings["estimate"] = _estimated(settings["estimate"], events, console)
     free = _free_noises(settings)
     chosen = {name: _settings(settings, name, read.start) for name in names}
     if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
@@ -311,16 +316,15 @@ def command(
     for method in names:
         check(events, method, chosen[method], grid, beacons, str(log))
     if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
-        click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
+        console.report("no two ranges of this log are of one instant: --correlation changes nothing")
     if _has_no_odometry(events):
-        click.echo(
+        console.report(
             "the log has no odometry: a constant-velocity model is used (--acceleration-std), "
-            "at the mean height of the beacons",
-            err=True,
+            "at the mean height of the beacons"
         )
-    Console(quiet=False, verbose=False).compile(names)
+    console.compile(names)
     if beacons and not has_scans:
-        chosen = _tuned(events, chosen, beacons, free, quiet=json_lines)
+        chosen = _tuned(events, chosen, beacons, free, console)
     tracks: dict[str, Track] = {
         method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
     }
@@ -332,27 +336,27 @@ def command(
 
         write_tracks(output, tracks, log, force)
     if picture is not None:
-        from linkpose.plotting import Scene
+        from linkpose import plotting
 
-        scene = Scene(grid, beacons, tracks[names[0]].rejected_xy_m)
-        _draw(picture, tracks, log, [truth_path] if truth_path else [], scene, force)
+        scene = plotting.Scene(grid, beacons, tracks[names[0]].rejected_xy_m)
+        figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], scene)
+        plotting.save(figure, picture, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
+    if has_page:
+        from linkpose.page.scene import Surroundings
+
+        page.play(_tables(tracks, log, truth_path), [], Surroundings(grid, beacons), console)
 
 
-def _draw(
-    picture: Path, tracks: dict[str, Track], log: Path, references: list[Path], scene: Scene, force: bool
-) -> None:
-    """Draws the paths as `plot` draws them from their file."""
-    from linkpose import plotting
+def _tables(tracks: dict[str, Track], log: Path, truth: Path | None) -> list[Table]:
+    """The paths and the truth as `plot` reads them from their files."""
     from linkpose.evaluation.references import read_for_picture
     from linkpose.localization.output import table_of
 
-    tables = [table_of(tracks, log), *(read_for_picture(path, "z") for path in references)]
-    figure, _ = plotting.plot_tables(tables, [], scene)
-    plotting.save(figure, picture, force)
+    return [table_of(tracks, log), *([read_for_picture(truth, "z")] if truth is not None else [])]
 
 
 def _refuse_in_stream(given: dict[str, object]) -> None:
@@ -361,7 +365,7 @@ def _refuse_in_stream(given: dict[str, object]) -> None:
         raise click.UsageError(f"a stream from standard input does not use {', '.join(unused)}; leave it out")
 
 
-def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:
+def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons, console: Console) -> None:
     """Reads rows from standard input and writes a row of CSV for each, until the input ends or the user interrupts."""
     import sys
 
@@ -375,8 +379,8 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
     settings["estimate"] = () if words == ("none",) else words
     free = _free_noises(settings)
     method = cast("Method", name)
-    Console(quiet=False, verbose=False).compile([name])
-    stream = Stream(method, _settings(settings, method, None), beacons, free, not words, _report)
+    console.compile([name])
+    stream = Stream(method, _settings(settings, method, None), beacons, free, not words, console.report)
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")
     last = None
@@ -388,18 +392,14 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
             sys.stdout.flush()
             last = row
     for remark in stream.remarks():
-        _report(remark)
+        console.report(remark)
     if stream.run is not None and last is not None:
         track = stream.run.track([last])
         _require_measurements(Path("standard input"), name, track)
-        click.echo(_sentence(name, track, None), err=True)
+        console.report(_sentence(name, track, None))
 
 
-def _report(text: str) -> None:
-    click.echo(text, err=True)
-
-
-def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
+def _estimated(words: tuple[str, ...], events: Log, console: Console) -> tuple[str, ...]:
     """The constants to estimate: as given, or those that the ranges determine."""
     from linkpose.localization.events import Event
     from linkpose.localization.measuring import default_constants
@@ -410,7 +410,7 @@ def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
     beacons = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
     found = default_constants(kinds_of(events), len(beacons))
     if found:
-        click.echo("scale error and bias of the ranges are estimated, too (--estimate none: not)", err=True)
+        console.report("scale error and bias of the ranges are estimated, too (--estimate none: not)")
     return found
 
 
@@ -427,7 +427,7 @@ def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _tuned(
-    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], quiet: bool
+    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], console: Console
 ) -> dict[Method, Settings]:
     """The settings of all filters with the free noises estimated from the log, and a line that reports them."""
     from linkpose.localization.tuning import described, tune
@@ -436,8 +436,7 @@ def _tuned(
     tuned = tune(events, first, beacons, free)
     if tuned is first:
         return chosen
-    if not quiet:
-        click.echo(f"noises estimated from the log: {described(tuned, events)}", err=True)
+    console.report(f"noises estimated from the log: {described(tuned, events)}")
     return dict.fromkeys(chosen, tuned)
 
 

@@ -208,10 +208,10 @@ def up(function: Function) -> Function:
     )(function)
 
 
-def seeds(what: str) -> Callable[[Function], Function]:
+def seeds(what: str, default: int = 5) -> Callable[[Function], Function]:
     """--seeds of an experiment: how many of these simulated runs."""
     return click.option(
-        "--seeds", type=click.IntRange(min=1), default=5, show_default=True, help=f"Number of simulated {what}."
+        "--seeds", type=click.IntRange(min=1), default=default, show_default=True, help=f"Number of simulated {what}."
     )
 
 
@@ -219,6 +219,19 @@ def plot(what: str) -> Callable[[Function], Function]:
     """--plot of a command that draws its result."""
     return click.option(
         "--plot", "plot_path", type=FILE, metavar="FILE.png", help=f"{what} PNG, SVG or PDF, by the file's ending."
+    )
+
+
+def thesis_figures(chapter: str) -> Callable[[Function], Function]:
+    """--plot of an experiment of the thesis: one picture per figure."""
+    return click.option(
+        "--plot",
+        "plot_path",
+        type=FILE,
+        metavar="FOLDER|FILE.png",
+        help=f"Draw the figures of {chapter}, one picture each, and the errors of all variants, into this folder "
+        "(figure-3.1.png …, variants-….png). FILE.png (or .svg, .pdf) names the picture of the variants; figures lie "
+        "beside it as FILE-figure-3.1.png ….",
     )
 
 

@@ -1,13 +1,20 @@
-"""What several commands print: progress on a terminal, and rows as a table."""
+"""What several commands print: progress on a terminal, rows as a table, and an experiment with its figures."""
 
 from __future__ import annotations
 
 import functools
+import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from linkpose.experiments.variants import Verdict
 
 
 def progress(label: str, quiet: bool = False) -> Callable[[Iterable[Any]], Iterable[Any]]:
@@ -36,3 +43,46 @@ def _text(name: str, value: object) -> str:
     if value is None:
         return "off" if name == "gate" else "-"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def show_experiment(
+    tables: Sequence[Sequence[dict[str, object]]], verdicts: Sequence[Verdict], seeds: int, json_lines: bool
+) -> None:
+    """An experiment's tables and verdicts: as JSON lines, or as text."""
+    if json_lines:
+        rows = [*(row for table in tables for row in table), *(verdict.as_row() for verdict in verdicts)]
+        click.echo("\n".join(json.dumps(row) for row in rows))
+        return
+    from linkpose.experiments.variants import remark
+
+    click.echo("\n\n".join(as_table(table) for table in tables))
+    click.echo("\n".join(["", "Claims of the thesis:", *(one.text for one in verdicts if one.table)]))
+    further = [one.text for one in verdicts if not one.table]
+    if further:
+        click.echo("\n".join(["", "Comparisons that the thesis does not make:", *further]))
+    note = remark(seeds)
+    if note:
+        click.echo(f"\n{note}")
+
+
+def files_of_figures(place: Path | None, whole: str, numbers: Sequence[str], force: bool) -> dict[str, Path]:
+    """The file of the picture `whole`, which shows all variants, and of each figure; none without a place.
+
+    Raises FileError where one cannot be written: better before the work than after it.
+    """
+    from linkpose import plotting
+
+    if place is None:
+        return {}
+    files = plotting.picture_files(place, whole, [f"figure-{number}" for number in numbers], force)
+    return dict(zip((whole, *numbers), files.values(), strict=True))
+
+
+def save_figures(figures: Mapping[str, Figure], files: Mapping[str, Path], force: bool, quiet: bool) -> None:
+    """Writes each figure to its file, and lists the files on stderr."""
+    from linkpose import plotting
+
+    for name, file in files.items():
+        plotting.save(figures[name], file, force)
+        if not quiet:
+            click.echo(f"{f'Figure {name}' if name[0].isdigit() else name}: {file}", err=True)

@@ -1,8 +1,7 @@
-"""`linkpose reproduce indoor`: the comparisons of the thesis's chapter 3.1 on simulated drives."""
+"""`linkpose reproduce indoor`: the comparisons and figures of the thesis's chapter 3.1 on simulated drives."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
@@ -10,32 +9,32 @@ import click
 from linkpose.cli import options
 from linkpose.cli.live import Console
 
+VARIANTS = "variants-indoor"  # the picture with the errors of all variants
+
 
 @click.command("indoor")
-@options.seeds("drives")
-@options.plot("Draw the errors of all variants.")
+@options.seeds("drives", default=6)
+@options.thesis_figures("chapter 3.1")
 @options.force
 @options.as_json
 @options.quiet
 def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Compare fixed with range-adaptive R, diagonal with off-diagonal Q and R, and the EKF with the UKF, indoors.
 
-    The thesis's own logs and result tables are not public. The drives are simulated on a floor of the same size.
+    The drives are simulated on a floor of the size of the thesis's. Each claim is judged by a two-sided sign test over
+    the drives (p < 0.05). With --plot, Figures 3.1 to 3.6 show the drive of seed 0.
     """
     from linkpose import plotting
-    from linkpose.cli.rendering import as_table, progress
+    from linkpose.cli import rendering
     from linkpose.experiments import indoor
 
-    plotting.check_output(plot_path, force)
+    files = rendering.files_of_figures(plot_path, VARIANTS, plotting.INDOOR_FIGURES, force)
     Console(quiet, verbose=False).compile(indoor.FILTERS)
-    variants = indoor.compare(seeds, progress("drives", quiet))
-    rows = [variant.as_row() for variant in variants]
-    if json_lines:
-        click.echo("\n".join(json.dumps(row) for row in rows))
-    else:
-        click.echo(as_table(rows))
-        click.echo("\n".join(["", "Claims of the thesis:", *indoor.claims(variants)]))
-        click.echo("\n".join(["", "Comparisons that the thesis does not make:", *indoor.further_claims(variants)]))
-    if plot_path:
-        figure = plotting.variants("Indoor localisation", variants, [indoor.label(variant) for variant in variants])
-        plotting.save(figure, plot_path, force)
+    variants = indoor.compare(seeds, rendering.progress("drives", quiet))
+    tables = [[variant.as_row() for variant in variants]]
+    rendering.show_experiment(tables, indoor.claims(variants), seeds, json_lines)
+    if files:
+        labels = [indoor.label(variant) for variant in variants]
+        figures = plotting.indoor_figures(indoor.drive(0))
+        figures[VARIANTS] = plotting.variants("Indoor localisation", variants, labels)
+        rendering.save_figures(figures, files, force, quiet)

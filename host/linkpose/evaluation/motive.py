@@ -19,9 +19,10 @@ import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.takes import Take, reference_of, take_of_markers
-from linkpose.recording.chunks import read_bytes
+from linkpose.inputs import read_bytes
 from linkpose.recording.delimited import to_utf8
 from linkpose.recording.table import Table, check_times
+from linkpose.rotations import matrices
 from linkpose.sensors.measurements import Floats
 
 _SIGNATURE = re.compile(rb'"?Format Version"?([,;\t])')
@@ -124,14 +125,8 @@ def _axes_of_body(path: Path, quaternion: Floats, up: str) -> Floats:
     size = np.linalg.norm(quaternion, axis=1)
     if np.nanmax(np.abs(size - 1), initial=0) > _QUATERNION_TOLERANCE:
         raise LinkposeError(f"{path}: the rotation of the rigid body is no unit quaternion: export it as Quaternion")
-    x, y, z, w = (quaternion / size[:, None]).T
-    body = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
-            [2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)],
-            [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)  # the body's axes in the room
+    turned = matrices(np.roll(quaternion / size[:, None], 1, axis=1))
+    body = turned.transpose(0, 2, 1)  # the body's axes in the room
     return np.asarray(_SENSOR_IN_BODY[up] @ body)
 
 
@@ -140,7 +135,7 @@ def _unit(path: Path, head: list[str]) -> float:
     pairs = dict(zip(head[::2], head[1::2], strict=False))
     name = pairs.get("Length Units", "Meters").strip().lower()
     if name not in _METRES:
-        raise LinkposeError(f"{path}, line 1: unknown length unit {name!r}; export in {', '.join(_METRES)}")
+        raise LinkposeError(f"{path}, line 1: unknown length unit {name[:60]!r}; export in {', '.join(_METRES)}")
     return _METRES[name]
 
 

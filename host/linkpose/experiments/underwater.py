@@ -1,6 +1,7 @@
-"""The checks and comparisons of chapter 3.2 of [Thesis] on simulated dives.
+"""The checks, comparisons and figures of chapter 3.2 of [Thesis] on simulated dives.
 
-The simulator follows the thesis's Tables 2.2 to 2.9. The thesis's own values and result tables are not public.
+The simulator follows the thesis's Tables 2.2 to 2.9. Our copy of the thesis ends before its results:
+host/docs/thesis.md lists what is lost.
 """
 
 from __future__ import annotations
@@ -8,16 +9,27 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 
-from linkpose.experiments.variants import Progress, Variant, verdict
+import numpy as np
+
+from linkpose.experiments.paths import Path, path_of
+from linkpose.experiments.variants import Progress, Variant, Verdict, verdict
 from linkpose.localization.kalman import FilterName
+from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import localize
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score
 from linkpose.localization.track import Track
-from linkpose.simulation.underwater import BEACONS, UnderwaterErrors, UnderwaterRun, self_check, simulate_underwater
+from linkpose.simulation.underwater import (
+    BEACONS,
+    UnderwaterErrors,
+    UnderwaterRun,
+    motion_data,
+    self_check,
+    simulate_underwater,
+)
 
 FILTERS: tuple[FilterName, ...] = ("ekf", "ukf")
 GATE = 0.997
@@ -61,14 +73,28 @@ class Case:
     outliers: int
     variants: list[Variant] = field(default_factory=list)
     detections: list[Detection] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)  # measurements by sensor, in one dive
 
     def errors(self) -> UnderwaterErrors:
         """The simulated errors of this sea."""
         errors = UnderwaterErrors(outliers=self.outliers)
         return errors if self.correlated else replace(errors, correlation_m=0.0)
 
+    def as_set(self, number: int) -> dict[str, object]:
+        """The row of Table 3.10: which errors this set of measurements has, and how many measurements of each kind."""
+        errors = self.errors()
+        return {
+            "table": "3.10",
+            "set": number,
+            "timing": self.timing,
+            "range_std_m": errors.range_m,
+            "correlation_std_m": errors.correlation_m,
+            "outliers": errors.outliers,
+            **self.counts,
+        }
+
     def rows(self) -> list[dict[str, object]]:
-        """The objects that `reproduce underwater --json` prints."""
+        """The objects of its variants that `reproduce underwater --json` prints."""
         return [v.as_row() | d.as_row() for v, d in zip(self.variants, self.detections, strict=True)]
 
 
@@ -99,10 +125,22 @@ def _case(timing: str, correlated: bool, outliers: int) -> Case:
 def _dive(case: Case, seed: int) -> None:
     errors = case.errors()
     run = simulate_underwater(seed, errors, DURATION_S, case.timing == "synchronous")
+    case.counts.update(_counts(run))
     for variant, detection in zip(case.variants, case.detections, strict=True):
         track = localize(run.log, variant.filter, _settings(errors, variant), None, BEACONS)
         variant.scores.append(score(track.time_s, track.position_m, track.heading_rad, run.motion.truth))
         detection.add(run, track)
+
+
+def _counts(run: UnderwaterRun) -> dict[str, int]:
+    """Measurements of one dive by kind."""
+    ranges = sum(len(values) for values in run.ranges_m.values())
+    return {
+        "velocities": len(run.velocity_m_s),
+        "attitudes": len(run.attitude_rad),
+        "depths": len(run.depth_m),
+        "ranges": ranges,
+    }
 
 
 def _settings(errors: UnderwaterErrors, variant: Variant) -> Settings:
@@ -117,32 +155,35 @@ def _settings(errors: UnderwaterErrors, variant: Variant) -> Settings:
 
 
 def check_simulator(seeds: int) -> list[dict[str, object]]:
-    """The simulator's own statistics beside the figures asked for, mean over the seeds."""
+    """The simulator's own statistics beside the figures asked for, mean over the seeds, in the order of the tables."""
     runs = [
         self_check(simulate_underwater(seed, UnderwaterErrors(outliers=OUTLIERS), DURATION_S)) for seed in range(seeds)
     ]
     return [
-        {"check": rows[0].check, "asked": rows[0].asked, "measured": sum(row.measured for row in rows) / seeds}
-        for rows in zip(*runs, strict=True)
+        asdict(rows[0]) | {"measured": sum(row.measured for row in rows) / seeds}
+        for rows in sorted(zip(*runs, strict=True), key=lambda rows: rows[0].table)
     ]
 
 
-def claims(cases: Sequence[Case]) -> list[str]:
-    """What the thesis expects, each with its result on these runs."""
+def claims(cases: Sequence[Case]) -> list[Verdict]:
+    """What the thesis expects, by the table that would show it."""
     late, at_once = TIMINGS
     ukf = _find(cases, late, True, OUTLIERS, "ukf")
     clean, synchronous = (_find(cases, timing, True, 0, "ukf") for timing in TIMINGS)
+    correlated = _find(cases, at_once, True, 0, "ukf", rho=True)
     return [
-        verdict("the UKF is better than the EKF", _find(cases, late, True, OUTLIERS, "ekf"), ukf),
-        verdict("with outliers, the gate is better than none", _find(cases, late, True, OUTLIERS, "ukf", None), ukf),
-        verdict("without outliers, the gate is better than none", _find(cases, late, True, 0, "ukf", None), clean),
-        verdict("ranges without a common error are better than with one", clean, _find(cases, late, False, 0, "ukf")),
         verdict(
-            "with a common error, off-diagonal R is better than diagonal R",
-            synchronous,
-            _find(cases, at_once, True, 0, "ukf", rho=True),
+            "ranges without a common error are better than with one", clean, _find(cases, late, False, 0, "ukf"), "3.8"
         ),
-        verdict("asynchronous sensors are better than synchronous ones", synchronous, clean),
+        verdict("with a common error, off-diagonal R is better than diagonal R", synchronous, correlated, "3.8"),
+        verdict("asynchronous sensors are better than synchronous ones", synchronous, clean, "3.8"),
+        verdict(
+            "with outliers, the gate is better than none", _find(cases, late, True, OUTLIERS, "ukf", None), ukf, "3.9"
+        ),
+        verdict(
+            "without outliers, the gate is better than none", _find(cases, late, True, 0, "ukf", None), clean, "3.9"
+        ),
+        verdict("the UKF is better than the EKF", _find(cases, late, True, OUTLIERS, "ekf"), ukf, "3.11"),
     ]
 
 
@@ -164,3 +205,42 @@ def label(variant: Variant) -> str:
     words = [variant.filter, str(variant.others["timing"]), f"ρ {variant.correlation:g}"]
     words += ["gate" if variant.gate else "no gate", f"common {variant.others['correlation_std_m']} m"]
     return ", ".join([*words, f"{variant.others['outliers']} outliers"])
+
+
+@dataclass(frozen=True, slots=True)
+class Dive:
+    """One simulated dive: the commanded and the true path (N, 3) m at `time_s` (N,), the estimates of Figure 3.8 from
+    sets of measurements, and those of Figures 3.9 and 3.10 by number.
+    """
+
+    time_s: Floats
+    command_m: Floats
+    truth_m: Floats
+    sets: list[Path]
+    paths: dict[str, Path]
+
+
+# Figure 3.8: what the ranges carry beside Gaussian noise.
+SETS = (
+    ("Gaussian noise alone", False, 0),
+    ("with common error", True, 0),
+    ("with common error, outliers", True, OUTLIERS),
+)
+
+
+def dive(seed: int) -> Dive:
+    """The runs behind Figures 3.7 to 3.10: asynchronous sensors, and in Figures 3.9 and 3.10 all errors at once."""
+    still = UnderwaterErrors(motion_velocity_m_s=0.0, motion_rate_rad_s=0.0)
+    command = motion_data(np.random.default_rng(seed), still, DURATION_S)
+    sets = [_estimated(seed, "ukf", words, correlated, n) for words, correlated, n in SETS]
+    ekf = _estimated(seed, "ekf", "EKF", True, OUTLIERS)
+    motion = simulate_underwater(seed, UnderwaterErrors(), DURATION_S).motion
+    paths = {"3.9": ekf, "3.10": replace(sets[-1], label="UKF")}
+    return Dive(motion.time_s, command.pose[:, :3], motion.pose[:, :3], sets, paths)
+
+
+def _estimated(seed: int, name: FilterName, words: str, correlated: bool, outliers: int) -> Path:
+    errors = Case(TIMINGS[0], correlated, outliers).errors()
+    run = simulate_underwater(seed, errors, DURATION_S)
+    track = localize(run.log, name, _settings(errors, Variant(name, "fixed", 0.0, GATE)), None, BEACONS)
+    return path_of(name, words, track, run.motion.truth, np.unwrap(run.motion.pose[:, 5]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, TypeAlias
 
 from linkpose.localization.kalman import FilterName
@@ -13,7 +13,8 @@ from linkpose.localization.tables import Score
 # Receives the runs of an experiment and yields them again: the place for a progress bar.
 Progress: TypeAlias = Callable[[Iterable[Any]], Iterable[Any]]
 
-SIGNIFICANCE = 0.05  # of the one-sided sign test: five seeds of five reach it (p = 0.031), four of four do not
+SIGNIFICANCE = 0.05  # of the two-sided sign test
+FEWEST_SEEDS = 6  # that reach it: six of six (p = 0.031), five of five do not (0.063)
 
 
 @dataclass(slots=True)
@@ -47,19 +48,63 @@ class Variant:
         }
 
 
-def verdict(claim: str, before: Variant, after: Variant) -> str:
-    """A sentence on whether `after` has the smaller position error, seed by seed, by a sign test."""
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether `after` has the smaller position error than `before`, seed by seed, by a two-sided exact sign test.
+
+    `table` is the number of the thesis's table that makes the comparison; empty where none does.
+    """
+
+    claim: str
+    table: str
+    before_m: float
+    after_m: float
+    wins: int
+    losses: int
+    seeds: int
+
+    @property
+    def p(self) -> float:
+        """Probability of wins and losses at least as uneven if both are equally likely."""
+        return sign_test(self.wins, self.losses)
+
+    @property
+    def result(self) -> str:
+        """holds, does not hold (the opposite does), or no difference."""
+        if not self.p < SIGNIFICANCE:
+            return "no difference"
+        return "holds" if self.wins > self.losses else "does not hold"
+
+    @property
+    def text(self) -> str:
+        """The verdict as a line of text."""
+        source = f"Table {self.table}: " if self.table else ""
+        return (
+            f"{source}{self.claim}: {self.result}; {self.before_m:.4g} m against {self.after_m:.4g} m, "
+            f"better on {self.wins} of {self.seeds} seeds (p = {self.p:.2g})"
+        )
+
+    def as_row(self) -> dict[str, object]:
+        """The object that `reproduce --json` prints."""
+        return asdict(self) | {"p": self.p, "result": self.result}
+
+
+def verdict(claim: str, before: Variant, after: Variant, table: str = "") -> Verdict:
+    """Compares two variants that ran on the same seeds."""
     pairs = [(old.position_rmse_m, new.position_rmse_m) for old, new in zip(before.scores, after.scores, strict=True)]
     wins, losses = sum(new < old for old, new in pairs), sum(new > old for old, new in pairs)
-    better, worse = sign_test(wins, losses), sign_test(losses, wins)
-    result = "holds" if better < SIGNIFICANCE else "does not hold" if worse < SIGNIFICANCE else "no difference"
-    return (
-        f"{claim}: {result}; {before.position_rmse_m():.4g} m against {after.position_rmse_m():.4g} m, "
-        f"better on {wins} of {len(pairs)} seeds (p = {min(better, worse):.2g})"
-    )
+    return Verdict(claim, table, before.position_rmse_m(), after.position_rmse_m(), wins, losses, len(pairs))
 
 
 def sign_test(wins: int, losses: int) -> float:
-    """One-sided p value: how likely so many wins or more are if wins and losses are equally likely."""
+    """Two-sided p value of the exact binomial test; ties are left out."""
     n = wins + losses
-    return float(sum(math.comb(n, i) for i in range(wins, n + 1)) / 2**n)
+    tail = sum(math.comb(n, i) for i in range(max(wins, losses), n + 1))
+    return float(min(1.0, 2.0 * tail / 2**n))
+
+
+def remark(seeds: int) -> str | None:
+    """Why no verdict can be reached with so few seeds; None where one can."""
+    if sign_test(seeds, 0) < SIGNIFICANCE:
+        return None
+    return f"A sign test needs at least {FEWEST_SEEDS} seeds for p < {SIGNIFICANCE:g}; {seeds} give no verdict."

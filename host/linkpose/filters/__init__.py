@@ -101,9 +101,17 @@ class FindsJ2s(Protocol):
 
 
 def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_MICE) -> Filter:
-    """A fresh filter for measurements of these sensors and of mice at ports 1 to `mice`.
+    """Creates a filter, whose `process` takes measurements block by block.
 
-    Raises CannotRun where the rig or the sensors do not support it, UnknownFilter for an unknown name.
+    Args:
+        name: such as "joint-inertial"; underscores are accepted.
+        rig: sensor placement and calibration. J2S is in the sensor's axes (m), mice are in the robot's frame (m).
+        sensors: the sensors that the measurements come from.
+        mice: the highest port of a mouse, counted from 1.
+
+    Raises:
+        UnknownFilter: there is no filter of this name.
+        CannotRun: the rig or the sensors do not support the filter.
     """
     name = name.replace("_", "-")
     if name not in REGISTRY:

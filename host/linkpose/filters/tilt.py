@@ -147,11 +147,12 @@ def predict(now: Registers, time_s: float, step_s: float, rate: Vec, held_s: flo
     """(5) over `step_s`, from the rates at its ends; the last of them has been held for `held_s`."""
     half, before = 0.5 * step_s, now.rate
     rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
-    tilt = vec.turn_back(rotation, now.tilt)
+    turn = vec.turn_of(rotation)
+    tilt = vec.turn_back(turn, now.tilt)
     covariance = vec.turn_back_sym(rotation, now.covariance)
     covariance = vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
     span = min(now.residual.span + step_s, _RESIDUAL_S)
-    residual = MeanResidual(vec.turn_back(rotation, now.residual.mean), span, step_s / span)
+    residual = MeanResidual(vec.turn_back(turn, now.residual.mean), span, step_s / span)
     return Registers(time_s, rate, held_s, tilt, covariance, now.accel, residual)
 
 
@@ -239,7 +240,7 @@ def describe(now: Registers, delay_s: float, j2s: Vec) -> Vec:
     """
     tilt = now.tilt
     if delay_s > 0.0:
-        tilt = vec.turn_back(vec.scale(delay_s, now.rate), tilt)
+        tilt = vec.turn_back(vec.turn_of(vec.scale(delay_s, now.rate)), tilt)
     roll, pitch = vec.roll_pitch(tilt)
     return vec.dot(tilt, j2s), roll, pitch
 

@@ -202,7 +202,7 @@ class _Words:
         value = self.number(index)
         if value < 0 or not value.is_integer():
             raise LinkposeError(
-                f"{self.path} line {self.line}: {self.words[index]!r} is no number of readings; "
+                f"{self.path} line {self.line}: {self.words[index][:60]!r} is no number of readings; "
                 "correct or delete the line"
             )
         return int(value)

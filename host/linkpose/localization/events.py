@@ -195,7 +195,7 @@ class _Numbers:
 def _read_row(path: Path, line: int, row: list[str], numbers: _Numbers) -> Event:
     kind = row[1].strip() if len(row) > 1 else ""
     if kind not in KINDS:
-        found = f"unknown kind {kind!r}" if kind else "the row is cut short"
+        found = f"unknown kind {kind[:60]!r}" if kind else "the row is cut short"
         raise LinkposeError(f"{path} line {line}: {found}; known kinds are {', '.join(KINDS)}")
     fields = KINDS[kind]
     cells = [cell.strip() for cell in row[2 : 2 + len(fields)]]
@@ -220,5 +220,5 @@ def read_number(cell: str, path: Path, line: int) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise LinkposeError(f"{path} line {line}: {cell.strip()!r} is not a number; correct or delete the row")
+        raise LinkposeError(f"{path} line {line}: {cell.strip()[:60]!r} is not a number; correct or delete the row")
     return value

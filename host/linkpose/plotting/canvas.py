@@ -89,6 +89,27 @@ def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMAT
         raise CannotWrite(path, f"there is no folder {path.absolute().parent}")
 
 
+def picture_files(place: Path, whole: str, names: Sequence[str], force: bool) -> dict[str, Path]:
+    """A file for each of several pictures, `whole` and `names`.
+
+    A folder `place` holds them all. A picture file `place` is that of `whole`, and the others lie beside it, after its
+    name. Makes the folder. Raises FileError where one of the pictures cannot be written.
+    """
+    if place == STDOUT:
+        raise CannotWrite(place, "standard output holds one picture only, not several")
+    if place.suffix and not place.is_dir():
+        files = {whole: place} | {name: place.with_name(f"{place.stem}-{name}{place.suffix}") for name in names}
+    else:
+        files = {name: place / f"{name}.png" for name in (whole, *names)}
+        try:
+            place.mkdir(exist_ok=True)
+        except OSError as error:
+            raise CannotWrite(place, error.strerror) from error
+    for file in files.values():
+        check_output(file, force)
+    return files
+
+
 def save(figure: Figure, path: Path, force: bool) -> None:
     """Writes the picture in the format that the file's ending names, to STDOUT as PNG.
 

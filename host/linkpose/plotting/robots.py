@@ -90,7 +90,7 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene, wide: bool) -> None
 
 def _draw_scene(axes: Axes, scene: Scene) -> None:
     if scene.grid is not None:
-        _draw_map(axes, scene.grid)
+        draw_map(axes, scene.grid)
     if scene.beacons:
         places = np.array([list(place)[:2] for place in scene.beacons.values()])
         axes.plot(*places.T, "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
@@ -100,7 +100,7 @@ def _draw_scene(axes: Axes, scene: Scene) -> None:
         axes.plot(*scene.rejected_xy_m.T, "x", color=OTHERS[3], markersize=4, label="measurement rejected", zorder=4)
 
 
-def _draw_map(axes: Axes, grid: GridMap) -> None:
+def draw_map(axes: Axes, grid: GridMap) -> None:
     """Cells that stop beams, in grey. The map's own axes may be turned against those of the path."""
     from matplotlib.transforms import Affine2D
 

@@ -14,6 +14,7 @@ from linkpose.plotting.canvas import new_figure
 from linkpose.plotting.sources import Sources, gather, is_recording, title
 from linkpose.quantities import (
     ANGLE,
+    BALL_ANGLES,
     CHAIN_ROTATION,
     HEIGHT,
     HEIGHT1,
@@ -131,12 +132,15 @@ def _link(sources: Sources) -> Section | None:
 
 
 def _chain(sources: Sources) -> Section | None:
-    """Angle of a hinge or rotation of a ball joint (largest), its error, and the heights."""
+    """Angle of a hinge (largest) and its error, or the angles of a ball joint; error of the rotation; heights."""
     found = []
     if panels.has(sources, ANGLE):
         found.append(Panel(3.0, _values(sources, ANGLE, legend=True)))
         if _scored(sources, ANGLE):
             found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "angle")))
+    for quantity in BALL_ANGLES:
+        if panels.has(sources, quantity):
+            found.append(Panel(2.2, _values(sources, quantity, legend=not found)))
     if any(track.has(*CHAIN_ROTATION) for track in sources.tracks or sources.all):
         if not found:
             found.append(Panel(3.0, lambda axes: robots.rotation(axes, sources)))

@@ -15,9 +15,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from linkpose.errors import CannotRead, CannotWrite, FileFormatError
+from linkpose.errors import CannotWrite, FileFormatError
+from linkpose.inputs import read_bytes
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
 
 # Endings of keys whose values must be above 0.
 _POSITIVE = (
@@ -27,6 +29,8 @@ _POSITIVE = (
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
 CHAIN_JOINTS = ("ball", "hinge")
+FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
+_UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
 # A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
@@ -95,6 +99,11 @@ class Chain:
     axis1_std_deg: float = 3.0  # standard deviation about each axis across it
     axis2: Vector | None = None
     axis2_std_deg: float = 3.0
+    # Angles of a ball joint. None: the length is vertical at the first sample, flexion is about an axis of sensor 1,
+    # and the joint is neutral at the first sample.
+    long_axis: Vector | None = None  # of link 1 in sensor 1's axes, away from link 2; of any length
+    flexion_axis: Vector | None = None  # in sensor 1's axes
+    neutral: Quaternion | None = None  # rotation from sensor 2's axes into sensor 1's: w, x, y, z
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +159,12 @@ class Mouse:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """All of a rig.toml."""
+    """Sensor placement and calibration, the contents of a rig.toml. Every value has a default.
+
+    `joint` holds J2S (the vector from the joint centre to the sensor) in the first sensor's axes (m), `chain` the joint
+    between two links, `mouse` each mouse in the robot's frame (m, degrees). `imu`, `noise`, `mag` and `baro` are
+    calibrations of the sensors.
+    """
 
     joint: Joint = field(default_factory=Joint)
     imu: Imu = field(default_factory=Imu)
@@ -212,9 +226,7 @@ class Rig:
     def load(path: str | PathLike[str]) -> Rig:
         """Reads a rig file. Raises CannotRead, or FileFormatError naming the file, the key and the cure."""
         try:
-            tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise CannotRead(path, error.strerror, "the rig file") from error
+            tables = tomllib.loads(read_bytes(Path(path), "the rig file").decode())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
             raise FileFormatError(path, f"{path} is not a rig file: {str(error)[:200]}") from error
         return Rig.from_dict(tables, str(path))
@@ -252,12 +264,18 @@ def to_vector(values: Iterable[float], decimals: int = 8) -> Vector:
     return x, y, z
 
 
+def to_quaternion(values: Iterable[float]) -> Quaternion:
+    """Four numbers as a rig holds them."""
+    w, x, y, z = (round(float(value), 8) for value in values)
+    return w, x, y, z
+
+
 def _refuse_unknown(table: Mapping[str, Any], known: list[str], origin: str, where: str) -> None:
     for key in table:
         if key not in known:
             near = difflib.get_close_matches(key, known, 1, 0.4)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-            raise FileFormatError(origin, f"{origin}: unknown key {where}{key}; {hint}")
+            raise FileFormatError(origin, f"{origin}: unknown key {where}{str(key)[:60]}; {hint}")
 
 
 def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
@@ -276,6 +294,8 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; it must be between 0 and 0.1 s")
         if key == "accel_scale" and min(values[key]) <= 0:
             raise FileFormatError(origin, f"{origin}: {name}.{key} is {value}; each axis must be above 0")
+    if _are_parallel(values.get("long_axis"), values.get("flexion_axis")):
+        raise FileFormatError(origin, f"{origin}: {name}.long_axis and {name}.flexion_axis are parallel")
     try:
         return cls(**values)
     except TypeError:
@@ -283,6 +303,14 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
         raise FileFormatError(
             origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
+
+
+def _are_parallel(one: Vector | None, other: Vector | None) -> bool:
+    """Whether two axes are within 10° of one line."""
+    if one is None or other is None:
+        return False
+    along = sum(a * b for a, b in zip(one, other, strict=True))
+    return abs(along) > math.cos(math.radians(10)) * math.hypot(*one) * math.hypot(*other)
 
 
 def _least(value: float | Vector) -> float:
@@ -295,6 +323,8 @@ def _read_value(kind: str, value: Any, origin: str, where: str) -> Any:
         if value not in CHAIN_JOINTS:
             raise FileFormatError(origin, f'{origin}: {where} is {quoted(value)}; it must be "ball" or "hinge"')
         return value
+    if "Quaternion" in kind:
+        return _read_quaternion(value, origin, where)
     if "Vector" not in kind or ("float |" in kind and not isinstance(value, list | tuple)):
         return _read_number(value, origin, where)
     vector = _read_vector(value, origin, where)
@@ -325,6 +355,15 @@ def _read_vector(value: Any, origin: str, where: str) -> Vector:
         raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; it must be three numbers: [x, y, z]")
     x, y, z = (_read_number(v, origin, where) for v in value)
     return x, y, z
+
+
+def _read_quaternion(value: Any, origin: str, where: str) -> Quaternion:
+    if not isinstance(value, list | tuple) or len(value) != 4:
+        raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; it must be four numbers: [w, x, y, z]")
+    w, x, y, z = (_read_number(v, origin, where) for v in value)
+    if abs(math.hypot(w, x, y, z) - 1) > _UNIT:
+        raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; a rotation must have length 1")
+    return w, x, y, z
 
 
 def _replace_file(path: Path, text: str) -> None:

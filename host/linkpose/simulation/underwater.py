@@ -2,8 +2,8 @@
 
 A command moves the vehicle; Doppler log (DVL), attitude sensor (AHRS), ranges to four beacons and depth are sampled
 each at its own times; the ranges carry Gaussian noise, an error common to all of them, and outliers. The surface is z =
-0, Z points up, depth is -z. Velocities are in the vehicle's axes (forward, left, up). The values of the thesis's Tables
-3.5 to 3.7 are not known here; those below are our own.
+0, Z points up, depth is -z. Velocities are in the vehicle's axes (forward, left, up). Our copy of the thesis lacks the
+values of its Tables 3.5 to 3.7; those below are our own.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from linkpose.localization.linalg import Floats
 from linkpose.localization.tables import Beacons, Truth
 
 STEP_S = 0.01  # of the true motion
+MOTION_NOISES = (  # standard deviations of the commanded motion's noise
+    "vx_std_m_s", "vy_std_m_s", "vz_std_m_s", "roll_rate_std_rad_s", "pitch_rate_std_rad_s", "yaw_rate_std_rad_s",
+)  # fmt: skip
 # Table 2.4: update rate of measurement.
 PERIODS_S = {"dvl": 0.20, "ahrs": 0.01, "range1": 0.10, "range2": 0.10, "range3": 0.10, "range4": 0.10, "depth": 0.02}
 SYNCHRONOUS_PERIOD_S = 0.20  # when all sensors are read at once, the slowest one sets the pace
@@ -232,15 +235,33 @@ def _log(times: dict[str, Floats], velocity: Floats, attitude: Floats, depth: Fl
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One figure of the simulator against what was asked of it."""
+    """A setting of the simulator, the same figure computed back from a run, and the thesis's, where our copy has it."""
 
+    table: str  # of the thesis
     check: str
     asked: float
     measured: float
+    thesis: float | None = None
 
 
 def self_check(run: UnderwaterRun) -> list[Check]:
-    """The noise's statistics computed back from the measurements and the true path, as chapter 3.2 does.
+    """The statistics of noise and times computed back from the measurements and the true path, as chapter 3.2 does."""
+    return [*_time_checks(run), *_motion_checks(run), *_noise_checks(run)]
+
+
+def _motion_checks(run: UnderwaterRun) -> list[Check]:
+    """Table 3.5: how far the true velocities are from the commands."""
+    motion, errors = run.motion, run.errors
+    noise = motion.twist - np.array([command_at(t) for t in motion.time_s])
+    asked = np.repeat((errors.motion_velocity_m_s, errors.motion_rate_rad_s), 3).tolist()
+    return [
+        Check("3.5", f"motion_{name}", std, float(measured))
+        for name, std, measured in zip(MOTION_NOISES, asked, noise.std(axis=0), strict=True)
+    ]
+
+
+def _noise_checks(run: UnderwaterRun) -> list[Check]:
+    """Tables 3.6 and 3.7, and the common error and the outliers of Tables 2.8 and 2.9.
 
     The variance between the intervals gives the common error, and the variance within them the Gaussian noise.
     Both leave out the instants of outliers. An error beyond half an outlier's size counts as one.
@@ -257,17 +278,15 @@ def self_check(run: UnderwaterRun) -> list[Check]:
     drawn = np.concatenate(list(run.outlier.values()))
     within, between = _split_variance(error[~drawn], (clock[~drawn] / errors.correlation_interval_s).astype(int))
     rows = [
-        Check("velocity_std_m_s", errors.velocity_m_s, float(spread)),
-        Check("attitude_std_rad", errors.attitude_rad, float(np.std(turned))),
-        Check("depth_std_m", errors.depth_m, float(np.std(sunk))),
-        Check("range_std_m", errors.range_m, math.sqrt(within)),
-        Check("correlation_std_m", errors.correlation_m, math.sqrt(max(between, 0.0))),
-        Check("outliers", float(errors.outliers), float((np.abs(error) > 0.5 * errors.outlier_m).sum())),
+        Check("3.6", "velocity_std_m_s", errors.velocity_m_s, float(spread)),
+        Check("3.6", "attitude_std_rad", errors.attitude_rad, float(np.std(turned))),
+        Check("3.6", "depth_std_m", errors.depth_m, float(np.std(sunk))),
+        Check("3.6", "range_std_m", errors.range_m, math.sqrt(within)),
+        Check("2.8", "correlation_std_m", errors.correlation_m, math.sqrt(max(between, 0.0))),
+        Check("2.9", "outliers", float(errors.outliers), float((np.abs(error) > 0.5 * errors.outlier_m).sum())),
     ]
     if drawn.any():
-        rows.append(Check("outlier_m", errors.outlier_m, float(np.mean(error[drawn]))))
-    if not run.synchronous:
-        rows += [_jitter_check(run, sensor) for sensor in PERIODS_S]
+        rows.append(Check("2.9", "outlier_m", errors.outlier_m, float(np.mean(error[drawn]))))
     return rows
 
 
@@ -282,7 +301,23 @@ def _split_variance(values: Floats, group: NDArray[np.int_]) -> tuple[float, flo
     return within, between
 
 
+def _time_checks(run: UnderwaterRun) -> list[Check]:
+    """Table 2.4, update rates, and where the sensors are not synchronous Table 2.3, the jitter of their times."""
+    periods = PERIODS_S if not run.synchronous else dict.fromkeys(PERIODS_S, SYNCHRONOUS_PERIOD_S)
+    rows = [
+        Check("2.4", f"{sensor}_period_s", period, _mean_period(run.times_s[sensor]), PERIODS_S[sensor])
+        for sensor, period in periods.items()
+    ]
+    if not run.synchronous:
+        rows += [_jitter_check(run, sensor) for sensor in PERIODS_S]
+    return rows
+
+
+def _mean_period(times_s: Floats) -> float:
+    return float((times_s[-1] - times_s[0]) / (len(times_s) - 1))
+
+
 def _jitter_check(run: UnderwaterRun, sensor: str) -> Check:
     times, period = run.times_s[sensor], PERIODS_S[sensor]
     jitter = times - period * np.arange(1, len(times) + 1)
-    return Check(f"{sensor}_time_std_s", run.errors.time_jitter * period, float(np.std(jitter)))
+    return Check("2.3", f"{sensor}_time_std_s", run.errors.time_jitter * period, float(np.std(jitter)))

@@ -50,7 +50,7 @@ class FakeSensor {
   }
 };
 
-// One tick: the driver gets the bus until it wants it no more.
+// One tick: the driver gets the bus until it needs it no more.
 void tick(Barometer& driver, FakeSensor& sensor, uint32_t now_us) {
   uint8_t data[I2cRequest::kMaxRead];
   I2cRequest request;
@@ -88,7 +88,7 @@ TEST_CASE("BMP180: valid two conversions after power-on") {
   CHECK(driver.valid());
 }
 
-TEST_CASE("BMP180: says how long the conversion takes that it is about to start") {
+TEST_CASE("BMP180: reports how long the conversion takes that it is about to start") {
   Barometer driver(1);
   FakeSensor sensor;
   uint8_t data[I2cRequest::kMaxRead];
@@ -166,7 +166,7 @@ TEST_CASE("BMP180: another sensor in its place starts with a temperature of its 
   CHECK(sensor.temperatures == before + 1);
 }
 
-TEST_CASE("BMP180: calibration words of 0 or 0xFFFF, or another chip's id, are not believed") {
+TEST_CASE("BMP180: calibration words of 0 or 0xFFFF, or another chip's id, are not used") {
   for (uint8_t rubbish : {0x00, 0xFF}) {
     Barometer driver(1);
     FakeSensor sensor;

@@ -10,7 +10,7 @@ namespace {
 
 using wire::NakReason;
 
-// Notes what it is told, as text.
+// Notes the calls, as text.
 class FakeBoard : public commands::Board {
  public:
   std::string log;

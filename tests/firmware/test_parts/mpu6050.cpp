@@ -111,7 +111,7 @@ TEST_CASE("MPU-6050: reset once, set up, and valid within 200 ms of power-on") {
   CHECK(rig.driver.restarts() == 0);
 }
 
-TEST_CASE("MPU-6050: every range and filter stands in the registers as the register map says") {
+TEST_CASE("MPU-6050: every range and filter is in the registers as in the register map") {
   const struct {
     Mpu6050::Settings settings;
     uint8_t divider, config, gyro, accel;
@@ -141,7 +141,7 @@ TEST_CASE("MPU-6050: a missed answer costs that reading and no set-up") {
   CHECK(rig.driver.restarts() == 0);
 }
 
-TEST_CASE("MPU-6050: a sensor that lost its supply is set up again, and believed when its gyro has settled") {
+TEST_CASE("MPU-6050: a sensor that lost its supply is set up again, and used when its gyro has settled") {
   Rig rig;
   rig.ticks_to_valid(20);
   SUBCASE("asleep, all zeros") { rig.sensor.lose_power(); }

@@ -48,7 +48,7 @@ class Line {
   }
 };
 
-// A mouse in remote mode, as far as the transactions of Ps2Mouse can tell.
+// A mouse in remote mode, as far as the transactions of Ps2Mouse show.
 class FakeMouse {
  public:
   bool present = true;
@@ -58,7 +58,7 @@ class FakeMouse {
   bool remote_works = true;
   bool remote = false, enabled = false;
   uint8_t resolution = 2, rate = 60, id = 0x00;
-  int x = 0, y = 0;  // moved, not yet told
+  int x = 0, y = 0;  // moved, not yet reported
   int resets = 0;
   std::deque<bool> bad_parity;  // of the next bytes
   uint8_t first_flags = 0x08;
@@ -97,45 +97,45 @@ class FakeMouse {
     log.push_back(byte);
     if (byte == 0xFE) return repeat();
     output_.clear();
-    if (refuses_now(byte)) return say({0xFE});
+    if (refuses_now(byte)) return send({0xFE});
     if (byte >= 0xE6) argument_of_ = 0;  // a command takes the place of a missing argument
     if (argument_of_ != 0) {
       (argument_of_ == 0xE8 ? resolution : rate) = byte;
       argument_of_ = 0;
-      return say({0xFA});
+      return send({0xFA});
     }
     switch (byte) {
       case 0xFF:
         resets++;
         remote = enabled = false;
         resolution = 2;
-        say({0xFA});
+        send({0xFA});
         output_.push_back(0xAA);
         output_.push_back(0x00);
         break;
       case 0xE8:
       case 0xF3:
         argument_of_ = byte;
-        say({0xFA});
+        send({0xFA});
         break;
-      case 0xF2: say({0xFA, id}); break;
-      case 0xE9: say({0xFA, static_cast<uint8_t>(remote << 6 | enabled << 5), resolution, rate}); break;
+      case 0xF2: send({0xFA, id}); break;
+      case 0xE9: send({0xFA, static_cast<uint8_t>(remote << 6 | enabled << 5), resolution, rate}); break;
       case 0xEB: report(); break;
       case 0xF0:
         remote = remote_works;
-        say({0xFA});
+        send({0xFA});
         break;
       case 0xF4:
         enabled = true;
-        say({0xFA});
+        send({0xFA});
         break;
       case 0xF6:
         remote = enabled = false;
         resolution = 2;
         rate = 100;
-        say({0xFA});
+        send({0xFA});
         break;
-      default: say({0xFA}); break;
+      default: send({0xFA}); break;
     }
   }
 
@@ -150,10 +150,10 @@ class FakeMouse {
 
   void report() {
     const uint8_t flags = static_cast<uint8_t>(first_flags | (x < 0 ? 0x10 : 0) | (y < 0 ? 0x20 : 0));
-    say({0xFA, flags, static_cast<uint8_t>(x), static_cast<uint8_t>(y)});
+    send({0xFA, flags, static_cast<uint8_t>(x), static_cast<uint8_t>(y)});
     x = y = 0;
   }
-  void say(const Bytes& bytes) {
+  void send(const Bytes& bytes) {
     output_.assign(bytes.begin(), bytes.end());
     said_ = bytes;
     sent_ = 0;

@@ -91,7 +91,7 @@ class Cpu extends CPU {
   }
 
   /** A reset: I/O registers take their initial values, r0 to r31 and SRAM keep theirs, the core waits the start-up time.
-   *  @param {boolean} causeKept whether MCUSR still tells when the program starts */
+   *  @param {boolean} causeKept whether MCUSR still holds it when the program starts */
   restart(cause, startUpCycles, causeKept) {
     const flags = this.data[MCUSR];
     this.data.fill(0, FIRST_IO, FIRST_SRAM);

@@ -4,7 +4,7 @@
 const FLASH_BYTES = 32768;
 
 /** @param {string} text
- *  @returns {Uint16Array} flash, erased where the file says nothing */
+ *  @returns {Uint16Array} flash, erased where the file has nothing */
 function readHex(text) {
   const flash = new Uint8Array(FLASH_BYTES).fill(0xff);
   let base = 0;

@@ -31,7 +31,7 @@ const CLOCK_STOPPED = 7;
 const DATA_READY = 0x01;
 const BYPASS = 0x02;
 
-/** By WHO_AM_I; `default` also for ids that nobody knows. `power`: PWR_MGMT_1 after reset. */
+/** By WHO_AM_I; `default` also for unknown ids. `power`: PWR_MGMT_1 after reset. */
 const FAMILIES = {
   mpu6050: { perDegree: 340, zeroAt: 36.53, accelConfig2: false, oldSelfTest: true, power: 0x40 },
   mpu6500: { perDegree: 333.87, zeroAt: 21, accelConfig2: true, oldSelfTest: false, power: 0x01 },

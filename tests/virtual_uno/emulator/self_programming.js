@@ -25,7 +25,7 @@ class SelfProgramming {
     cpu.selfProgramming = this;
   }
 
-  /** The instruction SPM: SPMCSR says what is to be done, Z where. */
+  /** The instruction SPM: SPMCSR selects the operation, Z the address. */
   execute() {
     const { data } = this.cpu;
     const word = (data[Z] | (data[Z + 1] << 8)) >> 1;

@@ -20,7 +20,6 @@ from linkpose.filters._imu import ImuSamples
 from linkpose.filters._records import record_of
 from linkpose.filters.chain.process import process
 from linkpose.filters.chain.state import (
-    AXES,
     BG,
     ESTIMATE,
     OF_SENSOR,
@@ -37,6 +36,10 @@ from linkpose.sensors.rig import Rig
 
 _ROTATION = ("chain_qw", "chain_qx", "chain_qy", "chain_qz", "chain_rotation_std_deg")
 _ANGLE = ("chain_angle_deg", "chain_angle_std_deg")
+_ANGLES = (
+    "chain_flexion_deg", "chain_flexion_std_deg", "chain_abduction_deg", "chain_abduction_std_deg",
+    "chain_axial_rotation_deg", "chain_axial_rotation_std_deg",
+)  # fmt: skip
 _HEIGHTS = ("chain_height1_m", "chain_height1_std_m", "chain_height2_m", "chain_height2_std_m")
 
 
@@ -60,12 +63,12 @@ class ChainFilter:
                 [[0.0] * 3, [1.0] * 3, [0.0] * 3],
             ]
         )
-        self._is_hinge, self._is_fixed = bool(self._bank[0].hinge >= 0), bool(self._bank[0].fixed >= 0)
+        self.is_hinge, self._is_fixed = bool(self._bank[0].hinge >= 0), bool(self._bank[0].fixed >= 0)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The rotation from sensor 2's axes into sensor 1's, a hinge's angle, heights over a fixed first joint."""
-        return _ROTATION + _ANGLE * self._is_hinge + _HEIGHTS * self._is_fixed
+        """The rotation from sensor 2's axes into sensor 1's, the joint's angles, heights over a fixed first joint."""
+        return _ROTATION + (_ANGLE if self.is_hinge else _ANGLES) + _HEIGHTS * self._is_fixed
 
     @property
     def rejected(self) -> int:
@@ -93,6 +96,11 @@ class ChainFilter:
         return self._states[self._bank[0].best]
 
     @property
+    def segment_axes(self) -> Floats:
+        """(3, 3) flexion, abduction and length of link 1 as columns, in sensor 1's axes; 0 before the first sample."""
+        return np.array(self._bank[0].frame)
+
+    @property
     def size(self) -> int:
         """Length of the error state."""
         return int(self._bank[0].length)
@@ -103,18 +111,17 @@ class ChainFilter:
         Gyro biases drift: only reversed time begins with those of the other filter's end.
         """
         other, hinge = learned.state, int(self._bank[0].hinge)
-        not_constant = {TH, V, OF_SENSOR + TH, OF_SENSOR + V}
+        not_constant = {TH, V, OF_SENSOR + TH, OF_SENSOR + V, START, START + 3}
         if not backwards:
             not_constant |= {BG, OF_SENSOR + BG}
-        if hinge >= 0:
-            not_constant |= {hinge + START, hinge + START + 3}
-            if not learned.knows_heading:  # the axis in sensor 1's axes depends on it
-                not_constant |= {hinge + AXES, hinge + AXES + 3}
+        if hinge >= 0 and not learned.knows_heading:  # the axis in sensor 1's axes depends on it
+            not_constant |= {hinge, hinge + 3}
         for state in self._states:
             for name in ("accel_bias", "lever", "lever0"):
                 setattr(state, name, getattr(other, name))
             if learned.knows_heading:
                 state.axis, state.has_axis = other.axis, other.has_axis
+            state.level = max(other.level, 1.0)
             if backwards:
                 state.gyro_bias = -other.gyro_bias
             for first in set(range(0, self.size, 3)) - not_constant:
@@ -143,10 +150,14 @@ class ChainFilter:
         table[:, :4] = found["q"]
         np.degrees(found["rotation_std"], out=table[:, 4])
         at = len(_ROTATION)
-        if self._is_hinge:
+        if self.is_hinge:
             np.degrees(found["angle"], out=table[:, at])
             np.degrees(found["angle_std"], out=table[:, at + 1])
             at += len(_ANGLE)
+        else:
+            np.degrees(found["joint"], out=table[:, at : at + 6 : 2])
+            np.degrees(found["joint_std"], out=table[:, at + 1 : at + 7 : 2])
+            at += len(_ANGLES)
         if self._is_fixed:
             table[:, at::2], table[:, at + 1 :: 2] = found["height"], found["height_std"]
         return table

@@ -14,8 +14,9 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
+from linkpose.filters.chain.level import floor_level, follow_innovation
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
-from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, Record
+from linkpose.filters.chain.state import OF_SENSOR, START, Floats, Record
 from linkpose.filters.chain.update import clear_row, expected_square, update
 
 # The sense of an axis is arbitrary: that of j_2 lies on this side, so that all hypotheses agree.
@@ -78,7 +79,7 @@ def _begin_axes(s: Record, size: int, hinge: int, q: Record) -> None:
             for i in range(3):
                 s.axis[k, i] = -s.axis[k, i]
     for k in range(2):
-        o, axis = hinge + AXES + 3 * k, s.axis[k]
+        o, axis = hinge + 3 * k, s.axis[k]
         for i in range(3):
             for j in range(size):
                 p[o + i, j] = p[j, o + i] = 0.0
@@ -96,7 +97,7 @@ def _horizontal_variance(s: Record, size: int, hinge: int) -> float:
         clear_row(s)
         s.row[OF_SENSOR + 1 - row] = z if row == 0 else -z  # δ(R j) = δθ × R j
         for c in range(3):
-            s.row[hinge + AXES + 3 + c] = s.rotation[1, row, c]
+            s.row[hinge + 3 + c] = s.rotation[1, row, c]
         total += max(expected_square(s, size), 0.0)
     return total
 
@@ -106,7 +107,7 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
     """Apply the constraint, `h` (s) after the last time. Returns its log likelihood, at most 0."""
     rotate(s.rotation[0], s.axis[0], s.a)
     rotate(s.rotation[1], s.axis[1], s.b)
-    variance = q.play_correlation * max(s.play_square, q.least_play_rad**2)
+    variance = q.play_correlation * max(s.play_square, floor_level(s, q) * q.least_play_rad**2)
     uncertain = _horizontal_variance(s, size, hinge)
     across = s.b[0] ** 2 + s.b[1] ** 2
     heading_share = min(max(across / (_CLEAR_AXIS * uncertain) - 1, 0.0), 1.0)
@@ -123,11 +124,12 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
         s.row[2] *= heading_share
         s.row[OF_SENSOR + 2] *= heading_share
         for c in range(3):
-            s.row[hinge + AXES + c] = s.rotation[0, row, c]
-            s.row[hinge + AXES + 3 + c] = -s.rotation[1, row, c]
+            s.row[hinge + c] = s.rotation[0, row, c]
+            s.row[hinge + 3 + c] = -s.rotation[1, row, c]
         value = s.a[row] - s.b[row]
         found += value * value
         fit, share = update(s, size, -value, variance, q.huber)
+        follow_innovation(s, 1, row, value, share + variance, h, q)
         likelihood += min(fit + density, 0.0)
         expected += share
     s.play_square += min(h / q.play_s, 1.0) * (max(found - expected, 0.0) / 2 - s.play_square)
@@ -158,5 +160,5 @@ def hinge_angle_std(s: Record, size: int, hinge: int) -> float:
     clear_row(s)
     for i in range(3):
         s.row[i], s.row[OF_SENSOR + i] = -s.c[i], s.c[i]
-        s.row[hinge + START + i], s.row[hinge + START + 3 + i] = s.b[i], -s.b[i]
+        s.row[START + i], s.row[START + 3 + i] = s.b[i], -s.b[i]
     return math.sqrt(max(expected_square(s, size), 0.0))

@@ -15,15 +15,17 @@ import math
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuSamples
+from linkpose.filters.chain.angles import report_angles, set_frame
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
+from linkpose.filters.chain.level import begin_level, follow_level
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
-from linkpose.filters.chain.state import AXES, OF_SENSOR, START, Floats, R, Record, V
+from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
 from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop
-from linkpose.filters.chain.update import apply_correction, clear_row, expected_square
-from linkpose.filters.frozen import is_frozen
+from linkpose.filters.chain.update import add_linearization_errors, apply_correction, clear_row, expected_square
+from linkpose.filters.frozen import MEMORY, is_frozen
 from linkpose.wire.messages import SampleFlags
 
 _NEEDED = int(SampleFlags.IMU_VALID | SampleFlags.IMU2_VALID)
@@ -34,8 +36,8 @@ _CLIPPED = int(
     | SampleFlags.GYRO2_SATURATED
 )
 # Readings of a sensor at rest may repeat to the last bit (low-pass filter, little noise): below this rate of all axes
-# they do not show a frozen sensor.
-_RESTING_RAD_S = 0.05
+# they do not show a frozen sensor, unless they repeat for _LONGEST_REPEAT_S.
+_RESTING_RAD_S, _LONGEST_REPEAT_S = 0.05, 2.0
 _LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
 _UNKNOWN_HEADING = math.pi / math.sqrt(3.0)  # σ of a heading that is uniform all around (rad)
 
@@ -83,12 +85,20 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             s.up_spread[k] = 0.0
             for j in range(3):
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
+        s.moved_heading = 0.0
+        begin_level(s, q)
+        for k in range(2):
+            for j in range(3):
+                s.moved_axis[k, j] = 0.0
         s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
         s.play_square = q.first_play_rad**2
         clear_stops(s)
         s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = int(i == 0), 0.0, 0.0, math.pi, math.pi
-        if bank.hinge >= 0 and not bank.begun:
-            _begin_start(s, bank.length, bank.hinge)
+        if not bank.begun:
+            _begin_start(s, bank.length)
+    if bank.hinge < 0 and not bank.begun:
+        set_frame(bank, states[0].rotation[0, 2])
+    bank.rests = int(not bank.begun)
     bank.begun, bank.spread, bank.best = 1, 0, 0
     if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
         _spread(bank, states, 0.0, gyro, q)
@@ -119,13 +129,12 @@ def _turn_link(s: Record, bank: Record, heading: float, axis_turns: float, gyro:
         rotate(m, s.axis[0], s.a)
         for i in range(3):
             s.axis[0, i] = s.a[i]
-        _turn_block(p, size, hinge + AXES, m, s.a, s.b)
+        _turn_block(p, size, hinge, m, s.a, s.b)
     s.a[0], s.a[1], s.a[2] = 0.0, 0.0, 1.0
     _about(s.a, heading, m)
     _turn_block(p, size, OF_SENSOR, m, s.a, s.b)
-    if hinge >= 0:
-        turn(s.start[1], 0.0, 0.0, heading, 1.0)
-        _turn_block(p, size, hinge + START + 3, m, s.a, s.b)
+    turn(s.start[1], 0.0, 0.0, heading, 1.0)
+    _turn_block(p, size, START + 3, m, s.a, s.b)
     for k in range(2):
         for i in range(3):
             s.a[i] = gyro[k, i] - s.gyro_bias[k, i]
@@ -187,7 +196,7 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
 
 
 @inner
-def _begin_start(s: Record, size: int, hinge: int) -> None:
+def _begin_start(s: Record, size: int) -> None:
     """S_k is the attitude now, with its error."""
     p = s.covariance
     for k in range(2):
@@ -195,11 +204,11 @@ def _begin_start(s: Record, size: int, hinge: int) -> None:
             s.start[k, i] = s.attitude[k, i]
         for i in range(3):
             for j in range(size):
-                p[hinge + START + 3 * k + i, j] = p[OF_SENSOR * k + i, j]
+                p[START + 3 * k + i, j] = p[OF_SENSOR * k + i, j]
     for k in range(2):
         for i in range(3):
             for j in range(size):
-                p[j, hinge + START + 3 * k + i] = p[j, OF_SENSOR * k + i]
+                p[j, START + 3 * k + i] = p[j, OF_SENSOR * k + i]
 
 
 @inner
@@ -227,6 +236,9 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
             update_stop(s, size, hinge_angle(s), q)
             apply_correction(s, size, hinge, base)
         s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
+    if bank.spread:
+        add_linearization_errors(s, hinge, h, q)
+    follow_level(s, h, q)
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
@@ -287,10 +299,16 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     out.angle = out.angle_std = math.nan
     if hinge >= 0 and best.has_axis > 0.0:
         _report_angle(best, states, out)
+    for i in range(3):
+        out.joint[i] = out.joint_std[i] = math.nan
+    if hinge < 0 and out.rotation_std < q.unknown_rad:
+        report_angles(bank, best, out)
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         if base >= 0:
-            out.height[k], out.height_std[k] = _height(best, k, size, base)
+            height, std = _height(best, k, size, base)
+            if std < q.unknown_m:
+                out.height[k], out.height_std[k] = height, std
     for k in range(2):
         for i in range(3):
             out.tilt[k, i] = best.rotation[k, 2, i]
@@ -395,7 +413,8 @@ def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, cali
         bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
         is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
-    return is_possible and not (frozen and turns)
+    frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
+    return is_possible and not frozen
 
 
 @inner
@@ -403,6 +422,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
     """One sample, `h` (s) after the last."""
     for k in range(2):
         follow_rest(bank, states[bank.best], k, gyro, accel, h, q)
+        if bank.still_s[k] == 0.0:
+            bank.rests = 0
     bank.since_update += h
     due = bank.since_update >= q.period_s
     for i in range(states.shape[0]):
@@ -413,6 +434,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
             s.span += h
             if due:
                 _update(s, bank, gyro, bank.since_update, q, noise)
+                if bank.rests and min(bank.still_s[0], bank.still_s[1]) > q.rest_s:
+                    _begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
     if due:
         bank.since_update = 0.0
         _select(bank, states, q)
@@ -437,6 +460,8 @@ def _blank(out: Record) -> None:
     for i in range(4):
         out.q[i] = math.nan
     out.rotation_std = out.angle = out.angle_std = math.nan
+    for i in range(3):
+        out.joint[i] = out.joint_std[i] = math.nan
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         for i in range(3):

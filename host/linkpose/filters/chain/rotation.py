@@ -46,6 +46,15 @@ def between(a: Floats, b: Floats, out: Floats) -> None:
 
 
 @inner
+def product(a: Floats, b: Floats, out: Floats) -> None:
+    """out = a b; `out` is neither of them."""
+    out[0] = a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3]
+    out[1] = a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2]
+    out[2] = a[0] * b[2] + a[2] * b[0] + a[3] * b[1] - a[1] * b[3]
+    out[3] = a[0] * b[3] + a[3] * b[0] + a[1] * b[2] - a[2] * b[1]
+
+
+@inner
 def rotate(m: Floats, v: Floats, out: Floats) -> None:
     """out = m v."""
     x, y, z = v[0], v[1], v[2]

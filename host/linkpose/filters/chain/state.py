@@ -2,9 +2,9 @@
 
 Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
 sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
-centre to the sensor in the sensor's axes. A hinge adds its axis j_k in either sensor's axes and S_k, the R_k at
-the first sample, from which the hinge angle counts. A fixed first joint adds r_0, the vector from that
-joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
+centre to the sensor in the sensor's axes. S_k are the R_k at the first sample, or at the end of a rest that begins
+there; joint angles count from them. A hinge adds its axis j_k in either sensor's axes. A fixed first joint adds r_0,
+the vector from that joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ Record = Any  # a record of STATE, BANK or of the parameters, which compiled cod
 # Errors of one sensor, relative to OF_SENSOR * k: attitude, velocity, gyro bias, accelerometer bias, r_k.
 TH, V, BG, BA, R = 0, 3, 6, 9, 12
 OF_SENSOR = 15
-BALL_SIZE = 2 * OF_SENSOR
-# Errors of the parts that only some chains have, relative to their first index.
-START, AXES, HINGE_SIZE = 0, 6, 12
+START = 2 * OF_SENSOR  # of S_1, then S_2
+BALL_SIZE = START + 6
+HINGE_SIZE = 6  # of j_1, then j_2
 MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
 # Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
 # openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
@@ -61,6 +61,25 @@ class ChainParameters(NamedTuple):
     # Acceleration noise grows up to `most_widening` times where innovations exceed their σ, by e in 1/widening_rate s.
     widening_rate: float = 1.0
     most_widening: float = 100.0
+    # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1
+    # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second,
+    # so the level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated
+    # leg (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8
+    # times their error; at 0.01 throughout, σ of data-sheet sensors is a fifth of it.
+    moving_mean_s: float = 0.5
+    # That square, where σ is right: 0.1 to 0.3 for all of these. Doubled, σ of the hinge [D] 3-4 is 25 % smaller than
+    # its error.
+    level_square: float = 0.25
+    level_s: float = 10.0  # over which the square is averaged (s). At 4 s, short bad stretches of [D] set the level.
+    # Rate (1/s) at which the level grows e-fold for each multiple of `level_square` beyond the first, and falls below;
+    # doubled, calibrated sensors have their σ 5 s earlier, and the ball joint of [D] loses a quarter of its accuracy.
+    level_rate: float = 0.25
+    level_most_ratio: float = 8.0
+    least_level: float = 0.01  # scale error of 0.2 %: twelve-position calibration
+    # Reached by a hinge's axis only: errors of the accelerometer turn with the link, and the axis shows them.
+    most_level: float = 10.0
+    least_floor_level: float = 0.06  # the same for floors of the residual and of the play: (2.5 mm/s)², not 10 mm/s
+    level_std_rad: float = 0.1  # σ of the rotation above which the level does not fall
     # Play of a hinge (rad): σ before it has been measured, and the least; time over which it is measured (s).
     first_play_rad: float = 0.01
     least_play_rad: float = 0.003
@@ -100,9 +119,18 @@ class ChainParameters(NamedTuple):
     # Successive innovations are correlated: log likelihoods of hypotheses count by this factor. [O]; doubled, a slow
     # start drops the true heading.
     tempering: float = 0.1
+    # Corrections move the heading and the axis away from where earlier measurements were linearised, so that these gave
+    # less than P holds: the square of the move within the last second, times this, is added to P. Chosen on the
+    # simulated leg, seeds 0-3: at 0, errors of a hinge after a start reach 8 σ; doubled, σ is the same 10 s later.
+    relinearized_share: float = 3.0
+    relinearized_s: float = 1.0  # over which corrections count as one move (s)
+    # A move that counts in full (rad); smaller ones are noise, and the error of a Jacobian is of second order.
+    # [O]: at 0.03, the slow robot arm loses half of its accuracy.
+    relinearized_rad: float = 0.1
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
+    unknown_m: float = 0.1  # ditto, of a height: an unknown r_k alone makes it 0.3 m
     # Prior standard deviations.
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
@@ -151,6 +179,11 @@ STATE = np.dtype(
         ("innovation_ratio", "f8"),  # mean square innovation over its expectation
         ("widening", "f8"),
         ("play_square", "f8"),
+        ("level", "f8"),  # of the model's errors
+        ("moving_mean", "f8", (2, 3)),  # of innovations over σ: of the joint, of a hinge's axis,
+        ("moving_square", "f8", 2),  # and the mean of its square, 1 for white noise
+        ("moved_heading", "f8"),  # corrections within the last second: of the relative heading (rad)
+        ("moved_axis", "f8", (2, 3)),  # and of either axis
         ("relative_spread", "f8", (3, 3)),  # ∫ ω_rel ω_relᵀ dt
         ("has_axis", "f8"),
         # Turning points of a hinge: angle without wraps, side (0, 1) of the next one, farthest angle on that side and
@@ -189,7 +222,7 @@ BANK = np.dtype(
         ("begun", "i8"),
         ("spread", "i8"),  # whether the headings have been spread over the hypotheses
         ("length", "i8"),  # of the error state
-        ("hinge", "i8"),  # first index of a hinge's errors, or −1
+        ("hinge", "i8"),  # first index of the errors of a hinge's axes, or −1
         ("fixed", "i8"),  # first index of the error of r_0, or −1
         ("time", "f8"),
         ("since_update", "f8"),
@@ -198,12 +231,26 @@ BANK = np.dtype(
         ("mean_gyro", "f8", (2, 3)),
         ("mean_accel", "f8", (2, 3)),
         ("still_s", "f8", 2),
+        ("rests", "i8"),  # whether both sensors have been at rest since the first sample
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
         ("new_accel", "f8", (2, 3)),
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
         ("best", "i8"),
         ("rejected", "i8"),
         ("restarts", "i8"),
+        # Angles of a ball joint: axes of flexion, abduction and length of link 1 as columns, in sensor 1's axes;
+        # whether the rig states the first and the last; the neutral rotation that it states.
+        ("frame", "f8", (3, 3)),
+        ("knows_flexion", "i8"),
+        ("knows_length", "i8"),
+        ("neutral", *_Q),
+        ("knows_neutral", "i8"),
+        ("turned", *_Q),  # scratch of `angles`
+        ("moved", *_Q),
+        ("by_error", "f8", (3, 3)),
+        ("now", "f8", (3, 3)),
+        ("before", "f8", (3, 3)),
+        ("covariance", "f8", (3, 3)),
     ],
     align=True,
 )
@@ -214,6 +261,8 @@ ESTIMATE = np.dtype(
         ("rotation_std", "f8"),  # rad
         ("angle", "f8"),
         ("angle_std", "f8"),
+        ("joint", *_V3),  # flexion, abduction, axial rotation of a ball joint
+        ("joint_std", *_V3),
         ("height", "f8", 2),  # m
         ("height_std", "f8", 2),
         ("tilt", "f8", (2, 3)),  # Z of n in either sensor's axes
@@ -231,9 +280,21 @@ def fresh_bank(rig: Rig) -> Any:
     bank.length, bank.hinge, bank.fixed = BALL_SIZE, -1, -1
     if rig.chain.joint == "hinge":
         bank.hinge, bank.length = bank.length, bank.length + HINGE_SIZE
+    else:
+        _declare_segment(bank, rig.chain)
     if rig.joint.j2s_m is not None:
         bank.fixed, bank.length = bank.length, bank.length + 3
     return banks
+
+
+def _declare_segment(bank: Any, chain: Chain) -> None:
+    """What the rig states of the angles of a ball joint."""
+    for at, axis in ((0, chain.flexion_axis), (2, chain.long_axis)):
+        if axis is not None:
+            bank.frame[:, at] = np.asarray(axis) / np.linalg.norm(axis)
+    bank.knows_flexion, bank.knows_length = chain.flexion_axis is not None, chain.long_axis is not None
+    if chain.neutral is not None:
+        bank.neutral, bank.knows_neutral = np.asarray(chain.neutral) / np.linalg.norm(chain.neutral), 1
 
 
 def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
@@ -256,7 +317,7 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
             variance[bank.fixed : bank.fixed + 3] = np.square(rig.joint.j2s_std_m)
         state.covariance[:] = np.diag(variance)
         if bank.hinge >= 0 and chain.axis1 is not None and chain.axis2 is not None:
-            _set_axes(state, bank.hinge + AXES, chain)
+            _set_axes(state, bank.hinge, chain)
     return states
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import inner
-from linkpose.filters.chain.rotation import to_matrix, turn
-from linkpose.filters.chain.state import AXES, BA, BG, OF_SENSOR, START, R, Record, V
+from linkpose.filters.chain.rotation import square, to_matrix, turn
+from linkpose.filters.chain.state import BA, BG, OF_SENSOR, START, R, Record, V
 
 
 @inner
@@ -71,6 +71,7 @@ def update(s: Record, size: int, innovation: float, variance: float, huber: floa
 def apply_correction(s: Record, size: int, hinge: int, base: int) -> None:
     """Move the waiting correction into the nominal state."""
     x = s.correction
+    s.moved_heading += x[OF_SENSOR + 2] - x[2]
     for k in range(2):
         o = OF_SENSOR * k
         turn(s.attitude[k], x[o], x[o + 1], x[o + 2], 1.0)
@@ -80,13 +81,14 @@ def apply_correction(s: Record, size: int, hinge: int, base: int) -> None:
             s.gyro_bias[k, i] += x[o + BG + i]
             s.accel_bias[k, i] += x[o + BA + i]
             s.lever[k, i] += x[o + R + i]
+        o = START + 3 * k
+        turn(s.start[k], x[o], x[o + 1], x[o + 2], 1.0)
     if hinge >= 0:
         for k in range(2):
-            o = hinge + START + 3 * k
-            turn(s.start[k], x[o], x[o + 1], x[o + 2], 1.0)
             axis, norm = s.axis[k], 1e-30
             for i in range(3):
-                axis[i] += x[hinge + AXES + 3 * k + i]
+                axis[i] += x[hinge + 3 * k + i]
+                s.moved_axis[k, i] += x[hinge + 3 * k + i]
                 norm += axis[i] * axis[i]
             for i in range(3):
                 axis[i] /= math.sqrt(norm)
@@ -95,3 +97,31 @@ def apply_correction(s: Record, size: int, hinge: int, base: int) -> None:
             s.lever0[i] += x[base + i]
     for i in range(size):
         x[i] = 0.0
+
+
+@inner
+def add_linearization_errors(s: Record, hinge: int, h: float, q: Record) -> None:
+    """Add the errors of former Jacobians to P, as the corrections since then show them; `h` (s) after the last time."""
+    p, keep = s.covariance, min(h / q.relinearized_s, 1.0)
+    wider = keep * _of_move(s.moved_heading**2, q)
+    o, start = OF_SENSOR + 2, START + 5  # the heading of link 2 at the first sample turns with the present one
+    p[o, o] += wider
+    p[o, start] += wider
+    p[start, o] += wider
+    p[start, start] += wider
+    if hinge >= 0:
+        for k in range(2):
+            axis, moved, at = s.axis[k], s.moved_axis[k], hinge + 3 * k
+            wider = keep * _of_move(square(moved), q)
+            for i in range(3):
+                p[at + i, at + i] += wider
+                for j in range(3):
+                    p[at + i, at + j] -= wider * axis[i] * axis[j]
+                moved[i] *= 1 - keep
+    s.moved_heading *= 1 - keep
+
+
+@inner
+def _of_move(moved: float, q: Record) -> float:
+    """Variance (rad²) to add after a move whose square is given (rad²)."""
+    return float(q.relinearized_share * moved * min(moved / q.relinearized_rad**2, 1.0))

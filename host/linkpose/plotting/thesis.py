@@ -1,0 +1,257 @@
+"""The figures of chapter 3 of [Thesis] by number, from the runs of `linkpose.experiments`.
+
+host/docs/thesis.md describes what each figure shows and what our copy of the thesis lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from linkpose.plotting.canvas import BAND_ALPHA, OTHERS, TRUTH, finish, legend_above, line_style, new_figure
+from linkpose.plotting.lines import MOST_POINTS
+from linkpose.plotting.robots import draw_map
+from linkpose.sensors.measurements import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from linkpose.experiments.indoor import Drive
+    from linkpose.experiments.paths import Path, Section
+    from linkpose.experiments.underwater import Dive
+    from linkpose.localization.grid import GridMap
+    from linkpose.localization.tables import Beacons
+
+INDOOR_FIGURES = ("3.1", "3.2", "3.3", "3.4", "3.5", "3.6")
+UNDERWATER_FIGURES = ("3.7", "3.8", "3.9", "3.10")
+_SECTIONS = 3  # of Figure 3.4
+_SECTION_M = 10.0  # length of each
+_HEADROOM = 1.5  # of an axis over the error that 99 % do not exceed
+_UNDER_TRUTH = {"linewidth": 2.6}  # of an estimated path, which the dashed truth covers
+
+
+def indoor_figures(drive: Drive) -> dict[str, Figure]:
+    """Figures 3.1 to 3.6 by number: map and path, four estimates with their errors, and where errors are large."""
+    from linkpose.experiments.paths import large
+
+    largest = large(list(drive.paths.values()))
+    figures = {"3.1": _map_and_path(drive), "3.4": _large_errors(drive)}
+    for number, path in drive.paths.items():
+        figures[number] = _estimate(number, path, drive.grid, largest)
+    return {number: figures[number] for number in INDOOR_FIGURES}
+
+
+def underwater_figures(dive: Dive, beacons: Beacons) -> dict[str, Figure]:
+    """Figures 3.7 to 3.10 by number: command and motion, estimates from sets of measurements, EKF, UKF."""
+    from linkpose.experiments.paths import large
+
+    largest = large([*dive.sets, *dive.paths.values()])
+    figures = {"3.7": _command_and_motion(dive, beacons)}
+    figures["3.8"] = _sets_of_measurements(dive.sets, beacons, largest)
+    for number, path in dive.paths.items():
+        figures[number] = _dive_estimate(number, path, beacons, largest)
+    return figures
+
+
+def _titled(figure: Figure, number: str, words: str) -> None:
+    figure.suptitle(f"Figure {number}  {words}", fontsize=10, x=0.01, ha="left")
+
+
+def _summary(path: Path) -> str:
+    return f"position error {100 * path.rms_m:.1f} cm rms, {100 * path.error_m.max():.0f} cm at most"
+
+
+def _plot(axes: Axes, points: Floats, **style: object) -> None:
+    """A path (N, 2 or 3) from above."""
+    keep = slice(None, None, max(1, len(points) // MOST_POINTS))
+    axes.plot(points[keep, 0], points[keep, 1], **style)  # type: ignore[arg-type]
+
+
+def _start(axes: Axes, point: Floats) -> None:
+    axes.plot(point[0], point[1], "o", color="black", markersize=6, markerfacecolor="white", label="start", zorder=6)
+
+
+def _from_above(axes: Axes) -> None:
+    """x and y in the same scale, with their names."""
+    axes.set_aspect("equal", "box")
+    axes.set_xlabel("x (m)")
+    finish(axes, "y (m)")
+    axes.margins(0.05)
+
+
+def _map_and_path(drive: Drive) -> Figure:
+    """Figure 3.1."""
+    figure = new_figure(10.0, 5.2)
+    _titled(figure, "3.1", "Map and path of the robot (simulated)")
+    axes = figure.add_subplot()
+    draw_map(axes, drive.grid)
+    _plot(axes, drive.odometry_m, color=OTHERS[0], linewidth=1.2, label="odometry alone")
+    _plot(axes, drive.truth_m, label="truth", **TRUTH)
+    _start(axes, drive.truth_m[0])
+    _from_above(axes)
+    legend_above(axes)
+    return figure
+
+
+def _estimate(number: str, path: Path, grid: GridMap, largest: tuple[float, float]) -> Figure:
+    """Figures 3.2, 3.3, 3.5, 3.6: the path on the map over its errors along the way."""
+    figure = new_figure(10.0, 8.6)
+    _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
+    above, position, heading = figure.subplots(3, 1, height_ratios=[3.2, 1.5, 1.5])
+    draw_map(above, grid)
+    _plot(above, path.position_m, label=path.filter, **line_style(path.filter) | _UNDER_TRUTH)
+    _plot(above, path.truth_m, label="truth", **TRUTH)
+    _start(above, path.truth_m[0])
+    _from_above(above)
+    legend_above(above)
+    _errors(position, heading, path, path.way_m, largest)
+    heading.set_xlabel("way (m)")
+    return figure
+
+
+def _errors(position: Axes, heading: Axes, path: Path, along: Floats, largest: tuple[float, float]) -> None:
+    """Errors of position and heading with 2σ, along the way or over time."""
+    style = line_style(path.filter) | {"linewidth": 0.9}
+    _position_error(position, path, along, largest)
+    off = np.degrees(2 * path.heading_std_rad)
+    heading.fill_between(along, -off, off, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
+    heading.plot(along, np.degrees(path.heading_error_rad), **style)
+    finish(heading, "heading error (°)")
+    most = np.degrees(_HEADROOM * largest[1])
+    heading.set_ylim(-most, most)
+    heading.sharex(position)
+    legend_above(position)
+
+
+def _position_error(axes: Axes, path: Path, along: Floats, largest: tuple[float, float]) -> None:
+    style = line_style(path.filter) | {"linewidth": 0.9}
+    axes.fill_between(along, 0.0, 200 * path.std_m, label="2σ", color=style["color"], alpha=BAND_ALPHA, linewidth=0)
+    axes.plot(along, 100 * path.error_m, label=path.filter, **style)
+    axes.set_ylim(0.0, 100 * _HEADROOM * largest[0])
+    finish(axes, "position error (cm)")
+
+
+def _large_errors(drive: Drive) -> Figure:
+    """Figure 3.4: where the errors with a fixed R are largest, with the adaptive R beside it."""
+    from linkpose.experiments.paths import worst_sections
+
+    fixed, adaptive = drive.paths["3.2"], drive.paths["3.3"]
+    sections = worst_sections(fixed, _SECTIONS, _SECTION_M)
+    figure = new_figure(10.0, 8.4)
+    _titled(figure, "3.4", f"Where the position error with the {fixed.label}, is largest (simulated)")
+    upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.25, 1.0])[:, 0]
+    axes = upper.add_subplot()
+    draw_map(axes, drive.grid)
+    _plot(axes, drive.truth_m, label="truth", **TRUTH)
+    for i, section in enumerate(sections, 1):
+        inside = (fixed.way_m >= section.start_m) & (fixed.way_m <= section.end_m)
+        _plot(axes, fixed.truth_m[inside], color=OTHERS[3], linewidth=7.0, alpha=0.6, label="large errors")
+        place = _middle(fixed, section)
+        axes.annotate(str(i), place, xytext=(0, 8), textcoords="offset points", fontsize=11, fontweight="bold")
+    _from_above(axes)
+    legend_above(axes)
+    details = np.atleast_1d(lower.subplots(1, len(sections), sharey=True))
+    for i, (place, section) in enumerate(zip(details, sections, strict=True), 1):
+        _detail(place, i, section, (fixed, adaptive))
+    details[0].set_ylabel("position error (cm)")
+    legend_above(details[0])
+    return figure
+
+
+def _middle(path: Path, section: Section) -> Floats:
+    at = int(np.searchsorted(path.way_m, 0.5 * (section.start_m + section.end_m)))
+    return path.truth_m[min(at, len(path.way_m) - 1), :2]
+
+
+def _detail(axes: Axes, number: int, section: Section, paths: Sequence[Path]) -> None:
+    """The errors along a section, with both R."""
+    from linkpose.experiments.paths import rms_within
+
+    for i, path in enumerate(paths):
+        inside = (path.way_m >= section.start_m) & (path.way_m <= section.end_m)
+        style = line_style(path.filter, len(paths) - 1 - i) | {"linewidth": 1.5}
+        axes.plot(path.way_m[inside], 100 * path.error_m[inside], label=path.label, **style)
+    errors = " and ".join(f"{100 * rms_within(path, section):.1f}" for path in paths)
+    axes.set_title(f"{number}: fixed and adaptive R {errors} cm rms", fontsize=9, pad=18)
+    axes.set_xlabel("way (m)")
+    finish(axes, "")
+
+
+def _command_and_motion(dive: Dive, beacons: Beacons) -> Figure:
+    """Figure 3.7: the path that the command describes, and the one that the vehicle takes."""
+    apart = np.linalg.norm(dive.truth_m - dive.command_m, axis=1)
+    figure = new_figure(10.0, 6.2)
+    _titled(figure, "3.7", f"Commanded and true path, {apart[-1]:.2f} m apart at the end (simulated)")
+    grid = figure.add_gridspec(2, 2, width_ratios=[1.1, 1.0])
+    above, depth = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    distance = figure.add_subplot(grid[1, 1], sharex=depth)
+    _plot(above, dive.command_m, color=OTHERS[2], linewidth=1.4, label="command")
+    _plot(above, dive.truth_m, label="truth", **TRUTH)
+    _start(above, dive.truth_m[0])
+    _draw_beacons(above, beacons)
+    depth.plot(dive.time_s, -dive.command_m[:, 2], color=OTHERS[2], linewidth=1.4)
+    depth.plot(dive.time_s, -dive.truth_m[:, 2], **TRUTH)
+    finish(depth, "depth (m)")
+    depth.invert_yaxis()
+    distance.plot(dive.time_s, apart, color=OTHERS[2], linewidth=1.4)
+    finish(distance, "command to truth (m)")
+    distance.set_xlabel("time (s)")
+    _from_above(above)
+    legend_above(above, 4)
+    return figure
+
+
+def _draw_beacons(axes: Axes, beacons: Beacons) -> None:
+    places = np.array(list(beacons.values()))
+    axes.plot(places[:, 0], places[:, 1], "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
+    for name, place in zip(beacons, places, strict=True):
+        axes.annotate(name, place[:2], xytext=(5, 3), textcoords="offset points", fontsize=8)
+
+
+def _sets_of_measurements(paths: Sequence[Path], beacons: Beacons, largest: tuple[float, float]) -> Figure:
+    """Figure 3.8: the path from the complete set, and the errors with each set."""
+    figure = new_figure(10.0, 6.6)
+    _titled(figure, "3.8", f"{paths[0].filter.upper()} on sets of simulated measurements, all with Gaussian noise")
+    grid = figure.add_gridspec(len(paths), 2, width_ratios=[1.0, 1.15])
+    _from_above_among_beacons(figure.add_subplot(grid[:, 0]), paths[-1], beacons)
+    first: Axes | None = None
+    for i, path in enumerate(paths):
+        axes = figure.add_subplot(grid[i, 1], sharex=first)
+        first = first or axes
+        _position_error(axes, path, path.time_s, largest)
+        axes.set_title(f"{path.label}: {_summary(path)}", fontsize=9, loc="left", pad=18 if i == 0 else 6)
+    legend_above(figure.axes[1])
+    axes.set_xlabel("time (s)")
+    return figure
+
+
+def _from_above_among_beacons(axes: Axes, path: Path, beacons: Beacons) -> None:
+    _plot(axes, path.position_m, label=path.filter, **line_style(path.filter) | _UNDER_TRUTH)
+    _plot(axes, path.truth_m, label="truth", **TRUTH)
+    _start(axes, path.truth_m[0])
+    _draw_beacons(axes, beacons)
+    _from_above(axes)
+    legend_above(axes, 4)
+
+
+def _dive_estimate(number: str, path: Path, beacons: Beacons, largest: tuple[float, float]) -> Figure:
+    """Figures 3.9 and 3.10: the path from above, the depth, and the errors over time."""
+    figure = new_figure(10.0, 6.6)
+    _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
+    grid = figure.add_gridspec(3, 2, width_ratios=[1.0, 1.15])
+    _from_above_among_beacons(figure.add_subplot(grid[:, 0]), path, beacons)
+    depth, position, heading = (figure.add_subplot(grid[i, 1]) for i in range(3))
+    depth.plot(path.time_s, -path.position_m[:, 2], **line_style(path.filter) | _UNDER_TRUTH)
+    depth.plot(path.time_s, -path.truth_m[:, 2], **TRUTH)
+    finish(depth, "depth (m)")
+    depth.invert_yaxis()
+    depth.sharex(position)
+    if len(path.rejected_s):
+        marks = np.zeros(len(path.rejected_s))
+        position.plot(path.rejected_s, marks, "|", color=OTHERS[3], label="range rejected", clip_on=False)
+    _errors(position, heading, path, path.time_s, largest)
+    heading.set_xlabel("time (s)")
+    return figure
