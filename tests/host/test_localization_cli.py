@@ -80,12 +80,13 @@ def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
         assert len(step.signatures) == 1
 
 
+KNOWN = ("--range-std", 0.25, "--drift-std", 0)  # the noises of the simulated ranges: a search for them takes time
+
+
 @pytest.mark.parametrize("noise", ["fixed", "adaptive", "affine"])
 def test_underwater_with_every_noise(dive, linkpose, noise):
     log, beacons, truth = dive
-    result = linkpose(
-        "localize", log, "--beacons", beacons, "--truth", truth, "--range-std", 0.25, "--noise", noise, "--json"
-    )
+    result = linkpose("localize", log, "--beacons", beacons, "--truth", truth, *KNOWN, "--noise", noise, "--json")
     (row,) = [json.loads(line) for line in result.out.splitlines()]
     assert row["filter"] == "ekf"
     assert row["position_rmse_m"] < 0.3
@@ -94,7 +95,7 @@ def test_underwater_with_every_noise(dive, linkpose, noise):
 def test_gate_counts_and_can_be_switched_off(dive, linkpose):
     log, beacons, _ = dive
     gated, open_ = (
-        json.loads(linkpose("localize", log, "--beacons", beacons, "--range-std", 0.25, "--gate", gate, "--json").out)
+        json.loads(linkpose("localize", log, "--beacons", beacons, *KNOWN, "--gate", gate, "--json").out)
         for gate in ("0.997", "off")
     )
     assert gated["rejected"] >= 50

@@ -141,7 +141,7 @@ def described(settings: Settings, log: Log) -> str:
     """The noises that the log's measurements have, in words."""
     present, ranges = _present(log), settings.ranges
     parts = []
-    if "range" in present:
+    if "range" in present or settings.drift_std_m:
         parts.append(f"range {ranges.std_m:.3g} m" + (f" + {ranges.growth:.2%}" if ranges.model == "affine" else ""))
     words = (
         ("bearing", settings.bearing_std_rad, "rad"), ("speed", settings.speed_std_m_s, "m/s"),
