@@ -18,7 +18,7 @@ from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.view import Extremes, Screen
 from linkpose.estimation import Estimator, LiveEstimator
-from linkpose.presentation import with_std
+from linkpose.presentation import aligned_length, angle_with_std, length_with_std
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
 
@@ -100,9 +100,21 @@ def test_the_path_ends_at_the_robot() -> None:
 
 
 def test_standard_deviations_are_shown_in_fitting_units() -> None:
-    assert with_std(1.5906, 0.0004, "m", 4) == "1.5906 m ±0.4 mm"
-    assert with_std(1.5, 0.12, "m", 2) == "1.50 m ±12.0 cm"
-    assert with_std(math.nan, 0.1, "m", 2) == "not known yet"
+    assert length_with_std(1.5906, 0.0004) == "1.5906 m ±0.4 mm"
+    assert length_with_std(math.nan, 0.1) == "not known yet"
+    assert length_with_std(1.5906, math.nan) == "1.591 m"
+
+
+@pytest.mark.parametrize("std", [0.0, 4e-5, 0.00009499, 0.000095, 0.0004, 0.0099, 0.00996, 0.12, 0.994, 0.996, 12.0])
+def test_a_value_and_its_deviation_end_at_the_same_digit(std: float) -> None:
+    value, unit, bound, bound_unit = length_with_std(12.345678, std).replace("±", "").split()
+    size = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+    assert unit == "m" and float(bound) > 0
+    last_digits = [10.0 ** -len(text.partition(".")[2]) * size[of] for text, of in ((value, unit), (bound, bound_unit))]
+    assert last_digits[0] == pytest.approx(last_digits[1])
+    assert aligned_length(12.345678, std).index(".") == 2
+    angle, bound = angle_with_std(-12.345678, 10 * std).replace("°", "").split(" ±")
+    assert len(angle.partition(".")[2]) == len(bound.partition(".")[2]) and float(bound) > 0
 
 
 def measurements(rows: int) -> lp.Measurements:
@@ -207,7 +219,8 @@ def test_the_next_filter_is_shown_with_its_own_curve() -> None:
         screen.next_filter()
     chosen = screen.render(health(), 80, 24).plain
     assert "▸ joint-inertial" in before and "▸ tilt" in chosen
-    assert f"{float(before.split('joint   ')[1].split()[0]) - 0.02:.4f}" in chosen.splitlines()[1]
+    height_m = float(before.split("joint   ")[1].split()[0])
+    assert f"{height_m - 0.02:.3f}" in chosen.splitlines()[1]
     screen.next_filter()
     assert screen.render(health(), 80, 24).plain == before
 

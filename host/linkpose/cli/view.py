@@ -21,15 +21,15 @@ from linkpose.presentation import (
     Exclusions,
     Row,
     RowReader,
+    aligned_length,
     best_filter,
     fault_lines,
     joint_angle,
     joint_texts,
-    number_text,
+    length_with_std,
     pose_text,
     signed_angle,
     std_text,
-    with_std,
 )
 from linkpose.quantities import Quantity
 from linkpose.sensors.measurements import Floats
@@ -224,7 +224,7 @@ class Screen:
     def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         path = self._paths.get(name if name == self._chosen else None, ())
         lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
-        head = (8, [("   ".join(pose_text(self._row[name])), "")])
+        head = (8, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
         return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
@@ -233,7 +233,7 @@ class Screen:
         parts = joint_texts(values)
         for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
             if quantity in values:
-                parts.append(f"height {number} {with_std(*values[quantity], 'm', 3)}")
+                parts.append(f"height {number} {length_with_std(*values[quantity])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
         lines = _curve_lines(self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
@@ -254,14 +254,14 @@ class Screen:
     def _headline(self, name: str, width: int) -> str:
         """Height, roll, pitch and yaw; narrow screens drop the last ones."""
         values = self._row[name]
-        parts = [f"HEIGHT over joint   {with_std(*values[quantities.HEIGHT], 'm', 4)}"]
+        parts = [f"HEIGHT over joint   {length_with_std(*values[quantities.HEIGHT])}"]
         for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
             if quantity in values:
                 parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
         if len(parts[0]) > width:
-            parts[0] = f"HEIGHT {with_std(*values[quantities.HEIGHT], 'm', 4)}"
+            parts[0] = f"HEIGHT {length_with_std(*values[quantities.HEIGHT])}"
         return "   ".join(parts)
 
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
@@ -273,7 +273,7 @@ class Screen:
             if quantities.HEIGHT not in self._row.get(name, {}):
                 continue
             value, std = self._row[name][quantities.HEIGHT]
-            line = f"{'▸' if name == best else ' '} {name:<16} {number_text(value, 'm', 4):>10} {std_text(std):>9}"
+            line = f"{'▸' if name == best else ' '} {name:<16} {aligned_length(value, std):>10} {std_text(std):>9}"
             if name != best and width >= 60 and math.isfinite(value - reference):
                 line += f"   {_signed_length(value - reference)}"
             lines.append((line, "bold" if name == best else ""))
@@ -283,13 +283,25 @@ class Screen:
         rows = [(name, self._row[name]) for name in self._filters if quantities.HEADING in self._row.get(name, {})]
         if len(rows) < 2:
             return []
-        lines = [(f"  {'filter':<16} {'x':>9} {'y':>9} {'heading':>9}", "dim")]
+        lines = [(f"  {'filter':<16} {'x':>10} {'y':>10} {'heading':>9}", "dim")]
         for name, values in rows:
-            x, y, heading = (values[q][0] for q in (quantities.X, quantities.Y, quantities.HEADING))
+            x, y = (aligned_length(*values[q]) for q in (quantities.X, quantities.Y))
+            heading = values[quantities.HEADING][0]
             angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
-            line = f"{number_text(x, 'm', 3):>9} {number_text(y, 'm', 3):>9} {angle:>9}"
+            line = f"{x:>10} {y:>10} {angle:>9}"
             lines.append((f"{'▸' if name == shown else ' '} {name:<16} {line}", "bold" if name == shown else ""))
         return lines
+
+
+def _packed(parts: Iterable[str], width: int) -> list[str]:
+    """Texts side by side, on as many lines of this width as they need."""
+    lines: list[str] = []
+    for part in parts:
+        if lines and len(f"{lines[-1]}   {part}") <= width:
+            lines[-1] += f"   {part}"
+        else:
+            lines.append(part)
+    return lines
 
 
 def _add_point(curves: dict[Any, Points], name: str | None, time_s: float, value: float) -> None:
@@ -310,7 +322,7 @@ def final_table(summary: Mapping[str, tuple[float, float, float]]) -> list[str]:
     """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m."""
     lines = [f"  {'filter':<16} {'lowest':>10} {'highest':>10} {'rms σ':>9}"]
     for name, (low, high, std) in summary.items():
-        lines.append(f"  {name:<16} {number_text(low, 'm', 4):>10} {number_text(high, 'm', 4):>10} {std_text(std):>9}")
+        lines.append(f"  {name:<16} {aligned_length(low, std):>10} {aligned_length(high, std):>10} {std_text(std):>9}")
     return lines if summary else []
 
 
