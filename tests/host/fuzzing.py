@@ -19,8 +19,7 @@ from linkpose.errors import LONGEST_TEXT, LinkposeError
 from linkpose.evaluation.references import read_any, read_for_picture
 from linkpose.evaluation.scores import evaluate
 from linkpose.flashing.image import MARK, read_image
-from linkpose.localization.carmen import read_carmen
-from linkpose.localization.events import read_events
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.tables import read_beacons, read_truth
 from linkpose.recording.reader import RecordingFile, load_recording
@@ -196,9 +195,9 @@ def targets(folder: Path) -> dict[str, Target]:
         "rig": Target(files.text("rig.toml", _RIG), as_rig),
         "map": Target(files.map(), load_map),
         "map-image": Target(files.map().with_suffix(".png"), lambda path: files.load_map_with(path)),
-        "carmen": Target(files.text("scans.log", _CARMEN), read_carmen),
+        "carmen": Target(files.text("scans.log", _CARMEN), read_log),
         "beacons": Target(files.text("beacons.csv", _BEACONS), read_beacons),
-        "events": Target(files.text("events.csv", _EVENTS), read_events),
+        "events": Target(files.text("events.csv", _EVENTS), read_log),
         "robot-truth": Target(files.text("robot.csv", _ROBOT), read_truth),
         "hex": Target(files.hex(), read_image),
     }

@@ -29,7 +29,7 @@ from linkpose.filters._imu import (
 from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
-from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
+from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis, relate_heading
 from linkpose.filters.inertial.joint_velocity import FIRST_REACH_M2_S2, measured_shares, update_joint_velocity
 from linkpose.filters.inertial.noise import follow_noise, start_noise, with_noise
 from linkpose.filters.inertial.propagate import (
@@ -133,18 +133,23 @@ def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
 
 @inner
 def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
-    """Mean and covariance from one sample and the priors."""
+    """Mean and covariance from one sample and the priors; at a restart, heading and its variance stay."""
+    heading_variance = s.covariance[PSI, PSI]
+    s.unmoved = s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0
     for i in range(SIZE):
         s.nominal[i] = s.start_mean[i]
         for j in range(SIZE):
             s.covariance[i, j] = s.start_covariance[i, j]
     s.distance = _distance(s)
     s.rate_noise = s.force_noise = 0.0
-    if s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0:
+    s.covariance[PSI, PSI] = heading_variance
+    if s.unmoved:
         vec.store(s.tilt, vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0))
         vec.store(s.north, heading_axis(vec.load(s.tilt)))
     _forget_motion(s, q)
     _align(s, force, rate, imu, q)
+    if s.unmoved:
+        relate_heading(s)
 
 
 @inner
