@@ -18,6 +18,7 @@ from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.page import PageOptions, show_newest
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
+from linkpose.presentation import counted
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -196,7 +197,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _report_mice(estimator, console)
     _report_field(estimator, console)
     if request.output:
-        console.report(f"{rows} rows of {', '.join(head['filters'])}{options.written(request.output)}")
+        console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
         options.show_next(console.is_quiet, f"plot {request.output}")
 
 
