@@ -26,9 +26,9 @@ from _localization_peers import filterpy_path, gtsam_path, problem_of
 from _report import RECORDINGS
 
 from linkpose.localization.carmen import Reading, flaser_angles, format_reading
-from linkpose.localization.events import read_events
 from linkpose.localization.kalman import SUBMERSIBLE
 from linkpose.localization.localizer import localize
+from linkpose.localization.logs import read_log
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import read_beacons, read_truth, score
@@ -272,7 +272,7 @@ def with_truth(cases: Iterable[Case], batch: bool) -> Iterable[dict[str, object]
 
 def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
     """filterpy's filter and, with `batch`, GTSAM's optimum, with the noises that linkpose estimates from the log."""
-    log, beacons = read_events(Path(case.arguments[0])).events, read_beacons(Path(case.arguments[2]))
+    log, beacons = read_log(Path(case.arguments[0])).events, read_beacons(Path(case.arguments[2]))
     truth = read_truth(Path(case.arguments[4]))
     many = len(beacons) >= BEACONS_FOR_CONSTANTS and vehicle_of(kinds_of(log)) is not SUBMERSIBLE
     ranging = any(event.kind == "range" for event in log)

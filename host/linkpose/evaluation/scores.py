@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, listed
 from linkpose.evaluation.scoring import CHAIN, LINK, Compared, Score, Scorer, Window, scores_of
 from linkpose.evaluation.series import Lag, Pair, Series, find_offset, paired
 from linkpose.evaluation.takes import MOTION_CAPTURE
@@ -82,7 +82,7 @@ def pairs_of(estimate: Table, reference: Table) -> dict[str, Compared]:
     known = {q: column for q in SCORED if (column := _reference_column(reference, q))}
     if not known:
         raise LinkposeError(
-            f"{reference.path} is no reference: it has {', '.join(reference.columns)}, "
+            f"{reference.path} is no reference: it has {listed(reference.columns)}, "
             f"and none of {', '.join(q.column for q in SCORED)}"
         )
     compared: dict[str, Compared] = {}

@@ -18,6 +18,7 @@ from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.angles import report_angles, set_frame
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
+from linkpose.filters.chain.level import begin_level, follow_level
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
@@ -85,6 +86,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             for j in range(3):
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
         s.moved_heading = 0.0
+        begin_level(s, q)
         for k in range(2):
             for j in range(3):
                 s.moved_axis[k, j] = 0.0
@@ -236,6 +238,7 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
         s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
     if bank.spread:
         add_linearization_errors(s, hinge, h, q)
+    follow_level(s, h, q)
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
