@@ -35,6 +35,7 @@ _LENGTH_DIGITS = (
     _Digits(math.inf, 1, 1.0, 1, "m"),
 )
 _MOST_DECIMALS = 4  # that a column of lengths aligns
+_MOST_ERROR_DECIMALS = 6
 _ANGLE_DECIMALS = ((0.0095, 3), (0.095, 2), (9.95, 1), (math.inf, 0))  # σ (°) below -> decimals
 _STATES = ("being set up", "left out")  # that need no cure here
 
@@ -175,6 +176,12 @@ def std_text(std_m: float) -> str:
 def _digits(std_m: float) -> _Digits:
     """An unknown σ gives a value in mm."""
     return next((digits for digits in _LENGTH_DIGITS if std_m < digits.below_m), _LENGTH_DIGITS[-2])
+
+
+def same_digits(first: float, *others: float) -> list[str]:
+    """Errors as texts that end at the same digit, the third one of the first."""
+    decimals = max(0, min(_MOST_ERROR_DECIMALS, 2 - math.floor(math.log10(first)))) if first > 0 else 0
+    return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
 
 
 def counted(number: int, noun: str) -> str:

@@ -240,6 +240,23 @@ def check_the_heading(rng):
     np.testing.assert_allclose(s.north, true.north, rtol=0, atol=1e-9)
 
 
+def check_the_relation_of_heading_and_tilt(rng):
+    """ψ between the heading axis of a Z that is a little off and X as an update of Z turns it."""
+    _, s = random_state(rng)
+    s.north[:] = gravity.heading_axis(tuple(s.tilt))
+    s.covariance[PSI] = s.covariance[:, PSI] = 0.0
+    p = s.covariance.copy()
+    gravity.relate_heading(s)
+    slope, small = np.zeros(3), 1e-6
+    for k in range(3):
+        tilt = s.tilt + small * np.eye(3)[k]
+        tilt /= np.linalg.norm(tilt)
+        updated = s.north - (s.north @ tilt) * tilt
+        slope[k] = -np.cross(tilt, updated) @ np.array(gravity.heading_axis(tuple(tilt))) / small
+    np.testing.assert_allclose(s.covariance[PSI, :PSI], slope @ p[Z:V, :PSI], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(s.covariance[PSI, PSI], slope @ p[Z:V, Z:V] @ slope, rtol=0, atol=1e-4)
+
+
 def check_the_alignment_to_gravity(rng):
     """δZ = (I − ZZᵀ)(δf + a)/g, with δf from the accelerometer's errors."""
     _, s = random_state(rng)

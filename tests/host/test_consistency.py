@@ -133,6 +133,9 @@ def test_a_mistyped_port_is_answered_with_the_nearest(
     monkeypatch.setattr(ports, "find_ports", lambda: [PortInfo("/dev/ttyACM0", "", 1, 1, "", True, False)])
     assert "did you mean /dev/ttyACM0?" in refused("info", "--port", "/dev/ttyACN0")
     assert "did you mean sim://link?" in refused("info", "--port", "sim:/link")
+    near = refused("info", "--port", "sim://lnk")
+    assert near.count("sim://lnk") == 1 and near.endswith("did you mean sim://link?")
+    assert refused("info", "--port", "sim://rat").endswith("type sim://link, sim://chain, sim://mice")
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,9 @@ import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
-from linkpose.cli.view import Extremes, Screen
+from linkpose.cli.view import Extremes, Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
-from linkpose.presentation import aligned_length, angle_with_std, length_with_std
+from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
 
@@ -117,6 +117,11 @@ def test_a_value_and_its_deviation_end_at_the_same_digit(std: float) -> None:
     assert len(angle.partition(".")[2]) == len(bound.partition(".")[2]) and float(bound) > 0
 
 
+def test_errors_in_a_row_end_at_the_same_digit() -> None:
+    assert same_digits(0.0486, 0.0172, 1.3, -5.07e-6) == ["0.0486", "0.0172", "1.3000", "0.0000"]
+    assert same_digits(123.4, 5.0) == ["123", "5"] and same_digits(0.0, 0.0) == ["0", "0"]
+
+
 def measurements(rows: int) -> lp.Measurements:
     noise = np.random.default_rng(1).normal(size=(rows, 6))
     force = np.array([0.0, 0.0, 9.80665]) + 0.04 * noise[:, :3]
@@ -176,6 +181,15 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
     assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
 
 
+def test_a_terminal_that_cannot_move_its_cursor_shows_a_line() -> None:
+    command = ["estimate", "--live", "--port", "sim://link?speed=0", "--filter", "tilt", "--duration", 2]
+    with Terminal(*command, kind="dumb") as terminal:
+        assert terminal.wait() == 0, terminal.text
+    assert "200 samples" in terminal.text and "lowest" in terminal.text
+    line = link_screen().line(health(imu={"state": "not answering"}))
+    assert line.startswith("25.0 s   IMU NOT ANSWERING: check VCC") and "HEIGHT" in line and len(line) <= 78
+
+
 def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
     marks: list[float] = []
     marker, block = Marker(marks.append), LinkRun(1, 0, 1.0).measurements()
@@ -210,6 +224,31 @@ def test_a_narrow_screen_drops_the_slow_columns_first() -> None:
     assert "sim://link" in wide and "difference from best" in wide
     assert "sim://link" not in narrow and "difference" not in narrow
     assert "IMU ok BARO ok" in narrow and "0 lost" in narrow and "±0.4 mm" in narrow
+
+
+def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> None:
+    """A barometer starts at once, a better filter later: its curve does not begin with the barometer's noise."""
+    screen = Screen("sim://link", ["joint", "baro"])
+    for at in range(100):
+        joint = 1.5 + 0.001 * at if at >= 50 else math.nan
+        screen.add(0.05 * at, {"joint": {quantities.HEIGHT: (joint, 0.01)}, "baro": {quantities.HEIGHT: (9.0, 0.3)}})
+    curve_lines = [line for line in screen.render(health(), 80, 24).plain.splitlines() if "┤" in line]
+    assert [float(line.split("┤")[0]) for line in (curve_lines[0], curve_lines[-1])] == pytest.approx(
+        [1.6, 1.55], abs=0.01
+    )
+    robot = Screen("sim://mice", ["tilt", "mice"])
+    pose = {quantities.X: (1.0, 0.01), quantities.Y: (2.0, 0.01), quantities.HEADING: (0.1, 0.01)}
+    robot.add(0.0, {"tilt": {quantities.HEIGHT: (math.nan, math.nan)}, "mice": pose})
+    shown = robot.render(health(), 80, 24).plain
+    assert "HEIGHT" not in shown and "x 1.000 m ±1.0 cm   y 2.000 m ±1.0 cm   heading +5.7° ±0.6°" in shown
+    assert all(len(line) <= 40 for line in robot.render(health(), 40, 24).plain.splitlines())
+    assert "heading +5.7° ±0.6°" in robot.render(health(), 40, 24).plain
+
+
+def test_the_final_table_fits() -> None:
+    summary = {"joint-inertial": (1.2, 1.65, 0.001), "baro": (0.9, 2.0, 0.3)}
+    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
+    assert final_table({}, 80) == []
 
 
 def test_the_next_filter_is_shown_with_its_own_curve() -> None:

@@ -10,6 +10,7 @@ runs fast.
 
 from __future__ import annotations
 
+import difflib
 import math
 import threading
 import time
@@ -131,7 +132,9 @@ def _parse(url: str) -> tuple[Callable[[Configure], Run], dict[str, float]]:
     if speed < 0 or abs(drift) > 10_000:
         raise LinkposeError("speed must be 0 or more, and drift_ppm within 10000")
     if parts.netloc not in _RIGS:
-        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type {', '.join(map(_address, _RIGS))}")
+        near = difflib.get_close_matches(parts.netloc, _RIGS, 1)
+        names = f"did you mean {_address(near[0])}?" if near else f"type {', '.join(map(_address, _RIGS))}"
+        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; {names}")
     rig, known = _RIGS[parts.netloc]
     make_run = rig(options)
     if options:

@@ -33,7 +33,9 @@ def report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
         _follow_covariance(s)
     _report_stds(s, tilt, north, west, row)
     row.distance = s.distance
-    row.unknown = vec.trace(sub_covariance(s.covariance, BA)) / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])
+    bias = sub_covariance(s.covariance, BA)
+    across = vec.trace(bias) - vec.quadratic(bias, tilt)
+    row.unknown = 1.5 * across / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])
     unknown = 0
     if math.isnan(s.time) or max(s.blind_s, s.no_force_s) > _NO_SENSOR_S:
         vec.store(row.tilt, (math.nan, math.nan, math.nan))

@@ -84,6 +84,7 @@ _FIELDS = np.dtype(
         ("rate_noise", "f8"),  # rad²/s²
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
+        ("unmoved", "b1"),  # at rest since the first sample
         ("rest_north", *_VECTOR),  # X when it began
         ("rest_heading_variance", "f8"),  # rad²
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
@@ -144,7 +145,7 @@ ESTIMATE = np.dtype(
         ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
         ("distance", "f8"),  # `distance` of the state
-        ("unknown", "f8"),  # share of the accelerometer's bias variance that the motion has not resolved
+        ("unknown", "f8"),  # share of the accelerometer's bias variance across Z that the motion has not resolved
     ],
     align=True,
 )
