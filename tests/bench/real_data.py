@@ -12,7 +12,7 @@ through the rig, VQF's estimate is extrapolated by the last rate less VQF's own 
 best lag stands beside the score at that fixed delay. The peer of --smooth is offline VQF.
 
 The pendulums' reference limits their scores. Its quaternion is that of a body whose x and y axes point the other way
-(177° about z); the rotation is fitted to the rates. It departs from the gyro by 5 to 8 °/s over a tenth of a second: its
+(177° about z); the rotation is fitted to the rates. It departs from the gyro by 5 to 8 °/s over 0.1 s: its
 time offset varies, and parts look interpolated. `slow` scores average the error over `SLOW_S`, which removes the
 departures that no filter follows; `fast_deg` is their size, a scale error of the gyro included. `within_2sigma` is the
 share of the second half's errors of roll and pitch within 2σ, with `slow` that of the averaged errors. The upward
