@@ -15,6 +15,7 @@ WORSE times the root mean square error without it, or LEAST_DEG more.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -147,9 +148,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     sources = [simulated(options.seeds), broad(options.data / "broad")]
-    rows = [row_of(case) for source in sources for case in source if options.only in case.name]
-    for row in rows:
-        print_row(row, options.json)
+    rows = []
+    for case in itertools.chain(*sources):
+        if options.only in case.name:
+            rows.append(row_of(case))
+            print_row(rows[-1], options.json)
     kinds = dict.fromkeys(str(row["case"]).rsplit(" ", 1)[0] for row in rows)
     for kind in kinds:
         mine = [row for row in rows if str(row["case"]).startswith(kind)]

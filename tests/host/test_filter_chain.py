@@ -107,6 +107,19 @@ def test_a_hinge_converges_from_any_start_and_its_std_covers_the_error_meanwhile
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.4
 
 
+@pytest.mark.parametrize(("errors", "most_deg"), [("calibrated", 1.0), ("datasheet", 4.0)])
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_the_std_holds_for_calibrated_and_for_data_sheet_sensors(joint: str, errors: str, most_deg: float) -> None:
+    run = ChainRun(joint, 3, 60.0, errors=errors)
+    measured = run.measurements()
+    truth, late = run.truth_columns(measured.time_s), measured.time_s > 30
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint)  # type: ignore[arg-type]
+    error = _error_deg(estimates, _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz"))))[late]
+    std = estimates["chain_rotation_std_deg"][late]
+    assert np.mean(error < 2 * std) > 0.9
+    assert np.sqrt(np.mean(std**2)) < most_deg
+
+
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     measured, _, angle = _chain("hinge")
     estimates = lp.estimate(measured, filters=["chain"], joint="hinge")

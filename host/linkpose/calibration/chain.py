@@ -51,6 +51,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.rotations import of_matrices, rotation_vectors
 from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Rig, Vector, to_vector
 
 Kind = Literal["ball", "hinge"]
@@ -91,6 +92,7 @@ _AXIS_PRIOR_STD_RAD = 1.0  # of each component of an axis: no knowledge
 _AXIS_STARTS, _SEEL_STEPS, _HINGE_STEPS = 12, 10, 10
 WEAK_AXIS_DEG = 15.0  # σ of an axis from which on it counts as not observable
 _LEAST_AXIS_STD_DEG = 0.7  # axes of a gyro: the data sheet allows 2 % between two of them
+_TURNS_ITSELF = 0.3  # share of the other sensor's rate from which on a sensor's own rate gives its axis
 _SIDE = np.array([1.0, 0.77, 0.61])  # the sense of an axis is arbitrary: j_2 lies on this side, as in the filter
 
 
@@ -240,7 +242,7 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
             f"the readings fit no joint between the two sensors ({fit.residual_m_s2:.1f} m/s² rms are left over): fix "
             "each sensor firmly on its own link, on either side of one joint"
         )
-    motion = _relative_motion(chosen, fit)
+    motion = _with_common_errors(_relative_motion(chosen, fit), fit, turning)
     kind = joint or _kind(motion)
     levers = fit.unknowns[_LEVERS].reshape(2, 3)
     covariance = fit.covariance[np.ix_(_LEVERS, _LEVERS)] + _coherent_errors(chosen, fit)
@@ -425,6 +427,23 @@ def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> Motion:
     parts = [_rotations(piece, fit) for piece in chosen]
     found = [_fit_hinge(parts, axes) for axes in _first_axes(parts)]
     return min(found, key=lambda each: each[0])[1]
+
+
+def _with_common_errors(motion: Motion, fit: _Fit, turning_rad_s: tuple[float, float]) -> Motion:
+    """The motion with errors of its axes that all pieces have in common.
+
+    Play that follows the motion turns the axes by as much as itself. Errors of the accelerometers tilt R. They reach
+    the axis of a sensor that hardly turns: the other sensor's rate and R give that axis.
+    """
+    of_bias = (slice(at, at + 3) for at in (ACCEL_BIAS, UNKNOWNS + ACCEL_BIAS))
+    tilt_square = sum(float(np.linalg.eigvalsh(fit.covariance[at, at])[-1]) for at in of_bias) / STANDARD_GRAVITY**2
+    covariance, (one, two) = motion.covariance.copy(), turning_rad_s
+    relies = [max(1 - (own / (_TURNS_ITSELF * other + 1e-12)) ** 2, 0.0) for own, other in ((one, two), (two, one))]
+    for k in range(2):
+        at, axis = slice(3 * k, 3 * k + 3), motion.axes[k]
+        square = np.radians(motion.play_deg) ** 2 + relies[k] * tilt_square
+        covariance[at, at] += square * (np.eye(3) - np.outer(axis, axis))
+    return motion._replace(covariance=covariance)
 
 
 def _rotations(piece: _Piece, fit: _Fit) -> _Rotations:

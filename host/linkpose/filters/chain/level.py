@@ -18,6 +18,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.chain.state import Record
 
+_LEAST_TURN_M_S3 = 1.0  # rate of the force in a sensor's axes, below which it rests: a turn of 6 °/s
 _MOST_SQUARE = 25.0  # of one moving mean, as the average counts it: knocks
 
 
@@ -43,8 +44,15 @@ def follow_innovation(s: Record, part: int, row: int, innovation: float, varianc
     mean = s.moving_mean[part, row]
     mean += min(h / q.moving_mean_s, 1.0) * (innovation / math.sqrt(variance) - mean)
     s.moving_mean[part, row] = mean
-    square = min(mean * mean * 2 * q.moving_mean_s / h, _MOST_SQUARE)
-    s.moving_square[part] += min(h / q.level_s, 1.0) / 3 * (square - s.moving_square[part])
+    if _turns(s):
+        square = min(mean * mean * 2 * q.moving_mean_s / h, _MOST_SQUARE)
+        s.moving_square[part] += min(h / q.level_s, 1.0) / 3 * (square - s.moving_square[part])
+
+
+@inner
+def _turns(s: Record) -> bool:
+    """Whether gravity turns in the axes of a sensor: at rest, scale and cross-axis errors add no innovations."""
+    return bool(max(s.force_rate_square[0], s.force_rate_square[1]) > _LEAST_TURN_M_S3**2)
 
 
 @inner
@@ -53,6 +61,8 @@ def follow_level(s: Record, h: float, q: Record) -> None:
 
     A hinge with measured play has innovations of its axis that are no errors of sensors.
     """
+    if not _turns(s):
+        return
     axis = s.moving_square[1] / q.level_square * q.least_play_rad**2 / max(s.play_square, q.least_play_rad**2)
     ratio = min(max(s.moving_square[0] / q.level_square, axis), q.level_most_ratio)
     if ratio > 1.0 or s.rotation_std < q.level_std_rad:
