@@ -16,8 +16,7 @@ from linkpose.errors import CannotRead, FileError, FileExists
 from linkpose.evaluation.references import read_any
 from linkpose.evaluation.scores import evaluate
 from linkpose.flashing.image import read_image
-from linkpose.localization.carmen import is_carmen
-from linkpose.localization.events import read_events
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.tables import read_beacons, read_truth
 from linkpose.recording.csvfile import STDOUT, create, write_all
@@ -33,8 +32,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "reference": read_any,
     "rig": Rig.load,
     "map": load_map,
-    "carmen": is_carmen,
-    "events": read_events,
+    "log": read_log,
     "beacons": read_beacons,
     "truth": read_truth,
     "hex": read_image,
