@@ -120,6 +120,13 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         browser.wait_for(alarm)
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
         assert "IMU ok" not in browser.evaluate("document.body.innerText")
+        found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
+        page.show(np.empty(0), lambda: Status(status()().health, found))
+        browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
+        browser.open("about:blank")  # and back: the page goes on
+        browser.open(page.url)
+        browser.wait_for_text("not excited yet")
+        browser.wait_for(f"{chart_data('height')}[3].length > 150")
         browser.screenshot(tmp_path / "page.png")
         leave_without_error(browser)
 

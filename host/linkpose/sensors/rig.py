@@ -52,7 +52,13 @@ class Joint:
     @property
     def largest_std_m(self) -> float:
         """Standard deviation along the axis that is known least (m)."""
-        return max(self.j2s_std_m) if isinstance(self.j2s_std_m, tuple) else self.j2s_std_m
+        return max(self.std_of_axes_m)
+
+    @property
+    def std_of_axes_m(self) -> Vector:
+        """Standard deviation along each axis (m)."""
+        std = self.j2s_std_m
+        return std if isinstance(std, tuple) else (std, std, std)
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.

@@ -81,6 +81,7 @@ _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
 _LOST, _LOST_M2_S2 = 0.5, 0.01
+_ANY_HEADING_RAD2 = math.pi**2  # variance of a heading that is not known
 # σ of what was learned grows by this factor then: after two or three losses in a row it is that of the start.
 _WIDEN = 3.0
 _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
@@ -135,6 +136,8 @@ def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
 def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
     """Mean and covariance from one sample and the priors; at a restart, heading and its variance stay."""
     heading_variance = s.covariance[PSI, PSI]
+    if not 0.0 <= heading_variance <= _ANY_HEADING_RAD2:  # NaN too, after impossible readings
+        heading_variance = _ANY_HEADING_RAD2
     s.unmoved = s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0
     for i in range(SIZE):
         s.nominal[i] = s.start_mean[i]
