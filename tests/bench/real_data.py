@@ -11,11 +11,11 @@ of the gyro behind the reference's rate, one for all trials of a kind. Every fil
 through the rig, VQF's estimate is extrapolated by the last rate less VQF's own bias. The score at each filter's own
 best lag stands beside the score at that fixed delay. The peer of --smooth is offline VQF.
 
-On the pendulums the reference is worse than the filters. Its quaternion is that of a body whose x and y axes point the
-other way (177° about z, found from the rates), and it departs from the gyro by 5 to 8 °/s over a tenth of a second: its
-stamps jitter by some 15 ms, and parts of 0.3 s are interpolated. The rotation is fitted. `slow` scores average the
-error over `SLOW_S`, which removes the departures that no filter follows; `fast_deg` is their size. `within_2sigma` is
-the share of the second half's errors of roll and pitch within 2σ, with `slow` that of the averaged errors. The upward
+The pendulums' reference limits their scores. Its quaternion is that of a body whose x and y axes point the other way
+(177° about z); the rotation is fitted to the rates. It departs from the gyro by 5 to 8 °/s over 0.1 s: its
+time offset varies, and parts look interpolated. `slow` scores average the error over `SLOW_S`, which removes the
+departures that no filter follows; `fast_deg` is their size, a scale error of the gyro included. `within_2sigma` is the
+share of the second half's errors of roll and pitch within 2σ, with `slow` that of the averaged errors. The upward
 direction is fitted to the accelerometer, whose own bias a filter that estimates it gets as an error.
 
 `chosen_on` marks the trials on which constants of the filters were chosen; all others are held out. The last lines give

@@ -19,9 +19,9 @@ from linkpose.calibration.mice import calibrate_mice
 from linkpose.calibration.noise import calibrate_noise
 from linkpose.evaluation.references import read_any
 from linkpose.flashing.image import MARK, read_image
-from linkpose.localization.carmen import read_carmen
-from linkpose.localization.events import Log, read_events
+from linkpose.localization.events import Log
 from linkpose.localization.localizer import Settings, check
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map, save_map
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.plausibility import check_units
@@ -46,18 +46,18 @@ def reading(read: Callable[[Path], object], text: str | bytes, name: str = "a.cs
 
 
 def carmen(text: str) -> Producer:
-    return reading(read_carmen, text, "a.log")
+    return reading(read_log, text, "a.log")
 
 
 EVENTS = "time_s,kind,a,b,c\n"
 
 
 def events(rows: str) -> Producer:
-    return reading(read_events, EVENTS + rows)
+    return reading(read_log, EVENTS + rows)
 
 
 def log_of(rows: str, then: Callable[[Log], object]) -> Producer:
-    return reading(lambda path: then(read_events(path).events), EVENTS + rows)
+    return reading(lambda path: then(read_log(path).events), EVENTS + rows)
 
 
 BEACONS = {"1": (0.0, 0.0, 0.0), "2": (5.0, 0.0, 0.0)}
@@ -147,16 +147,19 @@ def joint(**given: object) -> Producer:
 # In the order of the page. Text -> what produces it.
 MORE: dict[str, dict[str, Producer]] = {
     "Localization": {
-        "… holds no ODOM, FLASER or ROBOTLASER1 lines; give a CARMEN log or a CSV log": carmen("# nothing\n"),
+        "… holds no ODOM, FLASER or ROBOTLASER1 lines; give a CARMEN log or a CSV log": carmen("PARAM robot 1\n"),
         "… line …: … is cut short, … of … words; complete or delete the line": carmen("FLASER 2 2.5 2.5 1\nODOM\n"),
         "… line …: … is no number of readings; correct or delete the line": carmen("FLASER 1.5 2.5\n"),
-        "cannot read the log …: …": lambda folder: read_carmen(folder / "none.log"),
+        "cannot read the log …: …": lambda folder: read_log(folder / "none.log"),
         "… holds no measurements; a log has the header … and one row a measurement": events(""),
-        "… line …: the header is …; it must be …": reading(read_events, "a,b\n1,2\n"),
+        "… line …: the header is …; it must be …": reading(read_log, "a,b\n1,2\n"),
         "… line …: unknown kind …; known kinds are …": events("0,sonar,1,1,1\n"),
         "… line …: … needs …; complete or delete the row": events("0,odometry,1,,\n"),
         "… line …: … is not a number; correct or delete the row": events("0,odometry,fast,0,\n"),
-        "… is not a CSV file: …; give a log with the header …": reading(read_events, b"\xff\xfe\xff\xff\n"),
+        "… is not a CSV file: …; give a log with the header …": events("0,odometry," + "9" * 200_000),
+        "… line …: … and … can be read in two ways; save the log with one decimal mark and without separators of thousands": (
+            reading(read_log, "time_s;kind;a;b;c\n0;odometry;1,5;0;\n1;odometry;1.5;0;\n")
+        ),
         "… holds no measurements; record some first": raises(lambda: check([], "ekf", Settings(), None, BEACONS)),
         "… mixes a robot's odometry with a vehicle's …; delete the rows of the one or of the other": checked(
             "0,odometry,1,0,\n1,depth,3,,\n"

@@ -12,15 +12,14 @@ import pytest
 
 from linkpose import inputs
 from linkpose.convert import convert
-from linkpose.errors import CannotRead, FileExists
+from linkpose.errors import CannotRead, FileError, FileExists
 from linkpose.evaluation.references import read_any
 from linkpose.evaluation.scores import evaluate
 from linkpose.flashing.image import read_image
-from linkpose.localization.carmen import is_carmen
-from linkpose.localization.events import read_events
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.tables import read_beacons, read_truth
-from linkpose.recording.csvfile import create
+from linkpose.recording.csvfile import STDOUT, create, write_all
 from linkpose.recording.reader import RecordingFile
 from linkpose.recording.table import read_table
 from linkpose.sensors.rig import Rig
@@ -33,8 +32,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "reference": read_any,
     "rig": Rig.load,
     "map": load_map,
-    "carmen": is_carmen,
-    "events": read_events,
+    "log": read_log,
     "beacons": read_beacons,
     "truth": read_truth,
     "hex": read_image,
@@ -106,3 +104,12 @@ def test_an_output_may_be_a_link_to_a_file_that_does_not_exist_yet(tmp_path: Pat
         create(link, force=False)
     os.close(create(link, force=True))
     assert link.is_symlink() and target.exists()
+
+
+def test_the_standard_output_has_its_name_in_messages() -> None:
+    full = os.open("/dev/full", os.O_WRONLY)
+    try:
+        with pytest.raises(FileError, match="cannot write to the standard output any more: No space left"):
+            write_all(full, STDOUT, b"0\n")
+    finally:
+        os.close(full)

@@ -277,6 +277,7 @@ def command(
     page.check()
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
+    from linkpose import precompile
     from linkpose.localization.localizer import check, localize, most_at_once
     from linkpose.localization.logs import read_log
     from linkpose.localization.maps import load_map
@@ -322,7 +323,7 @@ def command(
             "the log has no odometry: a constant-velocity model is used (--acceleration-std), "
             "at the mean height of the beacons"
         )
-    console.compile(names)
+    console.compile([*names, precompile.NOISES] if beacons and not has_scans else names)
     if beacons and not has_scans:
         chosen = _tuned(events, chosen, beacons, free, console)
     tracks: dict[str, Track] = {
@@ -369,6 +370,7 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
     """Reads rows from standard input and writes a row of CSV for each, until the input ends or the user interrupts."""
     import sys
 
+    from linkpose import precompile
     from linkpose.localization.output import header_line, row_line
     from linkpose.localization.stream import Stream
 
@@ -379,7 +381,7 @@ def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons
     settings["estimate"] = () if words == ("none",) else words
     free = _free_noises(settings)
     method = cast("Method", name)
-    console.compile([name])
+    console.compile([name, precompile.NOISES])
     stream = Stream(method, _settings(settings, method, None), beacons, free, not words, console.report)
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")

@@ -70,6 +70,15 @@ LEAST_ACOUSTIC = 0.01
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 
 
+def warm_up() -> None:
+    """Compiles the likelihood, or loads it compiled."""
+    log: Log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(0.1, "range", (1.0,), "1")]
+    settings = Settings(drift_std_m=0.1)
+    start = Localizer(log, "ekf", settings, None, {"1": (1.0, 0.0, 0.0)})
+    rows, events = _arrays(log, start, None)
+    _run(rows, events, settings, start)
+
+
 def tune(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Settings:
     """The settings with the noises `free` (of TUNABLE) estimated from the log; unchanged where the log has fewer than
     FEWEST ranges and bearings, or where no noise that was tried makes the filter work.

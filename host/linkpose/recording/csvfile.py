@@ -137,6 +137,7 @@ def _standard_output() -> int:
 
 def write_all(fd: int, path: Path, data: bytes) -> None:
     """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
+    name = "the standard output" if path == STDOUT else path
     left = memoryview(data)
     written = 0
     try:
@@ -148,10 +149,10 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
         if written:
             _cut_back(fd, data[:written])
         if error.errno == errno.EPIPE:
-            raise FileError(path, f"the reader of {path} has gone; nothing more can be written to it") from error
+            raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
         raise FileError(
             path,
-            f"cannot write to {path} any more: {error.strerror}; what was written so far is whole, "
+            f"cannot write to {name} any more: {error.strerror}; what was written so far is whole, "
             "make room or name a file on another disk",
         ) from error
 
