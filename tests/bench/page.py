@@ -20,7 +20,7 @@ import numpy as np
 from _report import Row, report
 
 import linkpose as lp
-from linkpose.page import Page, Status
+from linkpose.page import Page, PageStatus
 from linkpose.simulation.link import PAPER_J2S_M, simulate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "host"))
@@ -59,7 +59,7 @@ def feed(page: Page, rows: np.ndarray, height: int, seconds: float) -> tuple[dic
     for at in range(round(seconds / INTERVAL_S)):
         time.sleep(max(0.0, began + at * INTERVAL_S - time.perf_counter()))
         before = time.thread_time()
-        page.show(rows[at : at + 1], lambda: Status(HEALTH))
+        page.show(rows[at : at + 1], lambda: PageStatus(HEALTH))
         busy_s += time.thread_time() - before
         shown.setdefault(f"{rows[at, height]:.4f} m ±", []).append(time.time())
     return shown, busy_s

@@ -16,7 +16,7 @@ from rich.console import Console
 import linkpose as lp
 from linkpose.cli.view import Screen
 from linkpose.estimation import Estimates
-from linkpose.page import Page, Status
+from linkpose.page import Page, PageStatus
 from linkpose.presentation import RowReader
 from linkpose.simulation.link import PAPER_J2S_M, simulate
 
@@ -45,7 +45,7 @@ def draw_page(estimates: Estimates) -> None:
     from browser import Browser
 
     with Page(estimates.columns, estimates.rig, "sim://link", on_mark=print) as page, Browser(1120, 720, 1) as browser:
-        page.show(estimates.values[::5], lambda: Status(HEALTH))
+        page.show(estimates.values[::5], lambda: PageStatus(HEALTH))
         browser.open(page.url)
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
         time.sleep(30)  # the scene fades in, slowly on a loaded machine without a graphics card

@@ -42,7 +42,7 @@ def unnamed(found: list[str]) -> list[str]:
 
 
 def test_the_columns_of_recordings() -> None:
-    found = columns.names(columns.Layout(1, imu2=True, mag=True))
+    found = columns.names(columns.ColumnLayout(1, imu2=True, mag=True))
     assert "mag_fresh" in found and not unnamed(found)
     assert unnamed(["gyro_z_rad", "tilt_height_km"]) == ["gyro_z_rad", "tilt_height_km"]
 

@@ -28,7 +28,7 @@ from websockets.typing import Origin, Subprotocol
 from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
-from linkpose.page import Page, Status, geometry
+from linkpose.page import Page, PageStatus, geometry
 from linkpose.page.history import PATH_POINTS, SPAN_S, History
 from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
@@ -66,9 +66,9 @@ def link_rows(count: int = 200) -> np.ndarray:
     return np.column_stack([time, height, 0.02 * std, roll, 1.5 * std, pitch, 1.5 * std])
 
 
-def status(imu: str = "ok") -> Callable[[], Status]:
+def status(imu: str = "ok") -> Callable[[], PageStatus]:
     health: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": imu}, "baro": {"state": "ok"}})
-    return lambda: Status(health)
+    return lambda: PageStatus(health)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +121,7 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
         assert "IMU ok" not in browser.evaluate("document.body.innerText")
         found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
-        page.show(np.empty(0), lambda: Status(status()().health, found))
+        page.show(np.empty(0), lambda: PageStatus(status()().health, found))
         browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
         browser.open("about:blank")  # and back: the page goes on
         browser.open(page.url)

@@ -161,7 +161,7 @@ def test_a_map_and_beacons_lie_under_the_path(tmp_path):
     t = np.arange(50) / 100
     file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
     grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
-    scene = plotting.Scene(grid, {"A1": (3.0, 4.0, 9.0)})
+    scene = plotting.PathBackground(grid, {"A1": (3.0, 4.0, 9.0)})
     figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
     (path,) = figure.axes
     (image,) = path.images

@@ -167,7 +167,7 @@ def test_other_tools_read_it(recording):
     lines = recording.read_text().splitlines()
     assert lines[0] == "# linkpose recording 1"
     assert json.loads(lines[1][1:])["settings"]["sample_rate_hz"] == 100
-    assert lines[2].split(",") == columns.names(columns.Layout(0))
+    assert lines[2].split(",") == columns.names(columns.ColumnLayout(0))
     assert json.loads(lines[-1][1:])["samples"] == 300
 
 

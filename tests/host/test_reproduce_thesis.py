@@ -14,7 +14,7 @@ from linkpose.experiments import indoor, underwater
 from linkpose.experiments.paths import Path, rms_within, worst_sections
 from linkpose.experiments.variants import Variant, remark, sign_test, verdict
 from linkpose.localization.grid import GridMap
-from linkpose.localization.tables import Score
+from linkpose.localization.tables import PathScore
 from linkpose.plotting.canvas import COLOURS
 from linkpose.simulation.underwater import BEACONS
 
@@ -39,7 +39,7 @@ def test_the_sign_test_is_the_exact_two_sided_binomial_test(wins: int, losses: i
 
 
 def scored(*errors_m: float) -> Variant:
-    return Variant("ekf", "fixed", 0.0, None, scores=[Score(error, error, 0.0) for error in errors_m])
+    return Variant("ekf", "fixed", 0.0, None, scores=[PathScore(error, error, 0.0) for error in errors_m])
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from linkpose.simulation.baro import DATASHEET_WORDS
 from linkpose.wire.messages import DeviceFamily, DeviceState, HelloMouse
 
 # BST-BMP280-DS001, 3.12.
-BMP280_WORDS = bmp280.Calibration(27504, 26435, -1000, 36477, -10685, 3024, 2855, 140, -7, 15500, -14600, 6000)
+BMP280_WORDS = bmp280.Bmp280Calibration(27504, 26435, -1000, 36477, -10685, 3024, 2855, 140, -7, 15500, -14600, 6000)
 
 
 def test_bmp280_data_sheets_example():
@@ -35,7 +35,7 @@ def test_bmp280_data_sheets_example():
 def test_a_barometer_compensates_by_its_family():
     words = tuple(word & 0xFFFF for word in BMP280_WORDS)
     other = Barometer(DeviceFamily.BMP280, words, 1)
-    assert other.is_sound and bmp280.Calibration.of(words) == BMP280_WORDS
+    assert other.is_sound and bmp280.Bmp280Calibration.of(words) == BMP280_WORDS
     temperature, pressure = other.compensate(np.array([519888 // 16] * 2), np.array([415148] * 2))
     assert pressure.tolist() == pytest.approx([100653.27] * 2, abs=0.05) and temperature[0] == pytest.approx(
         25.08, abs=0.005

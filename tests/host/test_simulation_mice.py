@@ -16,7 +16,7 @@ import pytest
 import linkpose
 from linkpose.errors import LinkposeError
 from linkpose.recording.reader import load_recording
-from linkpose.simulation.drive import Manoeuvres, Track
+from linkpose.simulation.drive import DrivenPath, Manoeuvres
 from linkpose.simulation.mice import LEVELS, Fault, MiceRun, MouseErrors, ring
 from linkpose.wire.messages import SampleFlags
 
@@ -46,7 +46,7 @@ def test_a_circle_s_pose_is_exact():
             return np.outer(time_s, [0.5, 0.0, math.pi / 2])
 
     radius = 0.5 / (math.pi / 2)
-    pose = Track(Circle((0,))).pose(np.array([2.0, 4.0]))
+    pose = DrivenPath(Circle((0,))).pose(np.array([2.0, 4.0]))
     np.testing.assert_allclose(pose, [[0, 2 * radius, math.pi], [0, 0, 2 * math.pi]], atol=1e-9)
 
 

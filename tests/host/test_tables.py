@@ -25,7 +25,7 @@ from linkpose.recording.table import read_table
 
 RIG = {"joint": {"j2s_m": [-0.09, 1.0, 1.65], "j2s_std_m": 0.0001}}
 METADATA = {"software": "linkpose", "device": 'sim://a?b=1&c="d"', "settings": {"sample_rate_hz": 100}, "is": True}
-NAMES = columns.names(columns.Layout(1))
+NAMES = columns.names(columns.ColumnLayout(1))
 rows_of_recordings = st.lists(
     st.tuples(
         *[st.integers(-156_000_000, 156_000_000)] * 3,

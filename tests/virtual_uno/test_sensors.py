@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from linkpose.sensors.bmp180 import Calibration, compensate
+from linkpose.sensors.bmp180 import Bmp180Calibration, compensate
 from virtual_uno import VirtualUno
 
 MPU, BMP = 0x68, 0x77
@@ -137,7 +137,7 @@ def test_slaves_can_be_made_silent(asleep: MakeBoard) -> None:
 
 # --- BMP180 ---
 
-EXAMPLE = Calibration(408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
+EXAMPLE = Bmp180Calibration(408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
 
 
 def convert(uno: VirtualUno, control: int, wait_ms: float) -> int:

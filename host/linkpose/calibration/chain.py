@@ -96,7 +96,7 @@ _TURNS_ITSELF = 0.3  # share of the other sensor's rate from which on a sensor's
 _SIDE = np.array([1.0, 0.77, 0.61])  # the sense of an axis is arbitrary: j_2 lies on this side, as in the filter
 
 
-class Motion(NamedTuple):
+class HingeMotion(NamedTuple):
     """The relative motion of the links, as a hinge explains it."""
 
     axes: Floats  # (2, 3) j_1 and j_2
@@ -116,7 +116,7 @@ class ChainCalibration:
     """Mounting of both sensors, and the kind of the joint between them."""
 
     joint: Kind | None  # None: the motion does not show it
-    motion: Motion  # of a hinge that explains it best
+    motion: HingeMotion  # of a hinge that explains it best
     levers_m: Floats  # (2, 3) r_1 and r_2
     covariance_m2: Floats  # (6, 6) of both
     residual_m_s2: float  # rms, by axis, of the force at the joint's centre that the two sensors do not agree on
@@ -418,7 +418,7 @@ class _Rotations(NamedTuple):
     information: Floats  # (3, 3) of R's error, 1/rad²
 
 
-def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> Motion:
+def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> HingeMotion:
     """The hinge that explains the relative motion best.
 
     Minimises the play y = C_1 j_1 − R C_2 j_2 over both axes and over a small rotation of each R, whose prior is what
@@ -429,7 +429,7 @@ def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> Motion:
     return min(found, key=lambda each: each[0])[1]
 
 
-def _with_common_errors(motion: Motion, fit: _Fit, turning_rad_s: tuple[float, float]) -> Motion:
+def _with_common_errors(motion: HingeMotion, fit: _Fit, turning_rad_s: tuple[float, float]) -> HingeMotion:
     """The motion with errors of its axes that all pieces have in common.
 
     Play that follows the motion turns the axes by as much as itself. Errors of the accelerometers tilt R. They reach
@@ -522,7 +522,7 @@ class _Step(NamedTuple):
     cost: float
 
 
-def _fit_hinge(parts: Sequence[_Rotations], axes: Floats) -> tuple[float, Motion]:
+def _fit_hinge(parts: Sequence[_Rotations], axes: Floats) -> tuple[float, HingeMotion]:
     """Gauss-Newton for both axes and the small rotations of the pieces' R. Returns the cost and the motion."""
     turns = [np.eye(3)] * len(parts)
     for _ in range(_HINGE_STEPS):
@@ -539,7 +539,7 @@ def _fit_hinge(parts: Sequence[_Rotations], axes: Floats) -> tuple[float, Motion
     pulls = np.array([step.gradient for step in steps])
     covariance = inverse @ (pulls.T @ pulls) @ inverse + inverse
     sense = 1.0 if axes[1] @ _SIDE >= 0 else -1.0
-    found = Motion(sense * axes, covariance, *_turn_and_play(parts, turns, axes))
+    found = HingeMotion(sense * axes, covariance, *_turn_and_play(parts, turns, axes))
     return sum(step.cost for step in steps), found
 
 
@@ -586,7 +586,7 @@ def _small_turn(vector: Floats) -> Floats:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
-def _kind(motion: Motion) -> Kind | None:
+def _kind(motion: HingeMotion) -> Kind | None:
     if np.hypot(motion.turn_deg, motion.play_deg) < LEAST_TURN_DEG:
         return None
     ratio = motion.play_deg / max(motion.turn_deg, 1e-9)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from linkpose.localization.events import Log
     from linkpose.localization.localizer import Method
     from linkpose.localization.settings import Settings
-    from linkpose.localization.tables import Beacons, Score
+    from linkpose.localization.tables import Beacons, PathScore
     from linkpose.localization.track import Track
     from linkpose.recording.table import Table
 
@@ -339,7 +339,7 @@ def command(
     if picture is not None:
         from linkpose import plotting
 
-        scene = plotting.Scene(grid, beacons, tracks[names[0]].rejected_xy_m)
+        scene = plotting.PathBackground(grid, beacons, tracks[names[0]].rejected_xy_m)
         figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], scene)
         plotting.save(figure, picture, force)
     for name, track in tracks.items():
@@ -500,7 +500,7 @@ def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float
     )
 
 
-def _summary(name: str, track: Track, result: Score | None) -> dict[str, object]:
+def _summary(name: str, track: Track, result: PathScore | None) -> dict[str, object]:
     row: dict[str, object] = {
         "filter": name,
         "updates": track.applied,
@@ -522,7 +522,7 @@ def _summary(name: str, track: Track, result: Score | None) -> dict[str, object]
     return row
 
 
-def _sentence(name: str, track: Track, result: Score | None) -> str:
+def _sentence(name: str, track: Track, result: PathScore | None) -> str:
     text = f"{name}: {counted(track.applied, 'measurement')} applied, {track.rejected} rejected"
     known = track.known
     if not known.all():

@@ -128,10 +128,10 @@ def show_newest(
     compiling: Precompilation,
 ) -> None:
     """Shows the newest row of a live run, which may be empty. Raises KeyboardInterrupt once "stop" was pressed."""
-    from linkpose.page.status import Status
+    from linkpose.page.status import PageStatus
 
     if page is not None:
-        page.show(newest, lambda: Status(health(), estimator.found_j2s, compiling.progress))
+        page.show(newest, lambda: PageStatus(health(), estimator.found_j2s, compiling.progress))
         page.raise_if_stopped()
 
 

@@ -16,7 +16,7 @@ from linkpose.errors import printable
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
     from linkpose.page.scene import Surroundings
-    from linkpose.plotting import Scene
+    from linkpose.plotting import PathBackground
     from linkpose.recording.table import Table
 
 _ANIMATION = ".html"
@@ -100,7 +100,7 @@ def command(
         click.echo(output)
 
 
-def _save_animation(tables: list[Table], wanted: list[str], output: Path, scene: Scene | None) -> None:
+def _save_animation(tables: list[Table], wanted: list[str], output: Path, scene: PathBackground | None) -> None:
     """Writes the first estimate, with the reference if there is one, as an animation in 3-D."""
     from linkpose.page.animation import save_animation
     from linkpose.page.tables import corners_of, rig_of, rows_of
@@ -110,7 +110,7 @@ def _save_animation(tables: list[Table], wanted: list[str], output: Path, scene:
     save_animation(output, columns, values, rig_of(tables), surroundings)
 
 
-def _surroundings(scene: Scene | None) -> Surroundings:
+def _surroundings(scene: PathBackground | None) -> Surroundings:
     from linkpose.page.scene import Surroundings
 
     return Surroundings(scene.grid, scene.beacons) if scene is not None else Surroundings()
@@ -120,14 +120,14 @@ def _show_progress(console: Console, path: Path) -> Callable[[float], None]:
     return lambda share: console.progress(lambda: f"reading {path} {share:.0%}")
 
 
-def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
+def _scene(map_file: Path | None, beacons: Path | None) -> PathBackground | None:
     """What --map and --beacons put under the path."""
     if map_file is None and beacons is None:
         return None
     from linkpose.localization.maps import load_map
     from linkpose.localization.tables import read_beacons
-    from linkpose.plotting import Scene
+    from linkpose.plotting import PathBackground
 
     grid = load_map(map_file) if map_file else None
     places = read_beacons(beacons) if beacons else {}
-    return Scene(grid, {str(name): place for name, place in places.items()})
+    return PathBackground(grid, {str(name): place for name, place in places.items()})

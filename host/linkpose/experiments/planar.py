@@ -30,7 +30,7 @@ EXACT = MouseErrors(scale=0.0, angle_deg=0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class PlanarRun:
     """A simulated drive: what the filters read, and the truth (N, 3) of x, y (m) and heading (rad, not wrapped)."""
 
     rig: Rig
@@ -49,14 +49,14 @@ class PoseError:
 def drive(
     seed: int, duration_s: float = 60.0, faults: tuple[Fault, ...] = (), mice: int = 3, scale: float = 1.0,
     errors: MouseErrors = EXACT,
-) -> Drive:  # fmt: skip
+) -> PlanarRun:  # fmt: skip
     """A drive from a rest of 4 s on; the mice count `scale` times as much as the rig states."""
     path = Manoeuvres((seed, 0), RESTS)
     run = MiceRun(seed, duration_s, RATE_HZ, ring(mice), mouse_errors=errors, faults=faults, drive=path)
     return _driven(run, scale)
 
 
-def drive_from_motion(seed: int) -> Drive:
+def drive_from_motion(seed: int) -> PlanarRun:
     """A drive at up to 2 m/s that begins at full speed."""
     whole = Manoeuvres((seed, 0), RESTS)
     instants = np.arange(0.0, 60.0, 0.1)
@@ -67,19 +67,19 @@ def drive_from_motion(seed: int) -> Drive:
     return _driven(run, 1.0)
 
 
-def _driven(run: MiceRun, scale: float) -> Drive:
+def _driven(run: MiceRun, scale: float) -> PlanarRun:
     truth, block = run.truth(), run.measurements()
     rate = np.full_like(block.gyro_rad_s, 0.0)
     rate[:, 2] = truth.wz_rad_s + rate_noise(run.seed, len(block), run.rate_hz)
     rig = Rig(mouse=tuple(replace(mouse, counts_per_m=mouse.counts_per_m / scale) for mouse in run.mice))
-    return Drive(rig, replace(block, gyro_rad_s=rate), np.column_stack([truth.x_m, truth.y_m, truth.heading_rad]))
+    return PlanarRun(rig, replace(block, gyro_rad_s=rate), np.column_stack([truth.x_m, truth.y_m, truth.heading_rad]))
 
 
 def _all(kind: str, seconds: float) -> tuple[Fault, ...]:
     return tuple(Fault(kind, mouse, FAULT_FROM_S, FAULT_FROM_S + seconds) for mouse in (1, 2, 3))
 
 
-CASES: dict[str, Callable[[int], Drive]] = {
+CASES: dict[str, Callable[[int], PlanarRun]] = {
     "three mice": drive,
     "ten minutes": lambda seed: drive(seed, 600.0),
     "all mice + 5 %": lambda seed: drive(seed, scale=1 / FLOOR_SCALE),
@@ -92,7 +92,7 @@ CASES: dict[str, Callable[[int], Drive]] = {
 }
 
 
-def baseline(drive: Drive) -> Floats:
+def baseline(drive: PlanarRun) -> Floats:
     """x, y (m) and heading (rad) at each sample, (N, 3): the gyro for the heading, the mean of the mice for the way."""
     m, mice = drive.measurements, drive.rig.mouse
     step = np.diff(m.time_s, prepend=m.time_s[0])

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, TypeAlias
 
 from linkpose.localization.kalman import FilterName
-from linkpose.localization.tables import Score
+from linkpose.localization.tables import PathScore
 
 # Receives the runs of an experiment and yields them again: the place for a progress bar.
 Progress: TypeAlias = Callable[[Iterable[Any]], Iterable[Any]]
@@ -26,7 +26,7 @@ class Variant:
     correlation: float
     gate: float | None
     others: dict[str, object] = field(default_factory=dict)
-    scores: list[Score] = field(default_factory=list)
+    scores: list[PathScore] = field(default_factory=list)
 
     def position_rmse_m(self) -> float:
         """Mean over the seeds."""

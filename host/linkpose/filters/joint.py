@@ -55,15 +55,15 @@ from linkpose.sensors.rig import Rig
 _UNSETTLED_RAD2 = 2e-6
 
 
-class History(NamedTuple):
+class RateHistory(NamedTuple):
     """The two samples before the present one, for the derivative of the rate; changed in place."""
 
     time: Floats  # (2,) s: one and two samples ago, NaN where that sample has no usable rate
     rate: Floats  # (2, 3) rad/s
 
     @staticmethod
-    def fresh() -> History:
-        return History(np.full(2, np.nan), np.zeros((2, 3)))
+    def fresh() -> RateHistory:
+        return RateHistory(np.full(2, np.nan), np.zeros((2, 3)))
 
 
 class JointFilter:
@@ -78,7 +78,7 @@ class JointFilter:
             raise MissingJ2S(self.name)
         self.parameters = parameters or TiltParameters()
         self.state = TiltState.fresh()
-        self._history = History.fresh()
+        self._history = RateHistory.fresh()
         self._imu = ImuCalibration.of(rig.imu)
         self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.std_of_axes_m
 
@@ -162,7 +162,7 @@ def _process(
     parameters: TiltParameters,
     joint: tuple[Vec, Vec],
     state: TiltState,
-    history: History,
+    history: RateHistory,
     out: Floats,
 ) -> None:
     now = load_state(state)

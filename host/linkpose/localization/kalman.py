@@ -25,7 +25,7 @@ WIDEST = {"x_m": 50.0, "y_m": 50.0, "heading_rad": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionModel:
     """A motion model's form: its number, its states with their units in the name, and how many controls and noises it
     takes.
     """
@@ -40,15 +40,15 @@ class Motion:
         """Which states live on the circle: the headings."""
         return np.array([name.startswith("heading") for name in self.states])
 
-    def extended(self, constants: tuple[str, ...]) -> Motion:
+    def extended(self, constants: tuple[str, ...]) -> MotionModel:
         """With constants to estimate after its own states."""
-        return Motion(self.model, self.states + constants, self.controls, self.noises)
+        return MotionModel(self.model, self.states + constants, self.controls, self.noises)
 
 
-UNICYCLE = Motion(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
-CONSTANT_VELOCITY = Motion(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 0, 2)
-HOLONOMIC = Motion(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
-SUBMERSIBLE = Motion(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
+UNICYCLE = MotionModel(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
+CONSTANT_VELOCITY = MotionModel(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 0, 2)
+HOLONOMIC = MotionModel(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
+SUBMERSIBLE = MotionModel(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class KalmanFilter:
     """
 
     name: FilterName
-    motion: Motion
+    motion: MotionModel
     state: Floats
     covariance: Floats
     noise_root: Floats

@@ -15,11 +15,11 @@ from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
 from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.measuring import Sensors, constant_states, drift_state, thesis_beams
+from linkpose.localization.measuring import MeasurementBuilder, constant_states, drift_state, thesis_beams
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.relocation import Relocator
 from linkpose.localization.settings import DRIFT, Pose, Settings
-from linkpose.localization.smoother import History
+from linkpose.localization.smoother import FilterPass
 from linkpose.localization.tables import Beacons
 from linkpose.localization.track import Track
 from linkpose.localization.vehicle import (
@@ -156,7 +156,7 @@ class Localizer:
             grid or no_map(),
             drifts_of(settings, motion),
         )
-        self.sensors = Sensors(settings, motion, beacons)
+        self.sensors = MeasurementBuilder(settings, motion, beacons)
         self.control, self.hold = np.zeros(motion.controls), np.ones(motion.noises)
         self.now = head[0].time_s
         self.last_control_s: float | None = None
@@ -168,7 +168,7 @@ class Localizer:
         self.is_replaced = False  # by the last measurement
         self.rivalry: Floats | None = None  # what a better pose adds to the covariance until it replaces this one
         self.known = start is not None
-        self.history = History() if settings.smooth else None
+        self.history = FilterPass() if settings.smooth else None
         self.laser: ScanTracker | None = None
         if name == "scan-match" and "scan" in kinds and grid is not None:
             from linkpose.localization.scan_tracking import ScanTracker

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from linkpose.localization import models
 from linkpose.localization.carmen import BEAM_ANGLES_RAD
 from linkpose.localization.events import Event, Scan
-from linkpose.localization.kalman import SUBMERSIBLE, Measurement, Motion
+from linkpose.localization.kalman import SUBMERSIBLE, Measurement, MotionModel
 from linkpose.localization.linalg import Floats
 from linkpose.localization.settings import CONSTANTS, DRIFT, ERROR_TIME_S, Settings
 from linkpose.localization.tables import Beacons
@@ -53,10 +53,10 @@ def _safe(beacon: str) -> str:
     return re.sub(r"\W", "_", beacon)
 
 
-class Sensors:
+class MeasurementBuilder:
     """Builds measurements for one motion model, with the constants that are estimated."""
 
-    def __init__(self, settings: Settings, motion: Motion, beacons: Beacons) -> None:
+    def __init__(self, settings: Settings, motion: MotionModel, beacons: Beacons) -> None:
         self.settings, self.beacons = settings, beacons
         self.states = motion.states
         self.height = self.states.index("z_m") if "z_m" in self.states else -1

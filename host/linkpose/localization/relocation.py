@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from linkpose.localization import models
 from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
-from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE, KalmanFilter, Motion
+from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE, KalmanFilter, MotionModel
 from linkpose.localization.linalg import Floats
-from linkpose.localization.measuring import Sensors
+from linkpose.localization.measuring import MeasurementBuilder
 from linkpose.rotations import wrapped
 
 # Of the latest so many measurements, so many contradict the pose: fewer are outliers, more delay the recovery.
@@ -76,7 +76,7 @@ class Relocation:
 class Relocator:
     """Collects the latest sightings of beacons and compares the filter's pose with the best fit of them."""
 
-    def __init__(self, motion: Motion, sensors: Sensors) -> None:
+    def __init__(self, motion: MotionModel, sensors: MeasurementBuilder) -> None:
         self.motion, self.sensors = motion, sensors
         free = ("x_m", "y_m") if motion.model == SUBMERSIBLE.model else tuple(PRIOR)
         self.at = np.array([i for i, name in enumerate(motion.states) if name in free])

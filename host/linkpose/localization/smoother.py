@@ -29,7 +29,7 @@ class _Step:
 
 
 @dataclass(slots=True)
-class History:
+class FilterPass:
     """What the backward pass needs of a filter."""
 
     steps: list[_Step] = field(default_factory=list)

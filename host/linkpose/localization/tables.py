@@ -88,7 +88,7 @@ def _read_whole(path: Path, *required: str) -> Table:
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class PathScore:
     """Errors of an estimated path against the truth. The heading's is None where either path has no heading.
 
     `rows` of `possible` were compared; `within_2_sigma` is the share of the errors in x and y within two standard
@@ -103,7 +103,7 @@ class Score:
     within_2_sigma: float | None = None
 
 
-def score_track(track: Track, truth: Truth) -> Score:
+def score_track(track: Track, truth: Truth) -> PathScore:
     """Compares a track with the truth; rows before the pose is known are left out."""
     known = track.known
     heading = None if track.heading_rad is None else track.heading_rad[known]
@@ -113,7 +113,7 @@ def score_track(track: Track, truth: Truth) -> Score:
 
 def score(
     time_s: Floats, position_m: Floats, heading_rad: Floats | None, truth: Truth, std_m: Floats | None = None
-) -> Score:
+) -> PathScore:
     """Compares estimates at times (N,), positions (N, 2 or 3), headings (N,) and deviations of x and y (N, 2).
 
     Estimates between two true poses at most LONGEST_TRUTH_GAP_S apart are compared at their own times. Where the truth
@@ -150,4 +150,4 @@ def score(
         off = np.interp(at[rows], time_s, np.unwrap(heading_rad)) - np.interp(at[rows], truth.time_s, truth.heading_rad)
         heading = math.sqrt(float(np.mean([wrap_angle(value) ** 2 for value in off])))
     worst = math.sqrt(float(np.max(distance2)))
-    return Score(math.sqrt(float(np.mean(distance2))), worst, heading, used, possible, within)
+    return PathScore(math.sqrt(float(np.mean(distance2))), worst, heading, used, possible, within)

@@ -13,7 +13,7 @@ from linkpose.localization.kalman import (
     HOLONOMIC,
     SUBMERSIBLE,
     UNICYCLE,
-    Motion,
+    MotionModel,
     covariance_root,
 )
 from linkpose.localization.linalg import Floats
@@ -33,7 +33,7 @@ def kinds_of(log: Iterable[Event | Scan]) -> set[str]:
     return {event.kind for event in log}
 
 
-def vehicle_of(kinds: set[str]) -> Motion:
+def vehicle_of(kinds: set[str]) -> MotionModel:
     """The motion model for these kinds of measurement."""
     if kinds & DIVING:
         return SUBMERSIBLE
@@ -95,7 +95,7 @@ def place_from_ranges(log: Log, beacons: Beacons) -> Pose | None:
     return (x, y, 0.0) if np.isfinite([x, y]).all() else None
 
 
-def start_state(pose: Pose, depth_m: float, settings: Settings, motion: Motion) -> tuple[Floats, Floats]:
+def start_state(pose: Pose, depth_m: float, settings: Settings, motion: MotionModel) -> tuple[Floats, Floats]:
     """State and standard deviations at the log's start."""
     state, std = np.zeros(len(motion.states)), np.zeros(len(motion.states))
     far, turned = settings.start_std
@@ -120,7 +120,7 @@ def _nuisance_std(name: str, settings: Settings) -> float:
     return next(std for stem, _, std in CONSTANTS.values() if name.startswith(stem))
 
 
-def drifts_of(settings: Settings, motion: Motion) -> Floats | None:
+def drifts_of(settings: Settings, motion: MotionModel) -> Floats | None:
     """Rates (1/s) and variances (n, 2) of the states that drift; None where none does."""
     if settings.drift_std_m == 0.0:
         return None
@@ -128,7 +128,7 @@ def drifts_of(settings: Settings, motion: Motion) -> Floats | None:
     return np.outer(is_drift, (1.0 / settings.drift_time_s, settings.drift_std_m**2))
 
 
-def noise_root(settings: Settings, vehicle: Motion) -> Floats:
+def noise_root(settings: Settings, vehicle: MotionModel) -> Floats:
     """The lower Cholesky factor of Q, (16): off-diagonal between the errors of speed and turn rate, or of a velocity's
     axes.
     """

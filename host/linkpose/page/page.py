@@ -16,7 +16,7 @@ from linkpose.errors import LinkposeError
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
-from linkpose.page.status import Status
+from linkpose.page.status import PageStatus
 from linkpose.presentation import Exclusions, fault_lines, working_sensors
 from linkpose.quantities import EXCLUDED
 from linkpose.sensors.measurements import Floats
@@ -80,7 +80,7 @@ class Page:
         self._replay = replay
         self._exclusions = Exclusions()
         self._queue: deque[Floats] = deque(maxlen=QUEUE_BLOCKS)
-        self._status, self._blocks = Status(), 0
+        self._status, self._blocks = PageStatus(), 0
         self._updates = 0
         self._clients: set[int] = set()
         self._marks: list[float] = []
@@ -93,7 +93,7 @@ class Page:
         self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
         self._thread.start()
 
-    def show(self, estimates: Floats, status: Callable[[], Status]) -> None:
+    def show(self, estimates: Floats, status: Callable[[], PageStatus]) -> None:
         """Takes estimates (N, columns) or the newest row (columns,). Never waits.
 
         `status` is called now and then, in the thread of the caller.
@@ -221,14 +221,14 @@ class Page:
         self._server.flush()  # at once: viser would wait for more
         self._updates += 1
 
-    def _draw_estimates(self, newest: Floats, row: Any, name: str, status: Status) -> None:
+    def _draw_estimates(self, newest: Floats, row: Any, name: str, status: PageStatus) -> None:
         self._panel.draw_headline(row, name)
         j2s_m = status.j2s.mean_m if status.j2s is not None else None
         self._drawing.draw(newest, row, name, self._history, j2s_m)
         if self._updates % CHART_INTERVAL == 0:
             self._panel.draw_charts(self._history.window(), name)
 
-    def _draw_health(self, newest: Floats | None, status: Status) -> None:
+    def _draw_health(self, newest: Floats | None, status: PageStatus) -> None:
         health, words = status.health, []
         if newest is not None:
             words.append(f"{newest[0]:.1f} s")

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class PageStatus:
     """What the page shows besides the estimates."""
 
     health: Health | None = None

@@ -9,7 +9,7 @@ import numpy as np
 
 from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import band, draw, shade
-from linkpose.plotting.sources import Sources, Track, is_barometric, pairs
+from linkpose.plotting.sources import DrawnTrack, Sources, is_barometric, pairs
 from linkpose.quantities import YAW, Quantity, unit_text
 from linkpose.sensors.measurements import Floats
 
@@ -26,7 +26,7 @@ def has(sources: Sources, *wanted: Quantity) -> bool:
     return any(track.has(q) for track in sources.tracks or sources.all for q in wanted)
 
 
-def shade_unknown(axes: Axes, tracks: Sequence[Track]) -> None:
+def shade_unknown(axes: Axes, tracks: Sequence[DrawnTrack]) -> None:
     """Shades gaps of the first file, and where none of its filters gives a value."""
     first = [track for track in tracks if track.file == tracks[0].file and track.values] if tracks else []
     if first:
@@ -56,7 +56,7 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
         legend_above(axes, best_first=[track.label for track, _ in drawn])
 
 
-def _from_start_of(estimate: Track, reference: Track) -> Floats:
+def _from_start_of(estimate: DrawnTrack, reference: DrawnTrack) -> Floats:
     """The reference's yaw, turned to agree with the estimate's where both begin: no filter measures north."""
     ours, theirs = estimate.values[YAW], reference.values[YAW]
     known = np.flatnonzero(np.isfinite(ours))
@@ -100,7 +100,7 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
     legend_above(axes, best_first=order)
 
 
-def _scored(sources: Sources, name: str) -> list[tuple[Track, Errors]]:
+def _scored(sources: Sources, name: str) -> list[tuple[DrawnTrack, Errors]]:
     """The drawn filters that have errors of a quantity, best first."""
     scored = ((track, sources.scores.get((track.file, track.name))) for track in sources.tracks)
     return [(track, score.errors[name]) for track, score in scored if score and name in score.errors]

@@ -11,7 +11,7 @@ import numpy as np
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import errors, shade_unknown, view_values
-from linkpose.plotting.sources import Sources, Track
+from linkpose.plotting.sources import DrawnTrack, Sources
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.rotations import rotation_vectors
 from linkpose.sensors.devices import MAX_MICE
@@ -30,7 +30,7 @@ TimePanel = tuple[float, Callable[["Axes"], None]]
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class PathBackground:
     """What lies under a robot's path, in its map's frame."""
 
     grid: GridMap | None = None
@@ -38,14 +38,14 @@ class Scene:
     rejected_xy_m: Floats | None = None  # (N, 2) where measurements were rejected
 
 
-def path_panel(sources: Sources, scene: Scene | None) -> Callable[[Axes], None] | None:
+def path_panel(sources: Sources, scene: PathBackground | None) -> Callable[[Axes], None] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
     tracks = _with_path(sources)
     wide = is_wide(sources, scene)
-    return (lambda axes: _path(axes, tracks, scene or Scene(), wide)) if tracks else None
+    return (lambda axes: _path(axes, tracks, scene or PathBackground(), wide)) if tracks else None
 
 
-def is_wide(sources: Sources, scene: Scene | None) -> bool:
+def is_wide(sources: Sources, scene: PathBackground | None) -> bool:
     """Whether a path, without a map, extends so much further along x than along y that a square would be empty."""
     if scene is not None and scene.grid is not None:
         return False
@@ -54,7 +54,7 @@ def is_wide(sources: Sources, scene: Scene | None) -> bool:
     return bool(extents) and bool(max(e[0] for e in extents) > _WIDE_RATIO * max(e[1] for e in extents))
 
 
-def _with_path(sources: Sources) -> list[Track]:
+def _with_path(sources: Sources) -> list[DrawnTrack]:
     return [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
 
 
@@ -74,7 +74,7 @@ def time_panels(sources: Sources) -> list[TimePanel]:
     return found
 
 
-def _path(axes: Axes, tracks: Sequence[Track], scene: Scene, wide: bool) -> None:
+def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: PathBackground, wide: bool) -> None:
     _draw_scene(axes, scene)
     for track in reversed(tracks):
         style = line_style(track.name, track.file) if track.name else TRUTH
@@ -91,7 +91,7 @@ def _path(axes: Axes, tracks: Sequence[Track], scene: Scene, wide: bool) -> None
     legend_above(axes, 6 if wide else 3, [track.label for track in tracks])
 
 
-def _draw_scene(axes: Axes, scene: Scene) -> None:
+def _draw_scene(axes: Axes, scene: PathBackground) -> None:
     if scene.grid is not None:
         draw_map(axes, scene.grid)
     if scene.beacons:
@@ -125,7 +125,7 @@ def _stride(cells: int) -> int:
     return max(1, cells // _MOST_CELLS)
 
 
-def _mark(axes: Axes, track: Track, colour: str) -> None:
+def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
     """Start, heading ticks and ±2σ ellipses along a path."""
     from matplotlib.patches import Ellipse
 
@@ -174,7 +174,7 @@ def _position_errors(axes: Axes, sources: Sources) -> None:
         legend_above(axes, 3)
 
 
-def _speed(track: Track) -> tuple[Floats, Floats | None] | None:
+def _speed(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:
     """Speed, and its σ along the motion."""
     if not track.has(VX):
         return None
@@ -183,7 +183,7 @@ def _speed(track: Track) -> tuple[Floats, Floats | None] | None:
     return np.hypot(track.values[VX], track.values[VY]), track.std.get(VX)
 
 
-def _heading(track: Track) -> tuple[Floats, Floats | None] | None:
+def _heading(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:
     if not track.has(HEADING):
         return None
     heading = track.values[HEADING].copy()
@@ -193,7 +193,7 @@ def _heading(track: Track) -> tuple[Floats, Floats | None] | None:
 
 
 def _over_time(
-    axes: Axes, sources: Sources, of: Callable[[Track], tuple[Floats, Floats | None] | None], label: str
+    axes: Axes, sources: Sources, of: Callable[[DrawnTrack], tuple[Floats, Floats | None] | None], label: str
 ) -> None:
     """A quantity of all tracks; ±2σ of the best."""
     drawn = [(track, found) for track in sources.tracks if (found := of(track)) is not None]
@@ -210,11 +210,11 @@ def _over_time(
     finish(axes, label)
 
 
-def _mice_panel(track: Track) -> Callable[[Axes], None]:
+def _mice_panel(track: DrawnTrack) -> Callable[[Axes], None]:
     return lambda axes: _mice(axes, track)
 
 
-def _mice(axes: Axes, track: Track) -> None:
+def _mice(axes: Axes, track: DrawnTrack) -> None:
     """A bar for each stretch in which a mouse was left out."""
     bits = np.nan_to_num(track.values[EXCLUDED]).astype(np.int64)
     shown = max(int(bits.max()).bit_length(), 1)

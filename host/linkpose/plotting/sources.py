@@ -24,7 +24,7 @@ _THINNED = "the picture shows the extremes of each part, and figures beside line
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class DrawnTrack:
     """The quantities of one filter, or of the reference, in the units in which they are shown."""
 
     name: str  # the filter; "" of the reference
@@ -43,14 +43,14 @@ class Track:
 class Sources:
     """Everything that one plot draws."""
 
-    tracks: list[Track]  # of filters, best first
-    reference: Track | None  # on the clock of the first estimate
+    tracks: list[DrawnTrack]  # of filters, best first
+    reference: DrawnTrack | None  # on the clock of the first estimate
     scores: dict[tuple[int, str], Score]  # by file and filter; empty without a reference
     hidden: list[str]  # filters that are not drawn
     remarks: list[str]
 
     @property
-    def all(self) -> list[Track]:
+    def all(self) -> list[DrawnTrack]:
         """The filters, then the reference."""
         return [*self.tracks, *([self.reference] if self.reference else [])]
 
@@ -121,7 +121,7 @@ def _rank(name: str) -> int:
     return filters.NAMES.index(name) if name in filters.NAMES else len(filters.NAMES)
 
 
-def _track(table: Table, name: str, columns: dict[Quantity, str], file: int, several: bool) -> Track:
+def _track(table: Table, name: str, columns: dict[Quantity, str], file: int, several: bool) -> DrawnTrack:
     values = {q: _shown_value(table, column, q) for q, column in columns.items()}
     std = {}
     for q, column in columns.items():
@@ -129,7 +129,7 @@ def _track(table: Table, name: str, columns: dict[Quantity, str], file: int, sev
         if sigma in table.columns and not q.std:
             std[q] = _shown_value(table, sigma or "", q)
     label = f"{name} ({table.path.stem})" if several else name
-    return Track(name, label, file, table.columns["time_s"], values, std)
+    return DrawnTrack(name, label, file, table.columns["time_s"], values, std)
 
 
 def _shown_value(table: Table, column: str, quantity: Quantity) -> Floats:
@@ -137,14 +137,14 @@ def _shown_value(table: Table, column: str, quantity: Quantity) -> Floats:
     return np.where(np.isfinite(value), value * quantity.value.scale, np.nan)
 
 
-def _reference(table: Table, offset_s: float) -> Track:
+def _reference(table: Table, offset_s: float) -> DrawnTrack:
     values = {}
     for column in table.columns:
         part = split(column)
         if part is not None and not part.is_std and part.prefix in ("", "chain"):
             values[part.quantity] = _shown_value(table, column, part.quantity)
     label = REFERENCES[0] if table.kind == "truth" else REFERENCES[1]
-    return Track("", label, 0, table.columns["time_s"] - offset_s, values, {})
+    return DrawnTrack("", label, 0, table.columns["time_s"] - offset_s, values, {})
 
 
 def _scores(estimates: Sequence[Table], reference: Table) -> tuple[dict[tuple[int, str], Score], float, list[str]]:
@@ -191,7 +191,7 @@ def _length(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 7200 else f"{seconds / 3600:.2f} h"
 
 
-def pairs(tracks: Sequence[Track], quantity: Quantity) -> Iterator[tuple[Track, Floats]]:
+def pairs(tracks: Sequence[DrawnTrack], quantity: Quantity) -> Iterator[tuple[DrawnTrack, Floats]]:
     """The tracks that have the quantity somewhere."""
     for track in tracks:
         if track.has(quantity):

@@ -37,7 +37,7 @@ _WIDE_PATH = 3.6  # height of a path above the panels
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class PlotPanel:
     """One panel over time: its share of the height, and what draws it."""
 
     share: float
@@ -48,7 +48,7 @@ class Panel:
 class Section:
     """A part of the figure: panels with a common time axis, and for a robot a path beside or above them."""
 
-    panels: list[Panel]
+    panels: list[PlotPanel]
     path: Callable[[Axes], None] | None = None
     is_wide: bool = False  # the path lies above the panels, over the whole width
 
@@ -62,7 +62,7 @@ class Section:
 
 
 def plot_tables(
-    tables: Sequence[Table], wanted: Sequence[str] = (), scene: robots.Scene | None = None
+    tables: Sequence[Table], wanted: Sequence[str] = (), scene: robots.PathBackground | None = None
 ) -> tuple[Figure, list[str]]:
     """Recordings, estimates and references in one figure, and remarks on what it leaves out.
 
@@ -118,16 +118,16 @@ def _link(sources: Sources) -> Section | None:
         return None
     found = []
     if panels.has(sources, HEIGHT):
-        found.append(Panel(3.0, lambda axes: panels.values(axes, sources, HEIGHT, legend=True)))
+        found.append(PlotPanel(3.0, lambda axes: panels.values(axes, sources, HEIGHT, legend=True)))
         if _scored(sources, HEIGHT):
             if panels.hides_best(sources, "height"):
-                found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
-            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "height")))
+                found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
+            found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height")))
         elif _estimated(sources, HEIGHT):
-            found.append(Panel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
+            found.append(PlotPanel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
     for quantity in (ROLL, PITCH, YAW):
         if panels.has(sources, quantity):
-            found.append(Panel(1.5, _values(sources, quantity, legend=not found)))
+            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found)))
     return Section(found)
 
 
@@ -135,32 +135,32 @@ def _chain(sources: Sources) -> Section | None:
     """Angle of a hinge (largest) and its error, or the angles of a ball joint; error of the rotation; heights."""
     found = []
     if panels.has(sources, ANGLE):
-        found.append(Panel(3.0, _values(sources, ANGLE, legend=True)))
+        found.append(PlotPanel(3.0, _values(sources, ANGLE, legend=True)))
         if _scored(sources, ANGLE):
-            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "angle")))
+            found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "angle")))
     for quantity in BALL_ANGLES:
         if panels.has(sources, quantity):
-            found.append(Panel(2.2, _values(sources, quantity, legend=not found)))
+            found.append(PlotPanel(2.2, _values(sources, quantity, legend=not found)))
     if any(track.has(*CHAIN_ROTATION) for track in sources.tracks or sources.all):
         if not found:
-            found.append(Panel(3.0, lambda axes: robots.rotation(axes, sources)))
+            found.append(PlotPanel(3.0, lambda axes: robots.rotation(axes, sources)))
         if _scored(sources, ROTATION):
-            found.append(Panel(1.9, lambda axes: panels.errors(axes, sources, "rotation")))
+            found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "rotation")))
     for quantity in (HEIGHT1, HEIGHT2):
         if panels.has(sources, quantity):
-            found.append(Panel(1.5, _values(sources, quantity, legend=not found)))
+            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found)))
     return Section(found) if found else None
 
 
-def _robot(sources: Sources, scene: robots.Scene | None) -> Section | None:
+def _robot(sources: Sources, scene: robots.PathBackground | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
     path = robots.path_panel(sources, scene)
-    over_time = [Panel(share, draw) for share, draw in robots.time_panels(sources)]
+    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources)]
     return Section(over_time, path, robots.is_wide(sources, scene)) if path or over_time else None
 
 
 def _readings(table: Table) -> Section | None:
-    found = [Panel(share, draw) for share, draw in readings.time_panels(table)]
+    found = [PlotPanel(share, draw) for share, draw in readings.time_panels(table)]
     return Section(found) if found else None
 
 

@@ -18,7 +18,7 @@ GYRO2 = tuple(f"imu2_{name}" for name in GYRO)
 MAG = ("mag_x_uT", "mag_y_uT", "mag_z_uT")
 
 
-class Layout(NamedTuple):
+class ColumnLayout(NamedTuple):
     """Which columns a recording has besides those that every recording has."""
 
     mouse_ports: int
@@ -44,7 +44,7 @@ _IMU2 = (
 _MAG = (*((name, f"%.{magnetometer.MAG_DECIMALS}f") for name in MAG), ("mag_fresh", "%.0f"))
 
 
-def _columns(layout: Layout) -> list[tuple[str, str]]:
+def _columns(layout: ColumnLayout) -> list[tuple[str, str]]:
     """Name and format of each column."""
     mice = [(name, "%.0f") for port in range(1, layout.mouse_ports + 1) for name in mouse_columns(port)]
     return [*_HEAD, *_IMU2 * layout.imu2, *_MAG * layout.mag, *mice, ("flags", "%.0f")]
@@ -55,12 +55,12 @@ def mouse_columns(port: int) -> tuple[str, str]:
     return f"mouse{port}_dx_counts", f"mouse{port}_dy_counts"
 
 
-def names(layout: Layout) -> list[str]:
+def names(layout: ColumnLayout) -> list[str]:
     """The header of a recording."""
     return [name for name, _ in _columns(layout)]
 
 
-def text(block: Block, layout: Layout) -> str:
+def text(block: Block, layout: ColumnLayout) -> str:
     """The block as lines of CSV. A missing value is an empty field."""
     part = block.measurements
     mice = part.mice_counts.reshape(len(part), 2 * layout.mouse_ports)
@@ -73,6 +73,6 @@ def text(block: Block, layout: Layout) -> str:
 
 
 @lru_cache(maxsize=16)
-def _line(layout: Layout) -> str:
+def _line(layout: ColumnLayout) -> str:
     """The format of a row."""
     return ",".join(code for _, code in _columns(layout)) + "\n"

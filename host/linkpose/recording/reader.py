@@ -329,7 +329,7 @@ class _TableSource:
 def _check_columns(path: Path, names: list[str]) -> int:
     """Number of mouse ports; raises FileFormatError for a column that no recording has, or without time_s."""
     require(path, names, "time_s")
-    known = columns.names(columns.Layout(MAX_MICE, imu2=True, mag=True))
+    known = columns.names(columns.ColumnLayout(MAX_MICE, imu2=True, mag=True))
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.4)

@@ -57,9 +57,9 @@ def closing(timeline: Timeline, corrupt: Corrupt, drift_ppm: float | None, **mor
     }
 
 
-def layout_of(settings: BoardSettings, mouse_ports: int = 0) -> columns.Layout:
+def layout_of(settings: BoardSettings, mouse_ports: int = 0) -> columns.ColumnLayout:
     """Columns of a recording of this board, with room for `mouse_ports` mice or for those found if they are more."""
-    return columns.Layout(max(settings.mouse_ports, mouse_ports), settings.has_imu2, settings.has_mag)
+    return columns.ColumnLayout(max(settings.mouse_ports, mouse_ports), settings.has_imu2, settings.has_mag)
 
 
 _BATCH = 4096  # samples converted at once; bounds the memory
@@ -70,7 +70,7 @@ class RecordingWriter(CsvFile):
     """A recording under way. Raises LinkposeError as `CsvFile` does."""
 
     def __init__(
-        self, path: Path, head: dict[str, Any], layout: columns.Layout, force: bool, plain: bool = False
+        self, path: Path, head: dict[str, Any], layout: columns.ColumnLayout, force: bool, plain: bool = False
     ) -> None:
         super().__init__(path, "recording", head, columns.names(layout), force, plain)
         self._layout = layout

@@ -31,7 +31,7 @@ class Barometer(NamedTuple):
         """Whether a supported barometer is fitted and its calibration was read."""
         if self.family == DeviceFamily.BMP280:
             return self.words[0] not in (0, 0xFFFF) and self.words[3] not in (0, 0xFFFF)
-        return self.family == DeviceFamily.BMP180 and bmp180.is_sound(bmp180.Calibration.of(self.words))
+        return self.family == DeviceFamily.BMP180 and bmp180.is_sound(bmp180.Bmp180Calibration.of(self.words))
 
     def compensate(
         self, ut: NDArray[np.int64], up: NDArray[np.int64]
@@ -42,11 +42,11 @@ class Barometer(NamedTuple):
         if self.family == DeviceFamily.BMP280:
             with np.errstate(all="ignore"):
                 temperature, pressure = bmp280.compensate(
-                    ut.astype(np.float64), up.astype(np.float64), bmp280.Calibration.of(self.words)
+                    ut.astype(np.float64), up.astype(np.float64), bmp280.Bmp280Calibration.of(self.words)
                 )
             wrong = ~np.isfinite(pressure)
             return np.where(wrong, np.nan, temperature), np.where(wrong, np.nan, pressure)
-        words = bmp180.Calibration.of(self.words)
+        words = bmp180.Bmp180Calibration.of(self.words)
         if len(ut) == 1 and (one := _compensate_one(int(ut[0]), int(up[0]), words, self.oversampling)) is not None:
             return np.array([one[0] / 10]), np.array([float(one[1])])
         wrong = bmp180.is_impossible(ut, words)
@@ -54,7 +54,7 @@ class Barometer(NamedTuple):
         return np.where(wrong, np.nan, tenths / 10), np.where(wrong, np.nan, pascals.astype(np.float64))
 
 
-def _compensate_one(ut: int, up: int, words: bmp180.Calibration, oversampling: int) -> tuple[int, int] | None:
+def _compensate_one(ut: int, up: int, words: bmp180.Bmp180Calibration, oversampling: int) -> tuple[int, int] | None:
     """Temperature (0.1 degC) and pressure (Pa) of one reading, as a live stream has it; None if it is not sound.
 
     Python's integers take a tenth of the time that NumPy needs for arrays of length 1. Below 2³¹ Pa no intermediate

@@ -20,7 +20,7 @@ PRESSURE_DECIMALS = 2  # Pa
 TEMPERATURE_DECIMALS = 3
 
 
-class Calibration(NamedTuple):
+class Bmp180Calibration(NamedTuple):
     """The eleven words of the BMP180's EEPROM."""
 
     ac1: int
@@ -37,17 +37,17 @@ class Calibration(NamedTuple):
 
     @staticmethod
     @lru_cache(maxsize=4)  # a live stream has the same words at each reading
-    def of(words: tuple[int, ...]) -> Calibration:
+    def of(words: tuple[int, ...]) -> Bmp180Calibration:
         """From HELLO's `baro_words`: unsigned, in the order of the EEPROM."""
         signed = [word - 0x10000 if word & 0x8000 and at not in (3, 4, 5) else word for at, word in enumerate(words)]
-        return Calibration(*signed[:11])
+        return Bmp180Calibration(*signed[:11])
 
     def words(self) -> tuple[int, ...]:
         """HELLO's `baro_words`."""
         return (*(word & 0xFFFF for word in self), 0)
 
 
-def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int) -> tuple[Integers, Integers]:
+def compensate(ut: Integers, up: Integers, words: Bmp180Calibration, oversampling: int) -> tuple[Integers, Integers]:
     """Temperature (0.1 degC) and pressure (Pa) from UT and UP; integers, or int64 arrays of one shape.
 
     Source: BMP180 data sheet, section 3.5, "Calculating pressure and temperature".
@@ -69,7 +69,7 @@ def compensate(ut: Integers, up: Integers, words: Calibration, oversampling: int
     return temperature, p + ((x1 + (-7357 * p >> 16) + 3791) >> 4)
 
 
-def is_impossible(ut: NDArray[np.int64], words: Calibration) -> NDArray[np.bool_]:
+def is_impossible(ut: NDArray[np.int64], words: Bmp180Calibration) -> NDArray[np.bool_]:
     """Where (N,) a temperature reading makes a divisor of `compensate` zero: no BMP180 gives it."""
     import numpy as np
 
@@ -86,6 +86,6 @@ def _quotient(numerator: int, denominator: Integers) -> Integers:
     return sign * (abs(numerator) // abs(denominator))
 
 
-def is_sound(words: Calibration) -> bool:
+def is_sound(words: Bmp180Calibration) -> bool:
     """No word is 0 or 0xFFFF (data sheet, 3.4): the EEPROM was really read."""
     return all(word not in (0, -1, 0xFFFF) for word in words)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     Number = TypeVar("Number", float, NDArray[np.float64])
 
 
-class Calibration(NamedTuple):
+class Bmp280Calibration(NamedTuple):
     """The twelve words of the BMP280's memory, dig_T1 to dig_P9."""
 
     t1: int
@@ -28,12 +28,12 @@ class Calibration(NamedTuple):
     p9: int
 
     @staticmethod
-    def of(words: tuple[int, ...]) -> Calibration:
+    def of(words: tuple[int, ...]) -> Bmp280Calibration:
         """From HELLO's `baro_words`: unsigned, in the order of the memory. dig_T1 and dig_P1 are unsigned."""
-        return Calibration(*(w - 0x10000 if w & 0x8000 and at not in (0, 3) else w for at, w in enumerate(words)))
+        return Bmp280Calibration(*(w - 0x10000 if w & 0x8000 and at not in (0, 3) else w for at, w in enumerate(words)))
 
 
-def compensate(ut: Number, up: Number, words: Calibration) -> tuple[Number, Number]:
+def compensate(ut: Number, up: Number, words: Bmp280Calibration) -> tuple[Number, Number]:
     """Temperature (degC) and pressure (Pa) from adc_T / 16 and adc_P; numbers, or float64 arrays of one shape.
 
     Source: BST-BMP280-DS001, appendix 8.1, "Compensation formula in double precision floating point"; the data sheet's

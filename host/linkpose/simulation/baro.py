@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.sensors.bmp180 import Calibration
+from linkpose.sensors.bmp180 import Bmp180Calibration
 
 Floats = NDArray[np.float64]
 
 # The data sheet's worked example.
-DATASHEET_WORDS = Calibration(408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
+DATASHEET_WORDS = Bmp180Calibration(408, -72, -14383, 32741, 32757, 23153, 6190, 4, -32768, -8711, 2868)
 PRESSURE_NOISE_PA = 3.0  # 0.25 m
 _CONVERSION_S = (0.0045, 0.0075, 0.0135, 0.0255)  # at oversampling 0 to 3; a temperature takes as long as the first
 _SETTLE_S = 0.0005  # the bus is silent for this long before the result is read
@@ -105,7 +105,7 @@ class Schedule:
         return np.asarray((number * self.cycle_ticks - self._lead) * self.tick_s + 0.5 * _CONVERSION_S[0])
 
 
-def raw_temperature(temp_degC: Floats, words: Calibration = DATASHEET_WORDS) -> NDArray[np.int64]:
+def raw_temperature(temp_degC: Floats, words: Bmp180Calibration = DATASHEET_WORDS) -> NDArray[np.int64]:
     """UT whose compensated temperature is `temp_degC`."""
     b5 = temp_degC * 160 - 8
     # B5 = X1 + MC 2^11 / (X1 + MD), solved for X1
@@ -115,7 +115,7 @@ def raw_temperature(temp_degC: Floats, words: Calibration = DATASHEET_WORDS) -> 
 
 
 def raw_pressure(
-    pressure_Pa: Floats, temp_degC: Floats, oversampling: int, words: Calibration = DATASHEET_WORDS
+    pressure_Pa: Floats, temp_degC: Floats, oversampling: int, words: Bmp180Calibration = DATASHEET_WORDS
 ) -> NDArray[np.int64]:
     """UP whose compensated pressure is `pressure_Pa` at `temp_degC`."""
     ac1, ac2, ac3, ac4, b1, b2 = words.ac1, words.ac2, words.ac3, words.ac4, words.b1, words.b2

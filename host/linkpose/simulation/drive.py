@@ -144,7 +144,7 @@ class Hastened:
         return np.asarray(self._drive.way(self._instants(time_s)) - before)
 
 
-class Track:
+class DrivenPath:
     """The pose that a drive leads to, from (0, 0, 0) on."""
 
     def __init__(self, drive: Drive) -> None:

@@ -22,7 +22,7 @@ from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Mouse, Rig
 from linkpose.simulation import imu
-from linkpose.simulation.drive import STILL_S, Drive, Manoeuvres, Move, Steady, Track
+from linkpose.simulation.drive import STILL_S, Drive, DrivenPath, Manoeuvres, Move, Steady
 from linkpose.wire.frames import sample
 from linkpose.wire.messages import DeviceFamily, DeviceState, HelloMouse, Sample, SampleFlags
 
@@ -146,7 +146,7 @@ class MiceRun:
         self._mouse_errors = mouse_errors or LEVELS[errors]
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
         self._drive = drive or _drive(path, seed, duration_s, length_m)
-        self._track = Track(self._drive)
+        self._track = DrivenPath(self._drive)
         self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
         self._place = np.array([(mouse.x_m, mouse.y_m) for mouse in mice])
         off = np.random.default_rng([seed, _MOUNTING]).standard_normal((MAX_MICE, 2))[: len(mice)]

@@ -47,7 +47,7 @@ class UnderwaterErrors:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class UnderwaterPath:
     """The true path: time (N,), pose (N, 6) x, y, z m, roll, pitch, yaw rad, twist (N, 6) m/s and rad/s held from each
     instant on.
     """
@@ -81,7 +81,7 @@ class UnderwaterRun:
 
     errors: UnderwaterErrors
     synchronous: bool
-    motion: Motion
+    motion: UnderwaterPath
     times_s: dict[str, Floats]
     velocity_m_s: Floats
     attitude_rad: Floats
@@ -133,7 +133,7 @@ def command_at(time_s: float) -> Floats:
     return np.array([0.8, 0.1 * math.sin(0.3 * time_s), 0.1 * math.cos(0.05 * time_s), roll_rate, pitch_rate, yaw_rate])
 
 
-def motion_data(rng: np.random.Generator, errors: UnderwaterErrors, duration_s: float) -> Motion:
+def motion_data(rng: np.random.Generator, errors: UnderwaterErrors, duration_s: float) -> UnderwaterPath:
     """Table 2.2, motion data: for each t, v_t = command_t + ε, ε ~ N(0, σ²); x_t+1 = motion_model(x_t, v_t)."""
     time = STEP_S * np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64)
     spread = np.repeat((errors.motion_velocity_m_s, errors.motion_rate_rad_s), 3)
@@ -142,7 +142,7 @@ def motion_data(rng: np.random.Generator, errors: UnderwaterErrors, duration_s: 
     pose[0] = START
     for i in range(len(time) - 1):
         pose[i + 1] = motion_model(pose[i], twist[i], STEP_S)
-    return Motion(time, pose, twist)
+    return UnderwaterPath(time, pose, twist)
 
 
 def measurement_time(rng: np.random.Generator, period_s: float, jitter: float, duration_s: float) -> Floats:
@@ -156,19 +156,19 @@ def measurement_time(rng: np.random.Generator, period_s: float, jitter: float, d
     return nominal + np.clip(rng.normal(0.0, 1.0, count - 1) * jitter, -0.49, 0.49) * period_s
 
 
-def velocity_data(rng: np.random.Generator, motion: Motion, times_s: Floats, std_m_s: float) -> Floats:
+def velocity_data(rng: np.random.Generator, motion: UnderwaterPath, times_s: Floats, std_m_s: float) -> Floats:
     """Table 2.5, velocity: the true velocity of the interval t_i ≤ t_j < t_i+1 plus ε ~ N(0, σ²), (18)."""
     return np.asarray(motion.twist[motion.index(times_s), :3] + rng.normal(0.0, std_m_s, (len(times_s), 3)))
 
 
 def range_data(
-    rng: np.random.Generator, motion: Motion, times_s: Floats, beacon: tuple[float, float, float], std_m: float
+    rng: np.random.Generator, motion: UnderwaterPath, times_s: Floats, beacon: tuple[float, float, float], std_m: float
 ) -> Floats:
     """Table 2.6, range: δ = t_j - t_i, x = motion_model(x_i, v_i, δ), r = ‖b - x‖ + ε, ε ~ N(0, σ²), (19)."""
     return true_range(motion, times_s, beacon) + rng.normal(0.0, std_m, len(times_s))
 
 
-def depth_data(rng: np.random.Generator, motion: Motion, times_s: Floats, std_m: float) -> Floats:
+def depth_data(rng: np.random.Generator, motion: UnderwaterPath, times_s: Floats, std_m: float) -> Floats:
     """Table 2.7, depth: δ = t_j - t_i, x = motion_model(x_i, v_i, δ), d = -z + ε, ε ~ N(0, σ²), (20)."""
     return np.asarray(-motion.at(times_s)[:, 2] + rng.normal(0.0, std_m, len(times_s)))
 
@@ -189,7 +189,7 @@ def outlier_times(rng: np.random.Generator, errors: UnderwaterErrors, sizes: lis
     return np.split(drawn, np.cumsum(sizes)[:-1])
 
 
-def true_range(motion: Motion, times_s: Floats, beacon: tuple[float, float, float]) -> Floats:
+def true_range(motion: UnderwaterPath, times_s: Floats, beacon: tuple[float, float, float]) -> Floats:
     """Distances (M,) m from the true poses to a beacon."""
     return np.asarray(np.linalg.norm(motion.at(times_s)[:, :3] - np.array(beacon), axis=1))
 
