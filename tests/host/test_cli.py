@@ -176,19 +176,22 @@ def test_a_motion_that_does_not_tell_j2s_is_said(linkpose, tmp_path):
 
 def test_smooth_is_better_than_the_filter_with_the_same_columns(linkpose, tmp_path):
     recording, truth = tmp_path / "r.csv", tmp_path / "t.csv"
-    linkpose("simulate", "link", "--test", 2, "--duration", 30, "-o", recording, "--truth", truth)
-    height = read_table(truth).columns["height_m"]
-    found = {}
-    for mode in ((), ("--smooth",)):
-        out = tmp_path / f"e{len(mode)}.csv"
-        done = linkpose("estimate", recording, "-o", out, "--filter", "joint-inertial", "--filter", "tilt", *mode)
-        assert done.status == 0, done.err
-        found[mode] = read_table(out, "estimate").columns
-    filtered, smoothed = found.values()
-    assert list(filtered) == list(smoothed)
-    assert list(filtered["tilt_roll_deg"]) == list(smoothed["tilt_roll_deg"])
-    errors = [columns["joint_inertial_height_m"] - height for columns in (filtered, smoothed)]
-    assert (errors[1] ** 2).mean() < 0.6 * (errors[0] ** 2).mean()
+    squares = np.zeros(2)
+    for seed in range(3):  # one run alone can favour the filter
+        simulated = ("--test", 2, "--seed", seed, "--duration", 20, "-o", recording, "--truth", truth, "--force")
+        linkpose("simulate", "link", *simulated)
+        height = read_table(truth).columns["height_m"]
+        found = {}
+        for mode in ((), ("--smooth",)):
+            out = tmp_path / f"e{seed}{len(mode)}.csv"
+            done = linkpose("estimate", recording, "-o", out, "--filter", "joint-inertial", "--filter", "tilt", *mode)
+            assert done.status == 0, done.err
+            found[mode] = read_table(out, "estimate").columns
+        filtered, smoothed = found.values()
+        assert list(filtered) == list(smoothed)
+        assert list(filtered["tilt_roll_deg"]) == list(smoothed["tilt_roll_deg"])
+        squares += [((columns["joint_inertial_height_m"] - height) ** 2).mean() for columns in (filtered, smoothed)]
+    assert squares[1] < 0.6 * squares[0]
 
 
 def test_smooth_without_joint_inertial_is_wrong_usage(linkpose, tmp_path):
