@@ -111,6 +111,7 @@ STATE = np.dtype(
         ("fit_x_variance", "f8"),
         ("fit_y_variance", "f8"),
         ("fit_turn_variance", "f8"),
+        ("is_still", "?"),  # whether most mice are silent on a robot that did not move before
         ("is_decisive", "?"),  # whether the faulty set is decisively more probable than every other
         ("rejected", "i8"),  # readings that gave no velocity, or whose time did not increase
     ],

@@ -7,7 +7,7 @@ import math
 from linkpose.compiling import compiled, inner
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
-from linkpose.filters.mice.faults import fault_limit, number
+from linkpose.filters.mice.faults import fault_limit, number, trusted
 from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
@@ -32,10 +32,14 @@ _ACCEL_M_S2, _ANGULAR_RAD_S2 = 0.6, 1.2
 # A gyro whose rates are missing for part of a step may be wrong by this for each second (rad/s²).
 _RATE_CHANGE_RAD_S2 = 4.0
 # The gyro sees another floor: by this many standard deviations, and at least by this share, over so much turning
-# (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors.
-_FLOOR_Z, _FLOOR_SHARE, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.5, 30.0
+# (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
+# than the second one is no floor but a slip or a lift.
+_FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
 # The bias that the fault tests assume is this much less certain than the filter's (rad/s): slow drift of a gyro.
 _BIAS_MARGIN_RAD_S = 0.005
+# A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
+# spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
+_SPOILT_Z = 2.0
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -95,6 +99,8 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
     if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
     keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
+    if abs(m.turn_rate - turn) > _FLOOR_MOST * abs(turn) + _FLOOR_Z * m.turn_std:
+        return
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
@@ -113,15 +119,34 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
 
 @inner
 def _restart(state: Record, first: int, end: int, keep: float) -> None:
-    """Part of the state starts anew, uncorrelated with the rest; `keep` of its mean stays.
+    """Part of the state starts anew, uncorrelated with the rest; `keep` of its mean and no smaller variances stay.
 
-    Positions of the mice, when they have taken up part of a scale error; all, where rounding has spoilt the covariance.
+    Positions of the mice, when they have taken up part of a scale error; the calibration, when a mouse at fault has
+    spoilt it; all, where rounding has spoilt the covariance.
     """
+    cov, fresh = state.covariance, state.fresh
     for at in range(first, end):
         state.mean[at] *= keep
+        before = cov[at, at]
         for k in range(state.size):
-            state.covariance[at, k] = state.covariance[k, at] = 0.0
-        state.covariance[at, at] = state.start[at] ** 2
+            cov[at, k] = cov[k, at] = 0.0
+        cov[at, at] = before if keep > 0.0 and before > fresh[at, at] else fresh[at, at]
+    for at in range(first, end):
+        for k in range(first, at):
+            cov[at, k] = cov[k, at] = fresh[at, k]
+
+
+@inner
+def _restart_spoilt(state: Record, excluded: int) -> None:
+    """Start the calibration anew where the mice in `excluded`, found at fault just now, have been taken for sound mice
+    of another scale or angle: the error would be shared among all mice.
+    """
+    for i in range((state.size - MICE) // OF_MOUSE):
+        if excluded >> i & 1:
+            for at in range(MICE + OF_MOUSE * i, MICE + OF_MOUSE * i + POSITION):
+                if state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
+                    _restart(state, MICE, state.size, 0.0)
+                    return
 
 
 @inner
@@ -165,7 +190,7 @@ def _correct(
         return False
     before = complex(state.at.vx, state.at.vy)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf):
+    if not update(state, limit if is_patient else math.inf, limit):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -235,11 +260,14 @@ def _step(
     if not reading.begin_step(m, sample.time):
         return
     dt, half = m.step + m.missed, 0.5 * m.missed if m.step > 0.0 else 0.0
+    before = m.excluded
     if reading.correct(m, mice, p, False):
         m.known_time = sample.time
-    is_silent = m.sound != 0
+    judges = trusted(m) or m.sound
+    is_silent = judges != 0
     for i in range(m.count):
-        is_silent = is_silent and (not m.sound >> i & 1 or mice[i].silent_s > 0.0)
+        is_silent = is_silent and (not judges >> i & 1 or mice[i].silent_s > 0.0)
+    _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt)
     is_good = half == 0.0 or _advance(state, tangent, points, half)
     _move_on(state, q, dt)
@@ -267,6 +295,25 @@ def _std(state: Record, at: int, since: float, change: float) -> float:
 
 
 @inner
+def _common_errors(state: Record, m: Record) -> tuple[float, float]:
+    """Variances of the mean scale and of the mean angle of the mice, by how far the mice are apart.
+
+    The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
+    apart, the mean is as uncertain as that of so many draws.
+    """
+    count = m.count
+    scale = angle = scale2 = angle2 = 0.0
+    for i in range(count):
+        mouse = state.at.mice[i]
+        scale += mouse.scale
+        angle += mouse.angle
+        scale2 += mouse.scale**2
+        angle2 += mouse.angle**2
+    pairs = max(count * (count - 1.0), 1.0)
+    return (scale2 - scale * scale / count) / pairs, (angle2 - angle * angle / count) / pairs
+
+
+@inner
 def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
     """Pose (heading in [−π, π)), velocity and their standard deviations at a sample."""
     at, since = state.at, time_s - m.time
@@ -280,7 +327,9 @@ def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
     lag = since
     if not state.at_rest and math.isfinite(m.interval):
         lag += 0.5 * m.interval
-    out.x_std, out.y_std = _std(state, X, since, 0.0), _std(state, Y, since, 0.0)
+    by_scale, by_angle = _common_errors(state, m)
+    out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2))
+    out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2))
     out.heading_std = _std(state, HEADING, since, 0.0)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)

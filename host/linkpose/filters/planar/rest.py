@@ -84,7 +84,7 @@ def _use_oldest(state: Record) -> None:
     state.innovation[0, 0] = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
     for k in range(state.size):
         state.cross[0, k] = state.covariance[BIAS, k]
-    update(state, math.inf)
+    update(state, math.inf, math.inf)
     for k in range(1, QUEUE):
         to, block = state.queue[k - 1], state.queue[k]
         to.mean, to.count, to.squares = block.mean, block.count, block.squares

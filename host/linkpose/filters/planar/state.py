@@ -50,7 +50,7 @@ _FIELDS = [
     ("size", "i8"),  # of the state with the rig's mice
     ("mean", *_VECTOR),
     ("covariance", *_MATRIX),
-    ("start", *_VECTOR),  # standard deviations to begin with
+    ("fresh", *_MATRIX),  # covariance to begin with
     ("gyro_variance", "f8"),  # of one sample ((rad/s)²), as the rests show it
     ("gyro_samples", "f8"),  # weight of that estimate
     # Rest.
@@ -167,8 +167,10 @@ class PlanarParameters(NamedTuple):
     # ... what may set them apart, as bought and mounted by eye: the drive determines it ...
     own_scale: float = 0.03
     own_angle_rad: float = math.radians(3.0)
-    # ... where a ruler puts them (±1 mm), and how fast height and floor change them (per √s).
-    position_m: float = 0.0006
+    # ... where a ruler puts them (±1 mm to the middle of a housing, in which the sensor sits within 2 mm), and how fast
+    # height and floor change them (per √s). A position prior of 0.6 mm takes one that is wrong by 2 cm for errors of
+    # scale and angle (0.1 m off after 60 s, 10σ); 5 mm leaves another floor undetermined.
+    position_m: float = 0.002
     scale_walk: float = 1e-4
     angle_walk: float = 1e-4
     # Another floor: change of the common scale once the gyro has shown one.
@@ -198,5 +200,5 @@ def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
             covariance[a + ANGLE, b + ANGLE] = p.common_angle_rad**2 + apart * p.own_angle_rad**2
         for k in range(2):
             covariance[a + POSITION + k, a + POSITION + k] = p.position_m**2
-    state.start[:] = np.sqrt(np.diag(covariance))
+    state.fresh[:] = covariance
     return records
