@@ -8,9 +8,9 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
-from linkpose.filters.mice.least_squares import squared_speed
+from linkpose.filters.mice.least_squares import ROUNDING, fit, squared_speed
 from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
-from linkpose.filters.mice.state import Record, Records
+from linkpose.filters.mice.state import NOBODY, Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
@@ -40,6 +40,14 @@ _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
 # spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
 _SPOILT_Z = 2.0
+# Mice against gyro: the bias has jumped where the mice turn by another rate over some seconds, by this many standard
+# deviations and at least by so much (rad/s), beyond a difference of scale (1σ). Doubling the deviations misses 1 °/s on
+# a straight of two seconds. Mice that differ by more than this velocity (m/s) are no judges of the gyro. A turn of
+# which the mice show a share between these two is a slip.
+_BIAS_M_S = 0.002
+_BIAS_Z, _BIAS_RAD_S, _BIAS_SCALE, _BIAS_MEMORY_S, _BIAS_LEAST_S = 5.0, 0.001, 0.03, 3.0, 0.5
+_SLIP_LEAST, _SLIP_MOST = 0.1, 0.92
+_REPAIR_SHARE = 0.3  # of the turn by which a wrong gyro's heading is corrected: σ of the correction
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -115,6 +123,95 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.floors += 1
+
+
+@inner
+def _turn_of_mice(m: Record, mice: Records) -> bool:
+    """Turn rate of the last step by the mice into `m.fit_turn`; False without one.
+
+    Where fewer than two mice are trusted, all count: mice that agree with each other are excluded by a wrong gyro too.
+    """
+    counting, judges = NOBODY, trusted(m)
+    if number(judges) < 2:
+        judges = m.sound
+    for i in range(m.count):
+        if judges >> i & 1 and mice[i].silent_s == 0.0:
+            counting |= 1 << i
+            mouse = mice[i]
+            mouse.sum = scaled(1.0 / m.step, mouse.moved)
+            mouse.weight = m.step * m.step / (ROUNDING * mouse.metres_per_count**2)
+    if number(counting) < 2 or counting != judges:
+        return False
+    return bool(fit(m, mice, counting, 0.0, 0j, 0.0, 0.0) > reading.NEAREST_M**2)
+
+
+@inner
+def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
+    """Widen the bias where all mice turn by another rate than the gyro, and repair the heading after a dead gyro."""
+    if state.at_rest or m.missed > 0.0 or not m.step > 0.0 or m.disagree_s > 0.0:
+        return
+    if not _turn_of_mice(m, mice):
+        return
+    _watch_dead_gyro(state, m)
+    if not math.isfinite(m.mean_rate):
+        return
+    keep, turn = math.exp(-m.step / _BIAS_MEMORY_S), m.mean_rate - state.at.bias
+    off = m.fit_turn - turn
+    state.compared = keep * state.compared + 1.0
+    state.compared_turn = keep * state.compared_turn + turn
+    state.compared_square = keep * state.compared_square + turn * turn
+    state.compared_off = keep * state.compared_off + off
+    state.compared_product = keep * state.compared_product + turn * off
+    is_agreed = True
+    for i in range(m.count):
+        mouse = mice[i]
+        apart = mouse.sum - m.fit - scaled(m.fit_turn, mouse.arm)
+        mouse.apart = scaled(keep, mouse.apart) + apart
+        is_agreed = is_agreed and square(mouse.apart) < (_BIAS_M_S * state.compared) ** 2
+    if is_agreed:
+        _find_jump(state, m)
+
+
+@inner
+def _find_jump(state: Record, m: Record) -> None:
+    """Fit ω_mice − ω_gyro = e ω_gyro − c, with e a small difference of scale: c is the error of the bias."""
+    count, turn, off = state.compared, state.compared_turn, state.compared_off
+    shown = abs(turn + off) * math.copysign(1.0, turn * (turn + off))
+    if count * m.step < _BIAS_LEAST_S or _SLIP_LEAST * abs(turn) < shown < _SLIP_MOST * abs(turn):
+        return
+    squares = state.compared_square + m.fit_turn_variance / _BIAS_SCALE**2
+    scatter = 1.0 / (count * squares - turn * turn)
+    jump = scatter * (squares * off - turn * state.compared_product)
+    spread = m.fit_turn_variance * scatter * squares + state.covariance[BIAS, BIAS]
+    if abs(jump) > _BIAS_Z * math.sqrt(spread) + _BIAS_RAD_S:
+        _turn_heading(state, jump * count * m.step)
+        state.covariance[BIAS, BIAS] += (2.0 * jump) ** 2
+        state.compared = state.compared_turn = state.compared_square = 0.0
+        state.compared_off = state.compared_product = 0.0
+        state.jumps += 1
+
+
+@inner
+def _watch_dead_gyro(state: Record, m: Record) -> None:
+    """Add up what the mice turn beyond a gyro that repeats one value, and turn the heading by it once it is dead."""
+    if m.same_rates == 0:
+        state.dead_turn = 0.0
+    elif math.isfinite(m.rate):
+        state.dead_turn += (m.fit_turn - (m.rate - state.at.bias)) * m.step
+    elif state.dead_turn != 0.0:
+        _turn_heading(state, state.dead_turn)
+        state.dead_turn = 0.0
+        state.jumps += 1
+
+
+@inner
+def _turn_heading(state: Record, turn: float) -> None:
+    """Correct the heading by what a wrong gyro has turned it (rad), and widen the pose by what is not known of it."""
+    state.at.heading += turn
+    state.covariance[HEADING, HEADING] += (_REPAIR_SHARE * turn) ** 2
+    way2 = (state.at.vx**2 + state.at.vy**2) * turn * turn
+    state.covariance[X, X] += way2
+    state.covariance[Y, Y] += way2
 
 
 @inner
@@ -280,6 +377,7 @@ def _step(
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
     _watch_floor(state, m, q)
+    _watch_gyro(state, m, mice)
     _calibrate(state, m, mice, rig)
 
 
@@ -310,7 +408,7 @@ def _common_errors(state: Record, m: Record) -> tuple[float, float]:
         scale2 += mouse.scale**2
         angle2 += mouse.angle**2
     pairs = max(count * (count - 1.0), 1.0)
-    return (scale2 - scale * scale / count) / pairs, (angle2 - angle * angle / count) / pairs
+    return max(scale2 - scale * scale / count, 0.0) / pairs, max(angle2 - angle * angle / count, 0.0) / pairs
 
 
 @inner

@@ -66,7 +66,18 @@ _FIELDS = [
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
     ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
+    ("jumps", "i8"),  # how often the gyro's bias has jumped or the gyro died
     ("floors", "i8"),  # how often the floor has changed
+    # Gyro against mice: sums over the readings of the last seconds, of 1, ω, ω², d, ω d, with d = ω_mice − ω.
+    ("compared", "f8"),
+    ("compared_turn", "f8"),
+    ("compared_square", "f8"),
+    ("compared_off", "f8"),
+    ("compared_product", "f8"),
+    ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
+    ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
+    ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
+    ("strange", "f8"),  # that rate (rad/s)
     ("chi2", "f8"),  # of the last innovation
     ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
     # A sudden change of velocity that only the mice show: a collision, or a lift or slip on a straight.
