@@ -97,9 +97,11 @@ def _is_still(state: Record, mice: Records, candidates: int) -> bool:
     """Whether most of the candidates are silent on a robot that did not move before."""
     silent = 0
     for i in range(state.count):
-        silent += (candidates >> i & 1) * (mice[i].silent_s >= _SILENT_S)
-    was_slow: bool = square(state.reference) < _STILL_M_S * _STILL_M_S
-    return 2 * silent > number(candidates) and was_slow
+        m = mice[i]
+        speed2 = squared_speed(m, state.reference, state.reference_rate)
+        silent += (candidates >> i & 1) * (m.silent_s >= _SILENT_S and speed2 < _STILL_M_S * _STILL_M_S)
+    is_still: bool = 2 * silent > number(candidates)
+    return is_still
 
 
 @inner

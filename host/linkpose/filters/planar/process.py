@@ -146,6 +146,30 @@ def _turn_of_mice(m: Record, mice: Records) -> bool:
 
 
 @inner
+def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, float]:
+    """Variances of the mean scale and of the mean angle of the mice, by how far the mice are apart.
+
+    The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
+    apart, the mean is as uncertain as that of so many draws. Positions beyond three standard deviations of the rig's
+    are taken for wrong ones, which show as scale and angle too.
+    """
+    count = m.count
+    scale = angle = scale2 = angle2 = moved2 = arm2 = 0.0
+    for i in range(count):
+        mouse = state.at.mice[i]
+        moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
+        arm2 += square(mice[i].arm)
+        scale += mouse.scale
+        angle += mouse.angle
+        scale2 += mouse.scale**2
+        angle2 += mouse.angle**2
+    pairs = max(count * (count - 1.0), 1.0)
+    placed = max(moved2, 0.0) / (count * max(arm2, 1e-6))
+    by_scale = max(scale2 - scale * scale / count, 0.0) / pairs + placed
+    return by_scale, max(angle2 - angle * angle / count, 0.0) / pairs + placed
+
+
+@inner
 def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
     """Widen the bias where all mice turn by another rate than the gyro, and repair the heading after a dead gyro."""
     if state.at_rest or m.missed > 0.0 or not m.step > 0.0 or m.disagree_s > 0.0:
@@ -162,7 +186,7 @@ def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
     state.compared_square = keep * state.compared_square + turn * turn
     state.compared_off = keep * state.compared_off + off
     state.compared_product = keep * state.compared_product + turn * off
-    is_agreed = True
+    is_agreed = _common_errors(state, m, mice)[0] < _BIAS_SCALE * _BIAS_SCALE
     for i in range(m.count):
         mouse = mice[i]
         apart = mouse.sum - m.fit - scaled(m.fit_turn, mouse.arm)
@@ -393,26 +417,7 @@ def _std(state: Record, at: int, since: float, change: float) -> float:
 
 
 @inner
-def _common_errors(state: Record, m: Record) -> tuple[float, float]:
-    """Variances of the mean scale and of the mean angle of the mice, by how far the mice are apart.
-
-    The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
-    apart, the mean is as uncertain as that of so many draws.
-    """
-    count = m.count
-    scale = angle = scale2 = angle2 = 0.0
-    for i in range(count):
-        mouse = state.at.mice[i]
-        scale += mouse.scale
-        angle += mouse.angle
-        scale2 += mouse.scale**2
-        angle2 += mouse.angle**2
-    pairs = max(count * (count - 1.0), 1.0)
-    return max(scale2 - scale * scale / count, 0.0) / pairs, max(angle2 - angle * angle / count, 0.0) / pairs
-
-
-@inner
-def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
+def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -> None:
     """Pose (heading in [−π, π)), velocity and their standard deviations at a sample."""
     at, since = state.at, time_s - m.time
     if not since > 0.0:
@@ -425,7 +430,7 @@ def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
     lag = since
     if not state.at_rest and math.isfinite(m.interval):
         lag += 0.5 * m.interval
-    by_scale, by_angle = _common_errors(state, m)
+    by_scale, by_angle = _common_errors(state, m, mice)
     out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2))
     out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2))
     out.heading_std = _std(state, HEADING, since, 0.0)
@@ -451,4 +456,4 @@ def process(
             reading.read_counts(m, mice, sample)
             _step(state, tangent, points, m, mice, rig, p, q, sample)
             reading.end_step(m)
-        _show(state, m, sample.time, out[k])
+        _show(state, m, mice, sample.time, out[k])

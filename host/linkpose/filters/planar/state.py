@@ -178,10 +178,9 @@ class PlanarParameters(NamedTuple):
     # ... what may set them apart, as bought and mounted by eye: the drive determines it ...
     own_scale: float = 0.03
     own_angle_rad: float = math.radians(3.0)
-    # ... where a ruler puts them (±1 mm to the middle of a housing, in which the sensor sits within 2 mm), and how fast
-    # height and floor change them (per √s). A position prior of 0.6 mm takes one that is wrong by 2 cm for errors of
-    # scale and angle (0.1 m off after 60 s, 10σ); 5 mm leaves another floor undetermined.
-    position_m: float = 0.002
+    # ... where a ruler puts them (±1 mm), and how fast height and floor change them (per √s). With 2 mm, another floor
+    # is taken for positions and is not found.
+    position_m: float = 0.0006
     scale_walk: float = 1e-4
     angle_walk: float = 1e-4
     # Another floor: change of the common scale once the gyro has shown one.
