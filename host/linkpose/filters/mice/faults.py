@@ -30,10 +30,10 @@ _FAULT_Z = 4.75
 # Doubled: a fault needs a larger contradiction.
 _EXCLUSION = 16.0
 # A mouse without a count for this long (s) while others move is probably lifted; so much less does it cost in F. While
-# most mice are silent on a robot that moved slower than this (m/s), silence is no sign of a fault but of a rest, and so
-# much more does a silent mouse cost: a mouse that counts at rest is found, not the others.
+# most mice are silent on a robot that moved slower than this (m/s), and the others have repeated one count so often,
+# silence is no fault but a rest, and so much more does a silent mouse cost: the mouse that counts at rest is found.
 _SILENT_S, _SILENT_BONUS = 0.04, 25.0
-_STILL_M_S, _STILL_COST = 0.02, 13.0
+_STILL_M_S, _STILL_COST, _REPEATS = 0.02, 13.0, 3
 # How much cheaper than the second a hypothesis must be, or for how long (s) the best one may be undecided.
 _DECISIVE, _UNDECIDED_S = 12.0, 0.1
 # A PS/2 packet that must be repeated brings its counts within three samples (s): no fault.
@@ -94,13 +94,15 @@ def _cost(state: Record, mice: Records, candidates: int, left_out: int, span: fl
 
 @inner
 def _is_still(state: Record, mice: Records, candidates: int) -> bool:
-    """Whether most of the candidates are silent on a robot that did not move before."""
-    silent = 0
+    """Whether most candidates are silent on a robot that did not move before, and the others repeat one count."""
+    silent = others = 0
     for i in range(state.count):
         m = mice[i]
         speed2 = squared_speed(m, state.reference, state.reference_rate)
-        silent += (candidates >> i & 1) * (m.silent_s >= _SILENT_S and speed2 < _STILL_M_S * _STILL_M_S)
-    is_still: bool = 2 * silent > number(candidates)
+        is_silent = m.silent_s >= _SILENT_S and speed2 < _STILL_M_S * _STILL_M_S
+        silent += (candidates >> i & 1) * is_silent
+        others += (candidates >> i & 1) * (not is_silent and m.repeats < _REPEATS)
+    is_still: bool = 2 * silent > number(candidates) and others == 0
     return is_still
 
 
