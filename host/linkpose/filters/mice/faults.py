@@ -29,11 +29,8 @@ _FAULT_Z = 4.75
 # Cost of each mouse in F: −2 log of its likelihood as noise of ±1 m/s at 5 mm/s resolution is about 16.
 # Doubled: a fault needs a larger contradiction.
 _EXCLUSION = 16.0
-# A mouse without a count for this long (s) while others move is probably lifted; so much less does it cost in F. While
-# most mice are silent on a robot that moved slower than this (m/s), and the others have repeated one count so often,
-# silence is no fault but a rest, and so much more does a silent mouse cost: the mouse that counts at rest is found.
+# A mouse without a count for this long (s) while others move is probably lifted; so much less does it cost in F.
 _SILENT_S, _SILENT_BONUS = 0.04, 25.0
-_STILL_M_S, _STILL_COST, _REPEATS = 0.02, 13.0, 3
 # How much cheaper than the second a hypothesis must be, or for how long (s) the best one may be undecided.
 _DECISIVE, _UNDECIDED_S = 12.0, 0.1
 # A PS/2 packet that must be repeated brings its counts within three samples (s): no fault.
@@ -84,26 +81,10 @@ def _cost(state: Record, mice: Records, candidates: int, left_out: int, span: fl
     for i in range(state.count):
         m = mice[i]
         if candidates & left_out & 1 << i:
-            cost += _EXCLUSION
-            if m.silent_s >= _SILENT_S:
-                cost += _STILL_COST if state.is_still else -_SILENT_BONUS
+            cost += _EXCLUSION - (_SILENT_BONUS if m.silent_s >= _SILENT_S else 0.0)
         elif candidates >> i & 1:
             cost += m.weight * misfit(m, v, w)
     return cost
-
-
-@inner
-def _is_still(state: Record, mice: Records, candidates: int) -> bool:
-    """Whether most candidates are silent on a robot that did not move before, and the others repeat one count."""
-    silent = others = 0
-    for i in range(state.count):
-        m = mice[i]
-        speed2 = squared_speed(m, state.reference, state.reference_rate)
-        is_silent = m.silent_s >= _SILENT_S and speed2 < _STILL_M_S * _STILL_M_S
-        silent += (candidates >> i & 1) * is_silent
-        others += (candidates >> i & 1) * (not is_silent and m.repeats < _REPEATS)
-    is_still: bool = 2 * silent > number(candidates) and others == 0
-    return is_still
 
 
 @inner
@@ -126,7 +107,6 @@ def _find_fault(state: Record, mice: Records, candidates: int, span: float, turn
     The mice's `sum` and `weight` hold the motions of the candidates over `span`.
     """
     state.is_decisive = True
-    state.is_still = _is_still(state, mice, candidates)
     count, has_gyro = number(candidates), math.isfinite(turn)
     # One mouse and a gyro have as many unknowns as equations; of two mice one is at fault only if a gyro shows which.
     if count < 2 or (count == 2 and not has_gyro):

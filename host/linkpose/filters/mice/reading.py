@@ -60,7 +60,6 @@ def read_counts(state: Record, mice: Records, sample: Record) -> None:
         moved = turned(m.axis, sample.counts[i])
         if math.isfinite(moved.real + moved.imag):
             has_counts |= 1 << i
-            m.repeats = m.repeats + 1 if square(moved - m.moved) == 0.0 else 0
             m.moved = moved
     # The first counts of a mouse that was away cover an unknown time.
     state.sound = has_counts & ~state.away

@@ -53,7 +53,6 @@ MOUSE = np.dtype(
         ("moved", "c16"),  # over the last step (m)
         ("window", "c16"),  # over the window of the fault tests: an exponentially forgetting sum (m)
         ("apart", "c16"),  # sum of its velocities beyond the fit of all mice (m/s), forgetting
-        ("repeats", "i8"),  # readings in a row with the same motion as the one before
         ("silent_s", "f8"),  # time without a count (s)
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)
@@ -116,7 +115,6 @@ STATE = np.dtype(
         ("fit_x_variance", "f8"),
         ("fit_y_variance", "f8"),
         ("fit_turn_variance", "f8"),
-        ("is_still", "?"),  # whether most mice are silent on a robot that did not move before
         ("is_decisive", "?"),  # whether the faulty set is decisively more probable than every other
         ("rejected", "i8"),  # readings that gave no velocity, or whose time did not increase
     ],
