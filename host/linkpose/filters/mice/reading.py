@@ -22,12 +22,22 @@ HOLD_S = 0.5
 # Gyro bias: before any calibration (data sheet: ±20 °/s), and how well agreeing mice determine it (rad/s). Doubling
 # the floor hides slow turns of a lifted robot; halving it mistakes the drift of the bias for a lift.
 BIAS_STD, BIAS_FLOOR, _BIAS_MEMORY_S, _BIAS_RATE_HZ = 0.35, 0.01, 10.0, 10.0
+# A gyro that gives one value, to the last bit, for this long (s) and so often is dead: the noise of a real one is half
+# a count or more, which repeats a value so often once in 10^12. Doubled: a dead gyro turns the path for twice as long.
+_DEAD_S, _DEAD_RATES = 0.4, 40
 
 
 @inner
 def follow_gyro(state: Record, sample: Record) -> None:
     """Integrate the gyro's rate up to a sample, by the trapezoidal rule."""
     dt, rate = sample.time - state.sample_time, sample.rate
+    if rate == state.last_rate:
+        state.same_rates += 1
+        state.same_s += dt
+    else:
+        state.same_rates, state.same_s, state.last_rate = 0, 0.0, rate
+    if state.same_rates >= _DEAD_RATES and state.same_s >= _DEAD_S:
+        rate = math.nan
     if sample.is_after_gap or dt > LONGEST_STEP_S:
         state.lost = True
     if math.isfinite(rate):

@@ -52,6 +52,7 @@ MOUSE = np.dtype(
         # Motion.
         ("moved", "c16"),  # over the last step (m)
         ("window", "c16"),  # over the window of the fault tests: an exponentially forgetting sum (m)
+        ("apart", "c16"),  # sum of its velocities beyond the fit of all mice (m/s), forgetting
         ("silent_s", "f8"),  # time without a count (s)
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)
@@ -83,6 +84,9 @@ STATE = np.dtype(
         ("turn_std", "f8"),
         # Gyro.
         ("rate", "f8"),  # last usable rate (rad/s); NaN without one
+        ("last_rate", "f8"),  # of the last sample, usable or not (rad/s)
+        ("same_rates", "i8"),  # how often, and for how long (s), it has been the same to the last bit
+        ("same_s", "f8"),
         ("turned", "f8"),  # ∫ rate since the last reading (rad), bias included
         ("turned_s", "f8"),  # time that the integral covers (s)
         ("mean_rate", "f8"),  # mean rate over the last step (rad/s); NaN without one
@@ -143,7 +147,9 @@ def fresh_state(count: int, bias_std_rad_s: float) -> Any:
     records = zeros(1, STATE)
     state: Any = records[0]
     state.count = count
-    state.time = state.sample_time = state.interval = state.known_time = state.rate = state.mean_rate = np.nan
+    state.time = state.sample_time = state.interval = state.known_time = state.rate = state.mean_rate = (
+        state.last_rate
+    ) = np.nan
     state.bias_std = bias_std_rad_s
     return records
 

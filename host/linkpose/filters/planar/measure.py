@@ -10,6 +10,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.mice.plane import scaled, turned
 from linkpose.filters.mice.state import Floats, Record, Records
+from linkpose.filters.planar.state import BIAS
 
 # Residual motion at rest: m/s and rad/s. Doubled: no visible change.
 _REST_M_S, _REST_RAD_S = 1e-4, 1e-5
@@ -72,11 +73,12 @@ def compare(state: Record, rate: float) -> None:
 
 
 @inner
-def update(state: Record, limit: float) -> bool:
+def update(state: Record, limit: float, plausible: float) -> bool:
     """x += C S⁻¹ (z − ẑ), P −= C S⁻¹ Cᵀ, by elimination row by row. False where S is not positive definite.
 
     Where the χ² of the innovation exceeds `limit`, only the first `state.always` rows count; `state.rows` is then set
-    to their number.
+    to their number. Where it exceeds `plausible`, bias and calibration keep their values and their covariance (a
+    Schmidt-Kalman update): a lift or a slip is no error of the calibration.
     """
     n, x, p = state.size, state.mean, state.covariance
     r, s, c = state.residual, state.innovation, state.cross
@@ -96,13 +98,15 @@ def update(state: Record, limit: float) -> bool:
                 c[below, k] -= share * cross[k]
     if state.chi2 > limit:
         state.rows = state.always
+    learned = n if state.chi2 <= plausible else BIAS
     for row in range(state.rows):
         cross = c[row]
         weight = 1.0 / s[row, row]
         for i in range(n):
             share = weight * cross[i]
-            x[i] += share * r[row]
-            for k in range(i + 1):
+            if i < learned:
+                x[i] += share * r[row]
+            for k in range(min(i + 1, learned)):
                 p[i, k] -= share * cross[k]
                 p[k, i] = p[i, k]
     return True

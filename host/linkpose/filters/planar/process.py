@@ -7,10 +7,10 @@ import math
 from linkpose.compiling import compiled, inner
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
-from linkpose.filters.mice.faults import fault_limit, number
-from linkpose.filters.mice.least_squares import squared_speed
+from linkpose.filters.mice.faults import fault_limit, number, trusted
+from linkpose.filters.mice.least_squares import ROUNDING, fit, squared_speed
 from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
-from linkpose.filters.mice.state import Record, Records
+from linkpose.filters.mice.state import NOBODY, Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
@@ -32,10 +32,22 @@ _ACCEL_M_S2, _ANGULAR_RAD_S2 = 0.6, 1.2
 # A gyro whose rates are missing for part of a step may be wrong by this for each second (rad/s²).
 _RATE_CHANGE_RAD_S2 = 4.0
 # The gyro sees another floor: by this many standard deviations, and at least by this share, over so much turning
-# (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors.
-_FLOOR_Z, _FLOOR_SHARE, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.5, 30.0
+# (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
+# than the second one is no floor but a slip or a lift.
+_FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
 # The bias that the fault tests assume is this much less certain than the filter's (rad/s): slow drift of a gyro.
 _BIAS_MARGIN_RAD_S = 0.005
+# A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
+# spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
+_SPOILT_Z = 2.0
+# Mice against gyro: the bias has jumped where the mice turn by another rate over some seconds, by this many standard
+# deviations and at least by so much (rad/s), beyond a difference of scale (1σ). Doubling the deviations misses 1 °/s on
+# a straight of two seconds. Mice that differ by more than this velocity (m/s) are no judges of the gyro. A turn of
+# which the mice show a share between these two is a slip.
+_BIAS_M_S = 0.002
+_BIAS_Z, _BIAS_RAD_S, _BIAS_SCALE, _BIAS_MEMORY_S, _BIAS_LEAST_S = 5.0, 0.001, 0.03, 3.0, 0.5
+_SLIP_LEAST, _SLIP_MOST = 0.1, 0.92
+_REPAIR_SHARE = 0.3  # of the turn by which a wrong gyro's heading is corrected: σ of the correction
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -95,6 +107,8 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
     if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
     keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
+    if abs(m.turn_rate - turn) > _FLOOR_MOST * abs(turn) + _FLOOR_Z * m.turn_std:
+        return
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
@@ -112,16 +126,148 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
 
 
 @inner
-def _restart(state: Record, first: int, end: int, keep: float) -> None:
-    """Part of the state starts anew, uncorrelated with the rest; `keep` of its mean stays.
+def _turn_of_mice(m: Record, mice: Records) -> bool:
+    """Turn rate of the last step by the mice into `m.fit_turn`; False without one.
 
-    Positions of the mice, when they have taken up part of a scale error; all, where rounding has spoilt the covariance.
+    Where fewer than two mice are trusted, all count: mice that agree with each other are excluded by a wrong gyro too.
     """
+    counting, judges = NOBODY, trusted(m)
+    if number(judges) < 2:
+        judges = m.sound
+    for i in range(m.count):
+        if judges >> i & 1 and mice[i].silent_s == 0.0:
+            counting |= 1 << i
+            mouse = mice[i]
+            mouse.sum = scaled(1.0 / m.step, mouse.moved)
+            mouse.weight = m.step * m.step / (ROUNDING * mouse.metres_per_count**2)
+    if number(counting) < 2 or counting != judges:
+        return False
+    return bool(fit(m, mice, counting, 0.0, 0j, 0.0, 0.0) > reading.NEAREST_M**2)
+
+
+@inner
+def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, float]:
+    """Variances of the mean scale and of the mean angle of the mice, by how far the mice are apart.
+
+    The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
+    apart, the mean is as uncertain as that of so many draws. Positions beyond three standard deviations of the rig's
+    are taken for wrong ones, which show as scale and angle too.
+    """
+    count = m.count
+    scale = angle = scale2 = angle2 = moved2 = arm2 = 0.0
+    for i in range(count):
+        mouse = state.at.mice[i]
+        moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
+        arm2 += square(mice[i].arm)
+        scale += mouse.scale
+        angle += mouse.angle
+        scale2 += mouse.scale**2
+        angle2 += mouse.angle**2
+    pairs = max(count * (count - 1.0), 1.0)
+    placed = max(moved2, 0.0) / (count * max(arm2, 1e-6))
+    by_scale = max(scale2 - scale * scale / count, 0.0) / pairs + placed
+    return by_scale, max(angle2 - angle * angle / count, 0.0) / pairs + placed
+
+
+@inner
+def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
+    """Widen the bias where all mice turn by another rate than the gyro, and repair the heading after a dead gyro."""
+    if state.at_rest or m.missed > 0.0 or not m.step > 0.0 or m.disagree_s > 0.0:
+        return
+    if not _turn_of_mice(m, mice):
+        return
+    _watch_dead_gyro(state, m)
+    if not math.isfinite(m.mean_rate):
+        return
+    keep, turn = math.exp(-m.step / _BIAS_MEMORY_S), m.mean_rate - state.at.bias
+    off = m.fit_turn - turn
+    state.compared = keep * state.compared + 1.0
+    state.compared_turn = keep * state.compared_turn + turn
+    state.compared_square = keep * state.compared_square + turn * turn
+    state.compared_off = keep * state.compared_off + off
+    state.compared_product = keep * state.compared_product + turn * off
+    is_agreed = _common_errors(state, m, mice)[0] < _BIAS_SCALE * _BIAS_SCALE
+    for i in range(m.count):
+        mouse = mice[i]
+        apart = mouse.sum - m.fit - scaled(m.fit_turn, mouse.arm)
+        mouse.apart = scaled(keep, mouse.apart) + apart
+        is_agreed = is_agreed and square(mouse.apart) < (_BIAS_M_S * state.compared) ** 2
+    if is_agreed:
+        _find_jump(state, m)
+
+
+@inner
+def _find_jump(state: Record, m: Record) -> None:
+    """Fit ω_mice − ω_gyro = e ω_gyro − c, with e a small difference of scale: c is the error of the bias."""
+    count, turn, off = state.compared, state.compared_turn, state.compared_off
+    shown = abs(turn + off) * math.copysign(1.0, turn * (turn + off))
+    if count * m.step < _BIAS_LEAST_S or _SLIP_LEAST * abs(turn) < shown < _SLIP_MOST * abs(turn):
+        return
+    squares = state.compared_square + m.fit_turn_variance / _BIAS_SCALE**2
+    scatter = 1.0 / (count * squares - turn * turn)
+    jump = scatter * (squares * off - turn * state.compared_product)
+    spread = m.fit_turn_variance * scatter * squares + state.covariance[BIAS, BIAS]
+    if abs(jump) > _BIAS_Z * math.sqrt(spread) + _BIAS_RAD_S:
+        _turn_heading(state, jump * count * m.step)
+        state.covariance[BIAS, BIAS] += (2.0 * jump) ** 2
+        state.compared = state.compared_turn = state.compared_square = 0.0
+        state.compared_off = state.compared_product = 0.0
+        state.jumps += 1
+
+
+@inner
+def _watch_dead_gyro(state: Record, m: Record) -> None:
+    """Add up what the mice turn beyond a gyro that repeats one value, and turn the heading by it once it is dead."""
+    if m.same_rates == 0:
+        state.dead_turn = 0.0
+    elif math.isfinite(m.rate):
+        state.dead_turn += (m.fit_turn - (m.rate - state.at.bias)) * m.step
+    elif state.dead_turn != 0.0:
+        _turn_heading(state, state.dead_turn)
+        state.dead_turn = 0.0
+        state.jumps += 1
+
+
+@inner
+def _turn_heading(state: Record, turn: float) -> None:
+    """Correct the heading by what a wrong gyro has turned it (rad), and widen the pose by what is not known of it."""
+    state.at.heading += turn
+    state.covariance[HEADING, HEADING] += (_REPAIR_SHARE * turn) ** 2
+    way2 = (state.at.vx**2 + state.at.vy**2) * turn * turn
+    state.covariance[X, X] += way2
+    state.covariance[Y, Y] += way2
+
+
+@inner
+def _restart(state: Record, first: int, end: int, keep: float) -> None:
+    """Part of the state starts anew, uncorrelated with the rest; `keep` of its mean and no smaller variances stay.
+
+    Positions of the mice, when they have taken up part of a scale error; the calibration, when a mouse at fault has
+    spoilt it; all, where rounding has spoilt the covariance.
+    """
+    cov, fresh = state.covariance, state.fresh
     for at in range(first, end):
         state.mean[at] *= keep
+        before = cov[at, at]
         for k in range(state.size):
-            state.covariance[at, k] = state.covariance[k, at] = 0.0
-        state.covariance[at, at] = state.start[at] ** 2
+            cov[at, k] = cov[k, at] = 0.0
+        cov[at, at] = before if keep > 0.0 and before > fresh[at, at] else fresh[at, at]
+    for at in range(first, end):
+        for k in range(first, at):
+            cov[at, k] = cov[k, at] = fresh[at, k]
+
+
+@inner
+def _restart_spoilt(state: Record, excluded: int) -> None:
+    """Start the calibration anew where the mice in `excluded`, found at fault just now, have been taken for sound mice
+    of another scale or angle: the error would be shared among all mice.
+    """
+    for i in range((state.size - MICE) // OF_MOUSE):
+        if excluded >> i & 1:
+            for at in range(MICE + OF_MOUSE * i, MICE + OF_MOUSE * i + POSITION):
+                if state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
+                    _restart(state, MICE, state.size, 0.0)
+                    return
 
 
 @inner
@@ -165,7 +311,7 @@ def _correct(
         return False
     before = complex(state.at.vx, state.at.vy)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf):
+    if not update(state, limit if is_patient else math.inf, limit):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -235,11 +381,14 @@ def _step(
     if not reading.begin_step(m, sample.time):
         return
     dt, half = m.step + m.missed, 0.5 * m.missed if m.step > 0.0 else 0.0
+    before = m.excluded
     if reading.correct(m, mice, p, False):
         m.known_time = sample.time
-    is_silent = m.sound != 0
+    judges = trusted(m) or m.sound
+    is_silent = judges != 0
     for i in range(m.count):
-        is_silent = is_silent and (not m.sound >> i & 1 or mice[i].silent_s > 0.0)
+        is_silent = is_silent and (not judges >> i & 1 or mice[i].silent_s > 0.0)
+    _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt)
     is_good = half == 0.0 or _advance(state, tangent, points, half)
     _move_on(state, q, dt)
@@ -252,6 +401,7 @@ def _step(
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
     _watch_floor(state, m, q)
+    _watch_gyro(state, m, mice)
     _calibrate(state, m, mice, rig)
 
 
@@ -267,7 +417,7 @@ def _std(state: Record, at: int, since: float, change: float) -> float:
 
 
 @inner
-def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
+def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -> None:
     """Pose (heading in [−π, π)), velocity and their standard deviations at a sample."""
     at, since = state.at, time_s - m.time
     if not since > 0.0:
@@ -280,7 +430,9 @@ def _show(state: Record, m: Record, time_s: float, out: Record) -> None:
     lag = since
     if not state.at_rest and math.isfinite(m.interval):
         lag += 0.5 * m.interval
-    out.x_std, out.y_std = _std(state, X, since, 0.0), _std(state, Y, since, 0.0)
+    by_scale, by_angle = _common_errors(state, m, mice)
+    out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2))
+    out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2))
     out.heading_std = _std(state, HEADING, since, 0.0)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
@@ -304,4 +456,4 @@ def process(
             reading.read_counts(m, mice, sample)
             _step(state, tangent, points, m, mice, rig, p, q, sample)
             reading.end_step(m)
-        _show(state, m, sample.time, out[k])
+        _show(state, m, mice, sample.time, out[k])

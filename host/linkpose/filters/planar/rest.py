@@ -13,11 +13,16 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.mice.state import Record
 from linkpose.filters.planar.measure import update
-from linkpose.filters.planar.state import BIAS, QUEUE
+from linkpose.filters.planar.state import BIAS, HEADING, QUEUE
 
 _BLOCK_S = 0.1  # one block (s)
 # Silence before a rest is assumed (s): a count every 0.3 s is 0.4 mm/s. Doubled: short rests are missed.
 _REST_S = 0.3
+# A rate that a silent robot's gyro shows for so long (s), constant within its noise, is a new bias: nobody turns a
+# lifted robot so steadily. Doubled: a bias that has jumped is found later.
+_NEW_BIAS_S = 2.0
+_LARGEST_RAD_S = 0.12  # a larger rate is a turn (7 °/s)
+_UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
 _GUARD_Z = 5.0  # standard normal quantile of the guards
 # The gyro's noise may be three times the assumed one: the data sheet gives 0.05 °/s, real sensors reach 0.13 °/s.
 _NOISE_MARGIN = 9.0
@@ -26,10 +31,13 @@ _NOISE_MARGIN = 9.0
 @inner
 def watch_rest(state: Record, is_silent: bool, rate: float, step: float) -> None:
     """Take one reading into account: `is_silent` when no mouse counted, `rate` (rad/s) the gyro's, NaN without one."""
+    state.since_rest_s += step
     if not is_silent:
         _end_rest(state)
         return
     state.rest_s += step
+    if state.at_rest:
+        state.since_rest_s = 0.0
     if math.isfinite(rate):
         state.block_s += step
         state.block_sum += rate
@@ -55,7 +63,7 @@ def _finish_block(state: Record) -> bool:
     mean = state.block_sum / count
     noise = _NOISE_MARGIN * state.gyro_variance / count
     limit = _GUARD_Z * math.sqrt(state.covariance[BIAS, BIAS] + noise)
-    if abs(mean - state.at.bias) > limit:
+    if abs(mean - state.at.bias) > limit and not _is_new_bias(state, mean, noise):
         return False
     if state.queued:
         last = state.queue[state.queued - 1]
@@ -73,6 +81,27 @@ def _finish_block(state: Record) -> bool:
 
 
 @inner
+def _is_new_bias(state: Record, mean: float, noise: float) -> bool:
+    """Whether the rate that contradicts a rest has stayed the same for long: the bias has jumped."""
+    is_same = abs(mean - state.strange) <= _GUARD_Z * math.sqrt(2.0 * noise)
+    is_same = is_same and abs(mean - state.at.bias) < _LARGEST_RAD_S
+    state.strange_s = state.strange_s + _BLOCK_S if is_same else 0.0
+    if not is_same:
+        state.strange = mean
+    if state.strange_s < _NEW_BIAS_S:
+        return False
+    jump = mean - state.at.bias
+    state.covariance[BIAS, BIAS] += jump * jump
+    # The robot has turned with the new bias since the rest began; nobody knows since when before.
+    state.at.heading -= jump * state.rest_s
+    since = min(state.since_rest_s, _UNSEEN_S)
+    state.covariance[HEADING, HEADING] += (jump * since) ** 2
+    state.strange_s = state.since_rest_s = 0.0
+    state.jumps += 1
+    return True
+
+
+@inner
 def _use_oldest(state: Record) -> None:
     """Update bias and noise with the oldest block, and drop it from the queue. ω was 0 then, so its rate is b."""
     block, known = state.queue[0], state.gyro_samples
@@ -84,7 +113,7 @@ def _use_oldest(state: Record) -> None:
     state.innovation[0, 0] = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
     for k in range(state.size):
         state.cross[0, k] = state.covariance[BIAS, k]
-    update(state, math.inf)
+    update(state, math.inf, math.inf)
     for k in range(1, QUEUE):
         to, block = state.queue[k - 1], state.queue[k]
         to.mean, to.count, to.squares = block.mean, block.count, block.squares

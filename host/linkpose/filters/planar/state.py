@@ -50,7 +50,7 @@ _FIELDS = [
     ("size", "i8"),  # of the state with the rig's mice
     ("mean", *_VECTOR),
     ("covariance", *_MATRIX),
-    ("start", *_VECTOR),  # standard deviations to begin with
+    ("fresh", *_MATRIX),  # covariance to begin with
     ("gyro_variance", "f8"),  # of one sample ((rad/s)²), as the rests show it
     ("gyro_samples", "f8"),  # weight of that estimate
     # Rest.
@@ -66,7 +66,18 @@ _FIELDS = [
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
     ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
+    ("jumps", "i8"),  # how often the gyro's bias has jumped or the gyro died
     ("floors", "i8"),  # how often the floor has changed
+    # Gyro against mice: sums over the readings of the last seconds, of 1, ω, ω², d, ω d, with d = ω_mice − ω.
+    ("compared", "f8"),
+    ("compared_turn", "f8"),
+    ("compared_square", "f8"),
+    ("compared_off", "f8"),
+    ("compared_product", "f8"),
+    ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
+    ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
+    ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
+    ("strange", "f8"),  # that rate (rad/s)
     ("chi2", "f8"),  # of the last innovation
     ("refused_s", "f8"),  # how long the mice have contradicted the prediction (s)
     # A sudden change of velocity that only the mice show: a collision, or a lift or slip on a straight.
@@ -167,7 +178,8 @@ class PlanarParameters(NamedTuple):
     # ... what may set them apart, as bought and mounted by eye: the drive determines it ...
     own_scale: float = 0.03
     own_angle_rad: float = math.radians(3.0)
-    # ... where a ruler puts them (±1 mm), and how fast height and floor change them (per √s).
+    # ... where a ruler puts them (±1 mm), and how fast height and floor change them (per √s). With 2 mm, another floor
+    # is taken for positions and is not found.
     position_m: float = 0.0006
     scale_walk: float = 1e-4
     angle_walk: float = 1e-4
@@ -198,5 +210,5 @@ def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
             covariance[a + ANGLE, b + ANGLE] = p.common_angle_rad**2 + apart * p.own_angle_rad**2
         for k in range(2):
             covariance[a + POSITION + k, a + POSITION + k] = p.position_m**2
-    state.start[:] = np.sqrt(np.diag(covariance))
+    state.fresh[:] = covariance
     return records
