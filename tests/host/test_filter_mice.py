@@ -333,7 +333,7 @@ def test_blocks_of_any_size_give_the_same_to_the_bit(size, rate_hz):
     [
         ((), 3, Sensors.MPU6050, "lacks the positions of the mice"),
         (ring(3), 0, Sensors.MPU6050, "no mouse gives counts"),
-        (ring(1), 1, Sensors(0), "cannot tell a turn"),
+        (ring(1), 1, Sensors(0), "cannot measure a turn"),
         ((Mouse(0.1, 0.2), Mouse(0.1, 0.2)), 2, Sensors.MPU6050, r"mice 1, 2 all sit at \(0.1, 0.2\) m"),
     ],
 )
