@@ -7,13 +7,26 @@ Python program has no flags.
 from __future__ import annotations
 
 import difflib
+import itertools
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+LONGEST_TEXT = 1500  # characters of a sentence. A list of all filters with reasons is shorter
 
 
 class LinkposeError(Exception):
-    """The base of all errors that a user can cause or cure. On the command line: one sentence, exit status 1."""
+    """The base of all errors that a user can cause or cure. On the command line: one sentence, exit status 1.
+
+    A sentence that quotes too much of a damaged file is cut in its middle: it begins with the file and ends with the
+    cure.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        if len(text) > LONGEST_TEXT:
+            half = LONGEST_TEXT // 2
+            text = f"{text[:half]} … {text[-half:]}"
+        super().__init__(text)
 
 
 # ---- files ----
@@ -87,6 +100,14 @@ class TooFewRows(LinkposeError):
             f"only {self.rows} of {self.known} estimates of {name} in {paths[0]} have a reference in {paths[1]}, "
             "less than half"
         )
+
+
+class NoEstimate(LinkposeError):
+    """A filter's columns are empty wherever they could be compared. `quantities` are their names."""
+
+    def __init__(self, name: str, path: object, quantities: Sequence[str]) -> None:
+        self.filter, self.quantities = name, tuple(quantities)
+        super().__init__(f"{path}: {name} estimated no {' or '.join(quantities)}, so nothing of it can be compared")
 
 
 # ---- ports and boards ----
@@ -319,6 +340,12 @@ class InvalidValue(LinkposeError, ValueError):
 
 
 # ---- text ----
+
+
+def listed(names: Iterable[str], most: int = 200) -> str:
+    """Names with commas between them, in at most `most` characters, for tables of any number of columns."""
+    text = ", ".join(itertools.islice(names, most))
+    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def printable(text: object, most: int | None = None) -> str:

@@ -19,6 +19,8 @@ from linkpose.sensors.devices import Sensors
 
 # The name of what writes estimates as text: every run needs it, whatever its filters.
 TEXT = "text"
+# The name of the search for the noises of a log, which `localize` runs before a filter.
+NOISES = "noises"
 POLL_S = 0.05  # between two looks at what the other processes have compiled
 
 
@@ -121,6 +123,10 @@ def compile_here(name: str) -> None:
         format_rows(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))
     elif name in filters.NAMES:
         filters.warm_up([name])
+    elif name == NOISES:
+        from linkpose.localization import tuning
+
+        tuning.warm_up()
     else:
         from linkpose.localization import localizer
 

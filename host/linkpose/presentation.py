@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from linkpose import quantities
 from linkpose.quantities import Quantity
@@ -16,6 +16,27 @@ if TYPE_CHECKING:
 Row = dict[str, dict[Quantity, tuple[float, float]]]
 
 _JOINT_ANGLES = (quantities.ANGLE, *quantities.BALL_ANGLES)
+
+
+class _Digits(NamedTuple):
+    """How a length and its standard deviation are written, for standard deviations below `below_m`."""
+
+    below_m: float
+    of_value: int  # decimals of the length (m)
+    factor: float  # units a metre
+    of_std: int  # decimals of the standard deviation
+    unit: str
+
+
+_LENGTH_DIGITS = (
+    _Digits(0.000095, 5, 1e3, 2, "mm"),
+    _Digits(0.00995, 4, 1e3, 1, "mm"),
+    _Digits(0.995, 3, 1e2, 1, "cm"),
+    _Digits(math.inf, 1, 1.0, 1, "m"),
+)
+_MOST_DECIMALS = 4  # that a column of lengths aligns
+_MOST_ERROR_DECIMALS = 6
+_ANGLE_DECIMALS = ((0.0095, 3), (0.095, 2), (9.95, 1), (math.inf, 0))  # σ (°) below -> decimals
 _STATES = ("being set up", "left out")  # that need no cure here
 
 
@@ -23,8 +44,12 @@ class RowReader:
     """Splits rows of estimates by filter and quantity."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        self._of_filter = quantities.by_filter(columns)
-        self._at = {column: at for at, column in enumerate(columns)}
+        at = {column: place for place, column in enumerate(columns)}
+        nowhere = len(columns)  # of a σ without a column: `read` appends NaN
+        self._of_filter = {
+            name: [(q, at[c], at.get(quantities.std_column(c) or "", nowhere)) for q, c in found.items()]
+            for name, found in quantities.by_filter(columns).items()
+        }
 
     @property
     def filters(self) -> list[str]:
@@ -33,13 +58,9 @@ class RowReader:
 
     def read(self, estimates: Sequence[float]) -> Row:
         """One row of estimates (columns,)."""
-
-        def of(column: str) -> tuple[float, float]:
-            std = self._at.get(quantities.std_column(column) or "")
-            return estimates[self._at[column]], math.nan if std is None else estimates[std]
-
+        known = [*estimates, math.nan]
         return {
-            name: {quantity: of(column) for quantity, column in found.items()}
+            name: {quantity: (known[value], known[std]) for quantity, value, std in found}
             for name, found in self._of_filter.items()
         }
 
@@ -93,15 +114,18 @@ def working_sensors(health: Health) -> list[str]:
     return [name.upper() for name, of in health.sensors.items() if of.get("state") == "ok"]
 
 
-def signed_angle(value_deg: float) -> str:
+def signed_angle(value_deg: float, decimals: int = 1) -> str:
     """An angle with its sign: +13.1°."""
-    return f"{value_deg:+.1f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
+    return f"{value_deg:+.{decimals}f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
 
 
 def angle_with_std(value_deg: float, std_deg: float) -> str:
-    """An angle with its standard deviation (°): +13.1° ±0.4°."""
-    bound = f" ±{std_deg:.2g}°" if math.isfinite(value_deg + std_deg) else ""
-    return signed_angle(value_deg) + bound
+    """An angle and its standard deviation (°), to the same digit: +13.1° ±0.4°, +13.12° ±0.05°."""
+    if not math.isfinite(value_deg + std_deg):
+        return signed_angle(value_deg)
+    decimals = next(count for below, count in _ANGLE_DECIMALS if std_deg < below)
+    bound = max(std_deg, 10.0**-decimals)  # ±0 would claim certainty
+    return f"{signed_angle(value_deg, decimals)} ±{bound:.{decimals}f}°"
 
 
 def joint_angle(values: Mapping[Quantity, tuple[float, float]]) -> tuple[float, float] | None:
@@ -116,37 +140,50 @@ def joint_texts(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
 
 def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
     """Place, heading and speed of a robot, each as a text."""
-    parts = [
-        f"{q.name} {with_std(*values[q], 'm', 3)}" for q in (quantities.X, quantities.Y) if q in values
-    ]  # fmt: skip
-    parts.append(f"heading {signed_angle(math.degrees(values[quantities.HEADING][0]))}")
+    parts = [f"{q.name} {length_with_std(*values[q])}" for q in (quantities.X, quantities.Y) if q in values]
+    parts.append(f"heading {angle_with_std(*map(math.degrees, values[quantities.HEADING]))}")
     speeds = [values[q][0] for q in (quantities.VX, quantities.VY) if q in values]
     if speeds and math.isfinite(sum(speeds)):
         parts.append(f"{math.hypot(*speeds):.2f} m/s")
     return parts
 
 
-def with_std(value: float, std: float, unit: str, decimals: int) -> str:
-    """A value with its standard deviation (m): 1.5906 m ±0.4 mm."""
-    if not math.isfinite(value):
+def length_with_std(value_m: float, std_m: float) -> str:
+    """A length and its standard deviation (m), to the same digit: 1.5906 m ±0.4 mm, 1.591 m ±1.2 cm."""
+    if not math.isfinite(value_m):
         return "not known yet"
-    return number_text(value, unit, decimals) + (f" ±{std_text(std)}" if math.isfinite(std) else "")
+    return length_text(value_m, std_m) + (f" ±{std_text(std_m)}" if math.isfinite(std_m) else "")
 
 
-def number_text(value: float, unit: str, decimals: int) -> str:
-    """A number with its unit, or a dash where it is not finite."""
-    return f"{value:.{decimals}f} {unit}" if math.isfinite(value) else "–"
+def length_text(value_m: float, std_m: float) -> str:
+    """A length to the last digit of its standard deviation (m); a dash where it is not finite."""
+    return f"{value_m:.{_digits(std_m).of_value}f} m" if math.isfinite(value_m) else "–"
+
+
+def aligned_length(value_m: float, std_m: float) -> str:
+    """`length_text` for a column: the decimal points stand below each other."""
+    text = length_text(value_m, std_m)
+    return text.replace(" m", " " * max(1, 1 + _MOST_DECIMALS - _digits(std_m).of_value) + "m")
+
+
+def std_text(std_m: float) -> str:
+    """A standard deviation (m) in mm, cm or m, with two or three digits."""
+    digits = _digits(std_m)
+    bound = max(digits.factor * std_m, 10.0**-digits.of_std)  # ±0 would claim certainty
+    return f"{bound:.{digits.of_std}f} {digits.unit}" if math.isfinite(std_m) else "–"
+
+
+def _digits(std_m: float) -> _Digits:
+    """An unknown σ gives a value in mm."""
+    return next((digits for digits in _LENGTH_DIGITS if std_m < digits.below_m), _LENGTH_DIGITS[-2])
+
+
+def same_digits(first: float, *others: float) -> list[str]:
+    """Errors as texts that end at the same digit, the third one of the first."""
+    decimals = max(0, min(_MOST_ERROR_DECIMALS, 2 - math.floor(math.log10(first)))) if first > 0 else 0
+    return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
 
 
 def counted(number: int, noun: str) -> str:
     """A number with its noun: 1 gap, 2 gaps."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
-
-
-def std_text(std: float) -> str:
-    """A standard deviation (m) in mm, cm or m, with two or three digits."""
-    if not math.isfinite(std):
-        return "–"
-    if std < 0.00995:
-        return f"{1e3 * std:.1f} mm"
-    return f"{1e2 * std:.1f} cm" if std < 0.995 else f"{std:.1f} m"

@@ -1,7 +1,8 @@
 """Peers of `linkpose localize` among beacons: filterpy's extended Kalman filter, and GTSAM's batch optimum.
 
-Both get the log, the places of the beacons and the noises that linkpose uses, and estimate scale and bias of the ranges
-where linkpose does. The batch optimum has Cauchy's loss against outliers.
+Both get the log, the positions of the beacons and the noises that linkpose uses, and estimate scale and bias of the
+ranges where linkpose does; a drift of the ranges, which linkpose estimates, is a part of their white noise here. The
+batch optimum has Cauchy's loss against outliers.
 """
 
 from __future__ import annotations
@@ -113,7 +114,8 @@ class Problem:
         by_state[0, :2] = scale * dx / distance, scale * dy / distance
         by_constants = np.zeros((len(event.values), len(constants)))
         by_constants[0] = [distance if name == "scale" else 1.0 for name in self.constants]
-        std = [math.sqrt(self.settings.ranges.variances(np.array([event.values[0]]), event.values[0])[0])]
+        variance = self.settings.ranges.variances(np.array([event.values[0]]), event.values[0])[0]
+        std = [math.sqrt(variance + self.settings.drift_std_m**2)]
         if len(event.values) == 2:
             residual.append(wrap_angle(event.values[1] - math.atan2(-dy, -dx) + state[2]))
             by_state[1, :3] = -dy / flat**2, dx / flat**2, -1.0

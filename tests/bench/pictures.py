@@ -48,7 +48,7 @@ def draw_page(estimates: Estimates) -> None:
         page.show(estimates.values[::5], lambda: Status(HEALTH))
         browser.open(page.url)
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
-        time.sleep(5)  # the scene fades in
+        time.sleep(30)  # the scene fades in, slowly on a loaded machine without a graphics card
         remark = "document.querySelector('.mantine-Notification-root')"
         browser.evaluate(f"{remark} && {remark}.remove()")
         browser.screenshot(IMAGES / "page.png")

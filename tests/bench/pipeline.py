@@ -15,9 +15,9 @@ import numpy as np
 from _report import Row, report
 
 from linkpose.estimation import EstimateWriter, Estimator
-from linkpose.filters import ALL_SENSORS
 from linkpose.recording.writer import RecordingWriter, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
+from linkpose.sensors.devices import found
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.simulation import board
 from linkpose.simulation.link import LinkRun
@@ -33,7 +33,7 @@ def main() -> None:
     settings = BoardSettings.of(hello)
     with tempfile.TemporaryDirectory() as folder:
         decoder, timeline, clock = StreamDecoder(), Timeline(100), BoardClock()
-        converter, estimator = Converter(settings), Estimator([], run.rig, ALL_SENSORS)
+        converter, estimator = Converter(settings), Estimator([], run.rig, found(hello))
         estimator.warm_up()
         head = metadata(hello, settings, "bench", run.rig, {})
         recording = RecordingWriter(Path(folder, "r.csv"), head, layout_of(settings), force=False)

@@ -11,6 +11,13 @@ of the gyro behind the reference's rate, one for all trials of a kind. Every fil
 through the rig, VQF's estimate is extrapolated by the last rate less VQF's own bias. The score at each filter's own
 best lag stands beside the score at that fixed delay. The peer of --smooth is offline VQF.
 
+The pendulums' reference limits their scores. Its quaternion is that of a body whose x and y axes point the other way
+(177° about z); the rotation is fitted to the rates. It departs from the gyro by 5 to 8 °/s over 0.1 s: its
+time offset varies, and parts look interpolated. `slow` scores average the error over `SLOW_S`, which removes the
+departures that no filter follows; `fast_deg` is their size, a scale error of the gyro included. `within_2sigma` is the
+share of the second half's errors of roll and pitch within 2σ, with `slow` that of the averaged errors. The upward
+direction is fitted to the accelerometer, whose own bias a filter that estimates it gets as an error.
+
 `chosen_on` marks the trials on which constants of the filters were chosen; all others are held out. The last lines give
 for each set and filter the geometric mean of the ratios to VQF, over all and over held-out trials, and the worst.
 """
@@ -38,6 +45,8 @@ OMC_LATE_S = 0.0165  # the camera's stamps of diodem_chain, half a frame
 # Constants of the filters are chosen on these only. Add a trial before you look at its score to choose anything.
 CHOSEN_ON = {"broad 01", "broad 15", "broad 24", "pendulum 02a_Trial1", "robot circle-100_radius", "diodem segment 2"}
 MOST_LAG_S = 0.06
+SLOW_S = 2.0  # longer than a swing of the pendulums (1.5 s)
+_RATE_S = 0.1  # over which the rates of a jittering reference are compared with the gyro's
 
 
 class Case(NamedTuple):
@@ -57,6 +66,15 @@ class Case(NamedTuple):
         """Root mean square error of tilts (N, 3)."""
         return float(np.sqrt(np.nanmean(np.square(self.errors_deg(tilt)))))
 
+    def split_deg(self, tilt: Floats) -> tuple[float, float]:
+        """Root mean square of the error's mean over `SLOW_S`, and of the rest, where the truth is a tilt."""
+        if self.truth is None:
+            raise ValueError("the truth of this recording is no tilt")
+        error = tilt - self.truth
+        slow = running_mean(error, self.time_s)
+        mean, rest = (float(np.degrees(np.sqrt(np.nanmean((e**2).sum(axis=1))))) for e in (slow, error - slow))
+        return mean, rest
+
     def best_deg(self, tilt: Floats) -> float:
         """The error at the estimate's own best lag."""
         step = (self.time_s[-1] - self.time_s[0]) / (len(self.time_s) - 1)
@@ -66,14 +84,22 @@ class Case(NamedTuple):
         return min(self.error_deg(tilt[np.clip(at + lag, 0, len(tilt) - 1)]) for lag in lags)
 
 
+def running_mean(values: Floats, time_s: Floats) -> Floats:
+    """Mean of values (N, k) over `SLOW_S` about each sample; over less at the ends."""
+    n, half = len(time_s), round(0.5 * SLOW_S * (len(time_s) - 1) / (time_s[-1] - time_s[0]))
+    total = np.cumsum(np.vstack([np.zeros((1, values.shape[1])), values]), axis=0)
+    begin, end = np.maximum(np.arange(n) - half, 0), np.minimum(np.arange(n) + half + 1, n)
+    return np.asarray((total[end] - total[begin]) / (end - begin)[:, None])
+
+
 def pendulum(folder: Path) -> Iterator[Case]:
-    """A link on a fixed pivot, Vicon. The reference's upward direction is fitted, as its README asks."""
+    """A link on a fixed pivot, Vicon; the mounting of the reference and its upward direction are fitted."""
     for path in sorted(folder.glob("Pendulum_*_Segment_1.csv")):
         lines = path.read_text(encoding="utf-8").splitlines()[2:]
         rows = np.array([[float(c.replace(",", ".")) for c in line.split(";") if c] for line in lines if line.strip()])
         time_s = np.linspace(0, rows[-1, 0] - rows[0, 0], len(rows))
         accel, gyro = np.ascontiguousarray(rows[:, 5:8]), np.ascontiguousarray(rows[:, 8:11])
-        rotation = matrices(rows[:, 1:5])
+        rotation = _mounted(matrices(rows[:, 1:5]), gyro, time_s, round(_RATE_S / time_s[1]))
         up = np.median(np.einsum("nij,nj->ni", rotation, accel), axis=0)
         tilt = np.einsum("nji,j->ni", rotation, up / np.linalg.norm(up))
         name = "pendulum " + path.stem[13:23]
@@ -180,19 +206,24 @@ def _at(at_s: Floats, time_s: Floats, values: Floats) -> Floats:
     return np.column_stack([np.interp(at_s, time_s, column) for column in values.T])
 
 
-def _mounted(rotation: Floats, gyro: Floats, time_s: Floats) -> Floats:
-    """Rotations (N, 3, 3) from the sensor, for those from the link or to it: the mounting that fits the rates best."""
-    gyro = np.vstack([0.5 * (gyro[1:] + gyro[:-1]), gyro[-1:]])  # between two samples, as the differences are
-    fits = []
+def _mounted(rotation: Floats, gyro: Floats, time_s: Floats, stride: int = 1) -> Floats:
+    """Rotations (N, 3, 3) from the sensor, for those from the link or to it: the mounting that fits the rates best.
+
+    Rates are compared over `stride` samples.
+    """
+    steps = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(time_s)[:, None]  # between two samples, as the differences are
+    total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    span = (time_s[stride:] - time_s[:-stride])[:, None]
+    gyro, fits = (total[stride:] - total[:-stride]) / span, []
     for turned in (rotation, rotation.transpose(0, 2, 1)):
-        step = np.einsum("nji,njk->nik", turned[:-1], turned[1:])
+        step = np.einsum("nji,njk->nik", turned[:-stride], turned[stride:])
         angle = np.column_stack(
             [step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]]
         )
-        rate = 0.5 * angle / np.diff(time_s)[:, None]
-        u, _, v = np.linalg.svd(rate.T @ gyro[:-1])
+        rate = 0.5 * angle / span
+        u, _, v = np.linalg.svd(rate.T @ gyro)
         mount = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
-        fits.append((float(np.square(rate @ mount - gyro[:-1]).sum()), turned @ mount))
+        fits.append((float(np.square(rate @ mount - gyro).sum()), turned @ mount))
     return min(fits, key=lambda fit: fit[0])[1]
 
 
@@ -231,16 +262,33 @@ def block_of(case: Case) -> Measurements:
     )  # fmt: skip
 
 
-def tilt_of(name: str, case: Case) -> Floats:
-    """A filter's tilts (N, 3)."""
+def estimate_of(name: str, case: Case) -> dict[str, Floats]:
+    """A filter's estimates (N,) by column, without the filter's name."""
     rig = Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))
     made = JointInertialSmoother(rig) if name == "--smooth" else filters.create(name, rig)
-    return tilt_from(made.process(block_of(case)))
+    prefix = made.name.replace("-", "_") + "_"
+    names = (column.removeprefix(prefix) for column in made.columns)
+    return dict(zip(names, made.process(block_of(case)).T, strict=True))
 
 
-def tilt_from(estimate: Floats) -> Floats:
-    """Tilts (N, 3) of estimates whose third and fourth columns are roll and pitch (°)."""
-    roll, pitch = np.radians(estimate[:, 2:4]).T
+def within_2sigma(case: Case, found: dict[str, Floats]) -> dict[str, float]:
+    """Share of the second half's errors of roll and pitch within 2σ, as they are and averaged over `SLOW_S`."""
+    if case.truth is None or "roll_std_deg" not in found:
+        return {}
+    x, y, z = case.truth.T
+    true, shares = {"roll": np.arctan2(y, z), "pitch": np.arctan2(-x, np.hypot(y, z))}, {}
+    half = slice(len(x) // 2, None)
+    for name, angle in true.items():
+        error = (found[f"{name}_deg"] - np.degrees(angle) + 180.0) % 360.0 - 180.0
+        slow, std = running_mean(error[:, None], case.time_s)[:, 0], found[f"{name}_std_deg"]
+        shares[f"{name}_within_2sigma"] = float((np.abs(error) < 2 * std)[half].mean())
+        shares[f"slow_{name}_within_2sigma"] = float((np.abs(slow) < 2 * std)[half].mean())
+    return shares
+
+
+def tilt_from(roll_deg: Floats, pitch_deg: Floats) -> Floats:
+    """Tilts (N, 3) from roll and pitch (N,)."""
+    roll, pitch = np.radians(roll_deg), np.radians(pitch_deg)
     return np.column_stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
 
 
@@ -260,11 +308,18 @@ def rows(case: Case) -> Iterator[dict[str, object]]:
     """The scores of each filter on a recording."""
     peers = {offline: vqf_tilt(case, offline) for offline in ((False, True) if case.joint else (False,))}
     for used in (*(("joint-inertial", "--smooth", "joint") if case.joint else ()), "tilt", "tilt-inertial"):
-        tilt, peer = tilt_of(used, case), peers[used == "--smooth"]
+        found = estimate_of(used, case)
+        tilt, peer = tilt_from(found["roll_deg"], found["pitch_deg"]), peers[used == "--smooth"]
         scores = {"ours_deg": case.error_deg(tilt), "vqf_deg": case.error_deg(peer)}
         scores |= {"ours_best_lag_deg": case.best_deg(tilt), "vqf_best_lag_deg": case.best_deg(peer)}
         ratios = {"ratio": scores["ours_deg"] / scores["vqf_deg"]}
         ratios["ratio_best_lag"] = scores["ours_best_lag_deg"] / scores["vqf_best_lag_deg"]
+        if case.joint:
+            (scores["ours_slow_deg"], scores["fast_deg"]), (scores["vqf_slow_deg"], _) = map(
+                case.split_deg, (tilt, peer)
+            )
+            ratios["ratio_slow"] = scores["ours_slow_deg"] / scores["vqf_slow_deg"]
+            scores |= within_2sigma(case, found)
         about = {"set": case.data, "data": case.name, "filter": used, "chosen_on": case.name in CHOSEN_ON}
         yield {**about, **scores, **ratios}
 
@@ -274,7 +329,7 @@ def summary(found: list[dict[str, object]]) -> Iterator[dict[str, object]]:
     for key in dict.fromkeys((row["set"], row["filter"]) for row in found):
         mine = [row for row in found if (row["set"], row["filter"]) == key]
         out: dict[str, object] = {"set": key[0], "filter": key[1], "trials": len(mine)}
-        for name in ("ratio", "ratio_best_lag"):
+        for name in (name for name in ("ratio", "ratio_best_lag", "ratio_slow") if name in mine[0]):
             values = np.array([float(str(row[name])) for row in mine])
             held_out = values[[not row["chosen_on"] for row in mine]]
             out[name] = float(np.exp(np.log(values).mean()))

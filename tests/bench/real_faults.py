@@ -120,7 +120,7 @@ def ours(name: str, case: Case, faulty: Faulty) -> tuple[Floats, Floats, int]:
     made = filters.create(name, rig)
     found = np.full((len(case.time_s), 4), np.nan)
     found[faulty.arrived] = made.process(_block(case, faulty))[:, :4]
-    return tilt_from(found), found[:, :2], int(getattr(made, "restarts", 0))
+    return tilt_from(found[:, 2], found[:, 3]), found[:, :2], int(getattr(made, "restarts", 0))
 
 
 def peer(case: Case, faulty: Faulty) -> Floats:

@@ -1,11 +1,11 @@
 """`linkpose localize` on public recordings of real robots, beside the figures that tuned filters of others reached.
 
-    python tests/bench/real_localization.py [--data FOLDER] [--batch] [--json]
+    python tests/bench/real_localization.py [--data FOLDER] [--quick] [--json]
 
 FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
 recording that is not there is named and left out. Each recording is run with the default options, smoothed, and with
 options from the sensors' data sheets. Beside them run filterpy's extended Kalman filter, Monte-Carlo localisation
-(laser), and with --batch the batch optimum of GTSAM, which takes some minutes.
+(laser), and the batch optimum of GTSAM, which takes some minutes and is left out with --quick.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from _localization_peers import filterpy_path, gtsam_path, problem_of
 from _report import RECORDINGS
 
 from linkpose.localization.carmen import Reading, flaser_angles, format_reading
-from linkpose.localization.events import read_events
-from linkpose.localization.kalman import SUBMERSIBLE
+from linkpose.localization.events import Event
 from linkpose.localization.localizer import localize
+from linkpose.localization.logs import read_log
+from linkpose.localization.measuring import default_constants
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import read_beacons, read_truth, score
 from linkpose.localization.tuning import TUNABLE, tune
-from linkpose.localization.vehicle import kinds_of, vehicle_of
+from linkpose.localization.vehicle import kinds_of
 
 PLAZA_RMS_M = {"Plaza1": 0.40, "Plaza2": 0.59}  # what a tuned EKF of others reached
 MRCLAM_RMS_M, LABYRINTH_RMS_M = 0.17, 0.15
@@ -41,7 +42,6 @@ TAG_RMS_M, AUV_RMS_M = 0.090, 5.3  # a constant-velocity EKF with a bias; GTSAM'
 FILES = 5  # log, --beacons, file, --truth, file: what is no option of the filter
 MRCLAM_ROBOTS = range(1, 6)
 WEAN_ENDS_M = {"robotdata1": (39.90, 41.43)}  # where a particle filter of others ended
-BEACONS_FOR_CONSTANTS = 3  # as `linkpose localize`
 
 
 @dataclass(frozen=True)
@@ -272,11 +272,10 @@ def with_truth(cases: Iterable[Case], batch: bool) -> Iterable[dict[str, object]
 
 def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
     """filterpy's filter and, with `batch`, GTSAM's optimum, with the noises that linkpose estimates from the log."""
-    log, beacons = read_events(Path(case.arguments[0])).events, read_beacons(Path(case.arguments[2]))
+    log, beacons = read_log(Path(case.arguments[0])).events, read_beacons(Path(case.arguments[2]))
     truth = read_truth(Path(case.arguments[4]))
-    many = len(beacons) >= BEACONS_FOR_CONSTANTS and vehicle_of(kinds_of(log)) is not SUBMERSIBLE
-    ranging = any(event.kind == "range" for event in log)
-    first = Settings(ranges=RangeNoise("affine"), estimate=("scale", "bias") if many and ranging else ())
+    ranged = {event.beacon for event in log if isinstance(event, Event) and event.kind == "range"}
+    first = Settings(ranges=RangeNoise("affine"), estimate=default_constants(kinds_of(log), len(ranged)))
     settings = tune(log, first, beacons, TUNABLE)
     problem = problem_of(log, beacons, settings)
     time_s, path = filterpy_path(problem)
@@ -299,14 +298,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=RECORDINGS, help="folder of the recordings")
     parser.add_argument("--json", action="store_true", help="one object a line")
-    parser.add_argument("--batch", action="store_true", help="also the batch optimum of GTSAM: some minutes")
+    parser.add_argument("--quick", action="store_true", help="leave out the batch optimum of GTSAM")
     options = parser.parse_args()
     sources: dict[str, Callable[[Path, Path], Iterable[dict[str, object]]]] = {
-        "plaza": lambda folder, out: with_truth(plaza(folder, out), options.batch),
-        "mrclam": lambda folder, out: with_truth(mrclam(folder, out), options.batch),
-        "uwb_labyrinth": lambda folder, out: with_truth(uwb_labyrinth(folder, out), options.batch),
-        "uwb_tag": lambda folder, out: with_truth(uwb_tag(folder, out), options.batch),
-        "auv_lbl": lambda folder, out: with_truth(auv_lbl(folder, out), options.batch),
+        "plaza": lambda folder, out: with_truth(plaza(folder, out), not options.quick),
+        "mrclam": lambda folder, out: with_truth(mrclam(folder, out), not options.quick),
+        "uwb_labyrinth": lambda folder, out: with_truth(uwb_labyrinth(folder, out), not options.quick),
+        "uwb_tag": lambda folder, out: with_truth(uwb_tag(folder, out), not options.quick),
+        "auv_lbl": lambda folder, out: with_truth(auv_lbl(folder, out), not options.quick),
         "laser_maps": laser_maps,
         "wean": wean,
     }

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import gzip
 import random
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +15,11 @@ from PIL import Image
 
 from linkpose.cli import group
 from linkpose.convert import convert
-from linkpose.errors import LinkposeError
+from linkpose.errors import LONGEST_TEXT, LinkposeError
 from linkpose.evaluation.references import read_any, read_for_picture
 from linkpose.evaluation.scores import evaluate
-from linkpose.flashing.image import read_image
-from linkpose.localization.carmen import read_carmen
-from linkpose.localization.events import read_events
+from linkpose.flashing.image import MARK, read_image
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.tables import read_beacons, read_truth
 from linkpose.recording.reader import RecordingFile, load_recording
@@ -30,6 +30,7 @@ from linkpose.sensors.rig import as_rig
 from linkpose.simulation import board
 from linkpose.simulation.link import LinkRun
 from linkpose.wire.frames import encode
+from linkpose.wire.messages import PROTOCOL_MAJOR, SCHEMA_CRC
 
 # What breaks parsers of numbers, of JSON, YAML and TOML, and what breaks programs that trust a number.
 TOKENS = [
@@ -39,6 +40,7 @@ TOKENS = [
     b"{" * 500, b"&a [*a,*a]", b"null", b"true", b"\x1b[31m", b"..", b"/dev/zero", b"%s", b"18446744073709551616",
     b"NaN,", b"99999999999", b"1e9", b"[[[]]]", b"{}", b"[]", b"time_s", b"-0", b"\xed\xa0\x80", b"=1+1",
 ]  # fmt: skip
+LONG = 100_000
 HOLDERS = (b",", b"\n", b" ", b":", b"=", b"\t", b"[", b"]")
 
 
@@ -97,8 +99,67 @@ def _line(data: bytearray, rng: random.Random) -> None:
     data[:] = b"\n".join(lines)
 
 
+def _columns(data: bytearray, rng: random.Random) -> None:
+    """A column is exchanged with another, doubled, removed or made longer in all lines."""
+    separator = rng.choice([b",", b",", b" ", b":"])
+    a, b, kind = rng.randrange(12), rng.randrange(12), rng.randrange(4)
+    lines = bytes(data).split(b"\n")
+    for at, line in enumerate(lines):
+        cells = line.split(separator)
+        if max(a, b) >= len(cells):
+            continue
+        if kind == 0:
+            cells[a], cells[b] = cells[b], cells[a]
+        elif kind == 1:
+            cells.insert(a, cells[b])
+        elif kind == 2:
+            del cells[a]
+        else:
+            cells[a] += cells[b]
+        lines[at] = separator.join(cells)
+    data[:] = b"\n".join(lines)
+
+
+def _layout(data: bytearray, rng: random.Random) -> None:
+    """The whole file is kept in another form: other line ends, encodings or separators, twice, upside down, zipped."""
+    text = bytes(data)
+    data[:] = rng.choice(_LAYOUTS)(text, rng)
+
+
+def _mixed_line_ends(text: bytes, rng: random.Random) -> bytes:
+    return b"".join(line + rng.choice([b"\n", b"\r\n", b"\r", b"\n\n", b"\0\n"]) for line in text.split(b"\n"))
+
+
+def _head_again(text: bytes, rng: random.Random) -> bytes:
+    lines = text.split(b"\n")
+    at = rng.randint(0, len(lines))
+    return b"\n".join(lines[:at] + lines[: rng.choice((1, 3, 6))] + lines[at:])
+
+
+def _encoded(text: bytes, rng: random.Random) -> bytes:
+    codec = rng.choice(["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "utf-7", "cp500"])
+    return text.decode("latin-1").encode(codec)
+
+
+def _huge(text: bytes, rng: random.Random) -> bytes:
+    """A cell of 100 000 characters, or a line or a header of 100 000 cells."""
+    at = rng.randint(0, len(text))
+    return text[:at] + rng.choice([b"9", b"a", b",", b"1,", b"a,", b" ", b'"', b"[", b"- ", b"a:"]) * LONG + text[at:]
+
+
+_LAYOUTS: list[Callable[[bytes, random.Random], bytes]] = [
+    _mixed_line_ends, _head_again, _encoded, _huge,
+    lambda text, rng: text + text,
+    lambda text, rng: b"\n".join(reversed(text.split(b"\n"))),
+    lambda text, rng: text.replace(b",", rng.choice([b";", b"\t", b" ", b",,", b'","'])),
+    lambda text, rng: text.replace(b".", rng.choice([b",", b"", b"e"])),
+    lambda text, rng: text.replace(b"\n", rng.choice([b"\r", b"", b",\n", b"\n#"])),
+    lambda text, rng: gzip.compress(text, 1),
+    lambda text, rng: bytes(len(text)),
+]  # fmt: skip
+
 _CHANGES: list[Callable[[bytearray, random.Random], None]] = [
-    _flip, _insert, _replace_field, _replace_field, _cut, _remove, _double, _line,
+    _flip, _insert, _replace_field, _replace_field, _cut, _remove, _double, _line, _columns, _layout,
 ]  # fmt: skip
 
 
@@ -134,9 +195,9 @@ def targets(folder: Path) -> dict[str, Target]:
         "rig": Target(files.text("rig.toml", _RIG), as_rig),
         "map": Target(files.map(), load_map),
         "map-image": Target(files.map().with_suffix(".png"), lambda path: files.load_map_with(path)),
-        "carmen": Target(files.text("scans.log", _CARMEN), read_carmen),
+        "carmen": Target(files.text("scans.log", _CARMEN), read_log),
         "beacons": Target(files.text("beacons.csv", _BEACONS), read_beacons),
-        "events": Target(files.text("events.csv", _EVENTS), read_events),
+        "events": Target(files.text("events.csv", _EVENTS), read_log),
         "robot-truth": Target(files.text("robot.csv", _ROBOT), read_truth),
         "hex": Target(files.hex(), read_image),
     }
@@ -183,8 +244,10 @@ def read_mutated(target: Target, data: bytes) -> None:
     """Reads damaged bytes under the name of the valid file's kind. Raises whatever is not a LinkposeError."""
     damaged = target.valid.with_name("damaged" + target.valid.suffix)
     damaged.write_bytes(data)
-    with contextlib.suppress(LinkposeError):
+    try:
         target.read(damaged)
+    except LinkposeError as error:
+        assert len(str(error)) <= LONGEST_TEXT + 3, str(error)[:300]
 
 
 _RIG = """[joint]
@@ -278,11 +341,12 @@ class _Files:
         load_map(self.text("damaged-map.yaml", f"image: {image.name}\nresolution: 0.5\norigin: [-1.0, -1.0, 0.0]\n"))
 
     def hex(self) -> Path:
-        packaged = Path(__file__).parents[2] / "host" / "linkpose" / "flashing" / "firmware.hex"
-        if packaged.exists():
-            return self.text("firmware.hex", packaged.read_text())
+        """An image of 512 bytes with the mark and the version by which linkpose knows its firmware."""
+        version = struct.pack("<BBIBBBI", PROTOCOL_MAJOR, 0, SCHEMA_CRC, 1, 0, 0, 7)
+        content = bytes(100) + MARK + version
+        content += bytes(range(256)) * 2
         lines = []
-        for at in range(0, 256, 16):
-            body = bytes([16, at >> 8, at & 255, 0, *range(16)])
+        for at in range(0, 512, 16):
+            body = bytes([16, at >> 8, at & 255, 0]) + content[at : at + 16]
             lines.append(":" + (body + bytes([-sum(body) & 255])).hex().upper())
         return self.text("firmware.hex", "\n".join([*lines, ":00000001FF"]) + "\n")

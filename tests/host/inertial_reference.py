@@ -7,15 +7,17 @@ states and compares a kernel with the reference to 1e-9.
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.linalg import expm
 
+from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._records import record_of
-from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, rest, update
+from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, report, rest, update
 from linkpose.filters.inertial.hypotheses import DATA_SHEET
-from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, V, Z, fresh_state
+from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, MG, PSI, SIZE, D, V, Z, fresh_state
 from linkpose.filters.joint_inertial import InertialParameters
 from linkpose.sensors.rig import Imu
 
@@ -147,21 +149,26 @@ def check_the_joint_constraint(rng):
     unconstrained(s)
     reading = s.gyro_bias + np.array([2.0, -1.5, 1.0])
     s.spread[:] = 1e3 * np.eye(3)
-    s.residual_square, s.reach_square = 0.01, 1.0
+    s.residual_square[:], s.reach_square, s.assumed = (0.01, 0.02, 0.03), 1.0, 0.0
     nominal, p, d, m = s.nominal.copy(), s.covariance.copy(), s.j2s.copy(), s.nominal[MG:D].reshape(3, 3)
     rate = (np.eye(3) - m) @ (reading - s.gyro_bias)
     h = np.zeros((3, SIZE))
     h[:, V:BG] = np.eye(3)
     h[:, BG:BA], h[:, MG:D] = -skew(d), -skew(d) @ by_matrix(reading - s.gyro_bias)
-    excited = np.array(joint_velocity.excited_part(s.spread, tuple(rate), IMU.gyro_variance))
+    interval, spread = 0.04, s.spread.copy()
+    joint_velocity.follow_spread(spread, tuple(rate), interval)
+    excited = np.array(joint_velocity.excited_part(spread, tuple(rate), IMU.gyro_variance))
     h[:, D:PSI] = -skew(excited)
     product = 0.5 * np.trace(p[BG:BA, BG:BA]) * np.trace(p[D:PSI, D:PSI])
-    share = max(0.01, Q.least_residual**2)
-    scalar = product + Q.velocity_floor_m_s**2 + share * (rate @ rate) * (d @ d)
-    noise = scalar * np.eye(3) + IMU.gyro_variance * skew(d) @ skew(d).T
+    floor, reach = Q.velocity_floor_m_s**2, (rate @ rate) * (d @ d)
+    lasting = 2.0 * Q.residual_correlation_s / interval - 1.0
+    excess = reach * (s.residual_square + lasting * (s.residual_square - Q.least_residual**2))
+    noise = (product + floor) * np.eye(3) + np.diag(excess) + IMU.gyro_variance * skew(d) @ skew(d).T
     noise += skew(rate - excited) @ p[D:PSI, D:PSI] @ skew(rate - excited).T
+    q = Q.copy()
+    q.residual_time_s = 1e15  # nothing is measured
     change, covariance = dense_update(p, h, noise, np.cross(rate, d) - s.velocity)
-    assert joint_velocity.update_joint_velocity(s, False, (0.0, 0.0, 0.0), tuple(reading), 0.0, IMU, Q)
+    assert joint_velocity.update_joint_velocity(s, False, (0.0, 0.0, 0.0), tuple(reading), interval, IMU, q)
     np.testing.assert_allclose(s.covariance, covariance, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.nominal, corrected(nominal, change), rtol=0, atol=1e-9)
 
@@ -227,10 +234,27 @@ def check_the_heading(rng):
     off = 1e-6 * s.tilt
     _, true = random_state(rng)
     true.tilt[:], true.north[:] = s.tilt, s.north
-    propagate.rotate_attitude(true, tuple(off))
+    propagate.rotate_attitude(true, vec.turn_of(tuple(off)))
     s.nominal[PSI] = s.tilt @ off
     update.constrain_attitude(s)
     np.testing.assert_allclose(s.north, true.north, rtol=0, atol=1e-9)
+
+
+def check_the_relation_of_heading_and_tilt(rng):
+    """ψ between the heading axis of a Z that is a little off and X as an update of Z turns it."""
+    _, s = random_state(rng)
+    s.north[:] = gravity.heading_axis(tuple(s.tilt))
+    s.covariance[PSI] = s.covariance[:, PSI] = 0.0
+    p = s.covariance.copy()
+    gravity.relate_heading(s)
+    slope, small = np.zeros(3), 1e-6
+    for k in range(3):
+        tilt = s.tilt + small * np.eye(3)[k]
+        tilt /= np.linalg.norm(tilt)
+        updated = s.north - (s.north @ tilt) * tilt
+        slope[k] = -np.cross(tilt, updated) @ np.array(gravity.heading_axis(tuple(tilt))) / small
+    np.testing.assert_allclose(s.covariance[PSI, :PSI], slope @ p[Z:V, :PSI], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(s.covariance[PSI, PSI], slope @ p[Z:V, Z:V] @ slope, rtol=0, atol=1e-4)
 
 
 def check_the_alignment_to_gravity(rng):
@@ -247,6 +271,41 @@ def check_the_alignment_to_gravity(rng):
     np.testing.assert_allclose(s.covariance[Z:V, Z:V], expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[Z:V, BG:], lean @ p[:, BG:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[V:BG, V:BG], 0.5 * np.eye(3), rtol=0, atol=1e-9)
+
+
+def empty_row():
+    """A row of ESTIMATE; a record of NumPy has a method `std`."""
+    return SimpleNamespace(**{name: np.zeros(ESTIMATE[name].shape) for name in ESTIMATE.names})
+
+
+def check_the_reported_stds(rng):
+    """σ of each reported value, by finite differences of the value, and at a later attitude: those of that attitude."""
+    states, s = random_state(rng)
+    across = np.eye(SIZE)
+    across[Z:V, Z:V] -= np.outer(s.tilt, s.tilt)
+    s.covariance[:] = 1e-4 * across @ s.covariance @ across
+    s.time = s.turned_at = 1.0
+    later, begin = 0.3 * rng.standard_normal(3), states.copy()
+
+    def reported(change, rotation):
+        trial, row = begin.copy().view(np.recarray)[0], empty_row()
+        trial.nominal[:] += change
+        update.constrain_attitude(trial)
+        propagate.rotate_attitude(trial, vec.turn_of(tuple(rotation)))
+        report.report(trial, 1.0, IMU, row)
+        return row.value
+
+    small = 1e-6
+    for rotation, held in (np.zeros(3), 0), (later, 3):
+        gradient = np.array(
+            [(reported(small * e, rotation) - reported(-small * e, rotation)) / (2 * small) for e in np.eye(SIZE)]
+        ).T
+        propagate.rotate_attitude(s, vec.turn_of(tuple(rotation)))
+        row = empty_row()
+        report.report(s, 1.0, IMU, row)
+        expected = np.sqrt(np.diag(gradient @ begin[0].covariance @ gradient.T))
+        np.testing.assert_allclose(row.std[held:], expected[held:], rtol=1e-6)
+        s.span = 0.01  # from here on the covariance is that of an earlier sample
 
 
 if __name__ == "__main__":

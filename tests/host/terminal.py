@@ -24,14 +24,16 @@ PATIENCE_S = 240.0  # a bound on a loaded machine, never a wait
 class Terminal:
     """linkpose in the foreground of a terminal; its stdout may be redirected. A context manager."""
 
-    def __init__(self, *command: object, stdout: BinaryIO | None = None, columns: int = 80, rows: int = 24) -> None:
+    def __init__(
+        self, *command: object, stdout: BinaryIO | None = None, columns: int = 80, rows: int = 24, kind: str = "xterm"
+    ) -> None:
         self._screen = pyte.HistoryScreen(columns, rows, history=1000)
         self._stream = pyte.ByteStream(self._screen)
         self._leader, follower = pty.openpty()
         self._set_size(columns, rows)
         # pytest's workers set COLUMNS and LINES, which would hide the terminal's own size.
         inherited = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
-        environment = {**inherited, "PYTHONPATH": str(HOST), "TERM": "xterm"}
+        environment = {**inherited, "PYTHONPATH": str(HOST), "TERM": kind}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "linkpose", *map(str, command)],
             stdin=follower,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import linkpose as lp
-from linkpose.calibration.chain import calibrate_chain, with_calibration
+from linkpose.calibration.chain import calibrate_chain, remarks, with_calibration
 from linkpose.errors import LinkposeError
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Rig
@@ -89,6 +89,24 @@ def test_sensors_on_no_common_joint_are_refused() -> None:
     )
     with pytest.raises(LinkposeError, match="fit no joint between the two sensors"):
         calibrate_chain([recording(mixed)], Rig())
+
+
+def test_a_wrong_kind_a_still_sensor_and_swapped_sensors_are_named() -> None:
+    run = ChainRun("hinge", seed=4, duration_s=20.0)
+    measured = run.measurements()
+    found = calibrate_chain([recording(measured)], Rig(), "ball")
+    (wrong,) = remarks(found, "ball", Rig())
+    assert wrong.startswith("The motion is that of a hinge, not of a ball joint: the links turn by ")
+    assert not remarks(found, None, Rig()) and not remarks(found, "hinge", run.calibrated_rig)
+    one = calibrate_chain([recording(one_link_in_motion())], Rig())
+    assert remarks(one, None, Rig()) == ["Sensor 1 does not turn, so r1 is not observable: move both links."]
+    other = lp.Measurements.from_imu(
+        measured.time_s, measured.accel2_m_s2, measured.gyro2_rad_s,
+        accel2_m_s2=measured.accel_m_s2, gyro2_rad_s=measured.gyro_rad_s,
+    )  # fmt: skip
+    before = with_calibration(Rig(), calibrate_chain([recording(measured)], Rig()))
+    (swapped,) = remarks(calibrate_chain([recording(other)], Rig()), None, before)
+    assert swapped.startswith("The sensors look swapped: r1 found here is r2 of the rig file")
 
 
 def test_the_command_writes_the_chain_and_keeps_the_rest_of_the_rig(linkpose: Any, tmp_path: Path) -> None:

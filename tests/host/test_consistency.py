@@ -39,16 +39,43 @@ def having(option: str) -> set[str]:
     return {name for name, command in ALL.items() if any(option in each.opts for each in command.params)}
 
 
+# Each command and which of these options it has: -q wherever there is more than the result, -v where there are details,
+# --json where the result has figures, --force where a file is written, --view where there is something that moves.
+FLAGS = "-q -v --json --force --view --plot"
+TABLE = """
+    ports                       --json
+    flash                -q -v
+    info                 -q -v  --json
+    record               -q -v  --json  --force  --view
+    estimate             -q -v  --json  --force  --view
+    calibrate imu        -q     --json
+    calibrate joint      -q     --json
+    calibrate chain      -q     --json
+    calibrate mag        -q     --json  --force
+    calibrate noise      -q     --json  --force
+    calibrate mice       -q     --json
+    convert              -q             --force
+    evaluate             -q     --json  --force          --plot
+    simulate link        -q             --force
+    simulate chain       -q             --force
+    simulate mice        -q             --force
+    simulate indoor      -q             --force
+    simulate underwater  -q     --json  --force
+    reproduce link       -q     --json  --force          --plot
+    reproduce mice       -q     --json  --force          --plot
+    reproduce indoor     -q     --json  --force          --plot
+    reproduce underwater -q     --json  --force          --plot
+    plot                 -q             --force  --view
+    localize             -q     --json  --force  --view  --plot
+"""
+
+
 def test_options_exist_wherever_they_make_sense() -> None:
-    pictures = {name for name in ALL if name.startswith("reproduce") or name in ("plot", "evaluate")}
-    writers = {name for name in ALL if name.startswith("simulate")} | {"record", "estimate", "localize", "convert"}
-    results = {name for name in ALL if name.startswith(("calibrate", "reproduce"))}
-    results |= {"ports", "info", "record", "estimate", "evaluate", "localize"}
-    assert having("--force") >= pictures | writers
-    assert having("--json") >= results
-    assert having("-q") >= set(ALL) - {"ports", "localize"}
-    assert having("-v") >= {"flash", "info", "record", "estimate"}
-    assert having("--view") == {"record", "estimate", "plot"}
+    expected = {}
+    for line in TABLE.strip().splitlines():
+        words = line.split()
+        expected[" ".join(word for word in words if word[0] != "-")] = {word for word in words if word[0] == "-"}
+    assert {name: {flag for flag in FLAGS.split() if name in having(flag)} for name in ALL} == expected
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -106,6 +133,9 @@ def test_a_mistyped_port_is_answered_with_the_nearest(
     monkeypatch.setattr(ports, "find_ports", lambda: [PortInfo("/dev/ttyACM0", "", 1, 1, "", True, False)])
     assert "did you mean /dev/ttyACM0?" in refused("info", "--port", "/dev/ttyACN0")
     assert "did you mean sim://link?" in refused("info", "--port", "sim:/link")
+    near = refused("info", "--port", "sim://lnk")
+    assert near.count("sim://lnk") == 1 and near.endswith("did you mean sim://link?")
+    assert refused("info", "--port", "sim://rat").endswith("type sim://link, sim://chain, sim://mice")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from serial.tools import list_ports_common
 from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
-from linkpose.errors import CannotWrite
+from linkpose.errors import BoardError, CannotWrite
 from linkpose.recorder import Recorder
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
@@ -61,10 +61,11 @@ def framed(payload: bytes) -> bytes:
         (random.Random(3).randbytes(60), "only noise was received"),
         (b"\xff\xfe\xff\xfc" * 10, "only noise was received"),
         (encode(Nak(Command.GET_INFO, NakReason.UNKNOWN_COMMAND)), "the board refuses every command"),
+        (framed(b"\x01\x02" + bytes(100)), "a frame of type 0x01 with 101 bytes arrived intact"),
         (framed(OLD_HELLO), "the board's firmware is old: it uses protocol 0.9, this linkpose 2.0"),
         (framed(NEW_HELLO), "this linkpose is old: it uses protocol 2.0, the board's firmware 3.0"),
     ],
-    ids=["silence", "text", "noise", "wrong baud", "refusals", "older board", "newer board"],
+    ids=["silence", "text", "noise", "wrong baud", "refusals", "five mice", "older board", "newer board"],
 )
 @pytest.mark.parametrize("command", ["record", "info", "estimate --live"])
 def test_what_answers_instead_of_a_board(impatient, refused, tmp_path, chatter, sentence, command):
@@ -481,6 +482,13 @@ def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
             if session.timeline.samples > 10 and not changed.is_set():
                 changed.set()
                 board.reset(says_hello=False)
+
+
+def test_a_board_that_starts_and_sends_no_sample_is_a_failure(tmp_path):
+    board = PtyBoard(tmp_path / "port", spoil=SpoiledSamples(0, lambda message, count: b""))
+    refusal = pytest.raises(BoardError, match="accepted START, but no sample arrived")
+    with board, Session(str(tmp_path / "port"), print) as session, refusal:
+        assert not any(session.stream(0.1))
 
 
 def test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence(tmp_path):

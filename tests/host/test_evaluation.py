@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
+from linkpose.cli.cures import sentence
 from linkpose.cli.evaluate import command
 from linkpose.cli.plot import command as plot
 from linkpose.errors import LinkposeError
@@ -214,6 +215,20 @@ def test_files_that_do_not_fit_are_refused_by_name(tmp_path, ours, theirs, sente
     with pytest.raises(LinkposeError, match=sentence) as error:
         scores(str(tmp_path / "ours.csv"), str(tmp_path / "theirs.csv"))
     assert str(tmp_path) in str(error.value)
+
+
+def test_a_filter_without_an_estimate_is_named(tmp_path):
+    """J2S of a link that turns about one axis: the filter has no height, and its columns are empty."""
+    ours, theirs = tmp_path / "ours.csv", tmp_path / "theirs.csv"
+    heights = [(0.1 * at, 1 + 0.1 * np.sin(0.3 * at)) for at in range(60)]
+    theirs.write_text("time_s,height_m\n" + "".join(f"{t:.1f},{height:.4f}\n" for t, height in heights))
+    ours.write_text("time_s,joint_height_m,tilt_height_m\n" + "".join(f"{t:.1f},,\n" for t, _ in heights))
+    shown = CliRunner().invoke(command, [str(ours), str(theirs)])
+    assert "joint estimated no height" in str(shown.exception) and "--j2s auto" in sentence(shown.exception)
+    rows = "".join(f"{t:.1f},,{height:.4f}\n" for t, height in heights)
+    ours.write_text("time_s,joint_height_m,tilt_height_m\n" + rows)
+    shown = CliRunner().invoke(command, [str(ours), str(theirs)])
+    assert shown.exit_code == 0 and "joint estimated no height" in shown.stderr and "tilt" in shown.stdout
 
 
 # ---- OptiTrack Motive ----

@@ -107,6 +107,19 @@ def test_a_hinge_converges_from_any_start_and_its_std_covers_the_error_meanwhile
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.4
 
 
+@pytest.mark.parametrize(("errors", "most_deg"), [("calibrated", 1.0), ("datasheet", 4.0)])
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_the_std_holds_for_calibrated_and_for_data_sheet_sensors(joint: str, errors: str, most_deg: float) -> None:
+    run = ChainRun(joint, 3, 60.0, errors=errors)
+    measured = run.measurements()
+    truth, late = run.truth_columns(measured.time_s), measured.time_s > 30
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint)  # type: ignore[arg-type]
+    error = _error_deg(estimates, _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz"))))[late]
+    std = estimates["chain_rotation_std_deg"][late]
+    assert np.mean(error < 2 * std) > 0.9
+    assert np.sqrt(np.mean(std**2)) < most_deg
+
+
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     measured, _, angle = _chain("hinge")
     estimates = lp.estimate(measured, filters=["chain"], joint="hinge")
@@ -134,6 +147,33 @@ def test_at_rest_the_heading_is_not_reported() -> None:
     estimates = lp.estimate(measured, filters=["chain"])
     assert np.isnan(estimates["chain_qw"]).all()
     assert estimates["chain_rotation_std_deg"].min() > 57
+
+
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_at_rest_from_the_start_only_what_rest_shows_is_reported(joint: str) -> None:
+    run, rng = ChainRun(joint, 0, 4.0), np.random.default_rng(0)
+    measured, at = run.measurements(), rng.integers(0, 40, 1000)  # of 0.4 s without motion
+    rest = lp.Measurements.from_imu(
+        np.arange(1000) / 100, measured.accel_m_s2[at], measured.gyro_rad_s[at],
+        accel2_m_s2=measured.accel2_m_s2[at], gyro2_rad_s=measured.gyro2_rad_s[at],
+    )  # fmt: skip
+    unknown = lp.estimate(rest, filters=["chain"], rig=run.rig)
+    known = {name for name in unknown.columns if np.isfinite(unknown[name]).any()}
+    # J2S and tilt give the height of sensor 1; σ of the rotation states that it is unknown.
+    assert known == {"time_s", "chain_rotation_std_deg", "chain_height1_m", "chain_height1_std_m"}
+    given = lp.estimate(rest, filters=["chain"], rig=run.calibrated_rig)
+    assert np.abs(given["chain_height2_m"] - run.truth_columns(np.zeros(1))["height2_m"]).max() < 0.01
+
+
+def test_a_second_sensor_that_is_frozen_at_rest_gives_nothing() -> None:
+    measured = _chain("hinge")[0][:1500]
+    held = (np.broadcast_to(of[0], of.shape) for of in (measured.accel2_m_s2, 0.0 * measured.gyro2_rad_s))
+    accel2, gyro2 = held
+    frozen = lp.Measurements.from_imu(
+        measured.time_s, measured.accel_m_s2, measured.gyro_rad_s, accel2_m_s2=accel2, gyro2_rad_s=gyro2
+    )
+    found = ChainFilter(Rig(chain=Chain("hinge"))).process(frozen)
+    assert np.isnan(found[measured.time_s > 2.1]).all()
 
 
 def test_a_long_gap_blanks_and_keeps_the_mounting() -> None:

@@ -60,6 +60,19 @@ def test_static_tilt(name, roll, pitch):
         assert estimate[-1, 1] < estimate[0, 1]
 
 
+@pytest.mark.parametrize("name", ["tilt", "joint"])
+def test_an_axis_of_j2s_counts_as_far_as_it_points_upwards(name):
+    """Upright, an error of 3 cm across the link does not reach the height; one along it does."""
+    time_s = np.arange(200) / 100
+    block = measurements(time_s, np.tile([0.0, 0.0, STANDARD_GRAVITY], (200, 1)), np.zeros((200, 3)))
+    across, along = (
+        filters.create(name, Rig(joint=Joint((0.0, 0.0, 1.0), std))).process(block)[-1, 1]
+        for std in ((0.03, 0.03, 0.001), (0.001, 0.001, 0.03))
+    )
+    assert across < 0.002
+    assert along == pytest.approx(0.03, rel=0.01)
+
+
 @pytest.mark.parametrize("name", INERTIAL)
 def test_pure_rotation_at_a_constant_rate(name):
     """A sensor on the joint's axis turns about x at 1 rad/s: roll is the angle turned by."""

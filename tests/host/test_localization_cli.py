@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
+import subprocess
+import sys
 
+import numpy as np
 import pytest
 
-from linkpose.localization.carmen import read_carmen
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.localizer import localize, warm_up
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.settings import Settings
 from linkpose.localization.ukf import ukf_step
@@ -69,19 +73,20 @@ def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
     """After the reported compilation nothing is left to compile."""
     log, grid, _ = indoor
     warm_up(["ekf", "ukf", "mcl", "scan-match"])
-    read = read_carmen(log)
+    read = read_log(log)
     events, start = read.events, read.start
     for name, step in (("ekf", ekf_step), ("ukf", ukf_step)):
         localize(events[:50], name, Settings(start=start), load_map(grid))
         assert len(step.signatures) == 1
 
 
+KNOWN = ("--range-std", 0.25, "--drift-std", 0)  # the noises of the simulated ranges: a search for them takes time
+
+
 @pytest.mark.parametrize("noise", ["fixed", "adaptive", "affine"])
 def test_underwater_with_every_noise(dive, linkpose, noise):
     log, beacons, truth = dive
-    result = linkpose(
-        "localize", log, "--beacons", beacons, "--truth", truth, "--range-std", 0.25, "--noise", noise, "--json"
-    )
+    result = linkpose("localize", log, "--beacons", beacons, "--truth", truth, *KNOWN, "--noise", noise, "--json")
     (row,) = [json.loads(line) for line in result.out.splitlines()]
     assert row["filter"] == "ekf"
     assert row["position_rmse_m"] < 0.3
@@ -90,7 +95,7 @@ def test_underwater_with_every_noise(dive, linkpose, noise):
 def test_gate_counts_and_can_be_switched_off(dive, linkpose):
     log, beacons, _ = dive
     gated, open_ = (
-        json.loads(linkpose("localize", log, "--beacons", beacons, "--range-std", 0.25, "--gate", gate, "--json").out)
+        json.loads(linkpose("localize", log, "--beacons", beacons, *KNOWN, "--gate", gate, "--json").out)
         for gate in ("0.997", "off")
     )
     assert gated["rejected"] >= 50
@@ -184,23 +189,119 @@ def test_mice_as_odometry(indoor, linkpose, refused, tmp_path):
     assert "no column mice_vx_m_s" in refused("localize", log, "--map", grid, "--odometry", truth)
 
 
-def test_rows_from_standard_input_become_poses_at_once(linkpose, monkeypatch, tmp_path):
-    """A negative range is left out."""
-    beacons = tmp_path / "beacons.csv"
-    beacons.write_text("id,x_m,y_m\nA1,0,0\nB2,10,0\nC3,0,10\n")
-    rows = ["time_s,kind,a,b,c\n", "0,pose,3,4,0\n", "0,odometry,0,0,\n"]
-    rows += [f"{0.5 * i},range,A1,{-1 if i == 3 else 5},\n" for i in range(1, 8)]
+@pytest.fixture
+def places(tmp_path):
+    path = tmp_path / "places.csv"
+    path.write_text("id,x_m,y_m\nA1,0,0\nB2,10,0\nC3,0,10\n")
+    return path
 
-    class Input:
-        def __iter__(self):
-            return iter(rows)
 
-    monkeypatch.setattr("sys.stdin", Input())
-    result = linkpose("localize", "-", "--beacons", beacons)
+@pytest.fixture
+def streamed(linkpose, places, monkeypatch):
+    """Runs `localize -` on lines of text."""
+
+    def run(lines, *options):
+        monkeypatch.setattr("sys.stdin", lines)
+        return linkpose("localize", "-", "--beacons", places, *options)
+
+    return run
+
+
+START = ["time_s,kind,a,b,c\n", "0,pose,3,4,0\n", "0,odometry,0,0,\n"]
+
+
+def test_rows_from_standard_input_become_poses_at_once(streamed):
+    """A negative range and a late row are left out, with counts."""
+    rows = [*START, *(f"{0.5 * i},range,A1,{-1 if i == 3 else 5},\n" for i in range(1, 8)), "2,range,A1,5,\n"]
+    result = streamed(rows)
     lines = result.out.splitlines()
-    assert lines[0].startswith("time_s,ekf_x_m,ekf_y_m,ekf_heading_rad,ekf_x_std_m")
+    assert lines[0].startswith(
+        "time_s,ekf_x_m,ekf_y_m,ekf_heading_rad,ekf_range_scale_error,ekf_range_bias_m,ekf_x_std"
+    )
     assert [float(line.split(",")[0]) for line in lines[1:]] == [0.0, 0.0, 0.5, 1.0, 2.0, 2.5, 3.0, 3.5]
     assert float(lines[-1].split(",")[1]) == pytest.approx(3.0, abs=0.05)
+    assert "1 negative range left out" in result.err and "1 row older than the one before left out" in result.err
+    assert "6 measurements applied" in result.err
+
+
+def test_a_stream_estimates_its_noises(streamed):
+    """Ranges with an error of 0.3 m: after 150 of them, the default of 0.1 m is replaced."""
+    rng = np.random.default_rng(1)
+    rows = [*START, *(f"{0.5 * i},range,{'ABC'[i % 3]}{i % 3 + 1},{far},\n" for i, far in far_ranges(rng, 200))]
+    result = streamed(rows, "--range-growth", 0)
+    (line,) = [line for line in result.err.splitlines() if line.startswith("noises estimated from the rows until 75 s")]
+    assert 0.2 < float(line.split("range ")[1].split(" m")[0]) < 0.45
+    assert streamed(rows, "--range-std", 0.3, "--range-growth", 0).err.count("range 0.3 m + 0.00%") == 1
+
+
+def far_ranges(rng, count):
+    """Numbers and ranges of a robot at (3, 4)."""
+    truth = [math.hypot(3, 4), math.hypot(7, 4), math.hypot(3, 6)]
+    return [(i, truth[i % 3] + rng.normal(0, 0.3)) for i in range(1, count)]
+
+
+@pytest.mark.parametrize(
+    ("last", "count", "remark"), [("2,range,A1,5", 2, ""), ("2,ran", 1, "the last row is cut short")]
+)
+def test_a_stream_without_a_final_line_end(streamed, last, count, remark):
+    result = streamed([*START, "1,range,A1,5,\n", last])
+    assert result.status == 0
+    assert f"ekf: {count} measurement{'s' * (count > 1)} applied, 0 rejected" in result.err
+    assert remark in result.err
+
+
+def test_an_interrupted_stream_ends_well(streamed):
+    def rows():
+        yield from [*START, "1,range,A1,5,\n", "2,range,A1,5,\n"]
+        raise KeyboardInterrupt
+
+    result = streamed(rows())
+    assert result.status == 0
+    assert len(result.out.splitlines()) == 5
+    assert "ekf: 2 measurements applied" in result.err
+
+
+@pytest.mark.parametrize(
+    ("rows", "options", "reason"),
+    [
+        ([], [], "standard input holds no measurements"),
+        (["x\n"], [], "line 1: the header is 'x'"),
+        ([*START, "1,range,Z9,5,\n"], [], "line 4: beacon Z9 is not in the beacon file"),
+        ([*START, "1,range,A1,five,\n"], [], "'five' is not a number"),
+        ([*START[:1], "0,odometry,0,0,\n", "1,range,A1,5,\n"], [], "add --start"),
+        ([*START, *(f"{i},range,A1,{5000 + i},\n" for i in range(1, 30))], [], "look like millimetres"),
+        ([*START, *(f"{i},range,A1,90,\n" for i in range(1, 3))], ["--estimate", "none"], "applied none of 2 measure"),
+        (START, ["--plot", "a.png", "--json"], "does not use --plot, --json"),
+        (START, ["--smooth"], "no --smooth"),
+    ],
+)
+def test_streams_that_cannot_be_are_refused(streamed, rows, options, reason):
+    result = streamed(rows, *options)
+    assert result.status in (1, 2)
+    assert reason in " ".join(result.err.split())
+
+
+def test_a_pose_comes_before_the_next_row_is_sent_and_the_reader_may_go(places):
+    """Through real pipes, in lockstep; then the output is closed."""
+    command = [sys.executable, "-m", "linkpose", "localize", "-", "--beacons", str(places)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        run.stdin.write("".join([*START, "1,range,A1,5,\n"]).encode())
+        run.stdin.flush()
+        assert [run.stdout.readline().split(b",")[0] for _ in range(4)] == [
+            b"time_s",
+            b"0.000000",
+            b"0.000000",
+            b"1.000000",
+        ]
+        for i in range(2, 5):
+            run.stdin.write(f"{i},range,B2,8,\n".encode())
+            run.stdin.flush()
+            assert run.stdout.readline().startswith(f"{i}.000000,".encode())
+        run.stdout.close()
+        run.stdin.write(b"".join(f"{i},range,B2,8,\n".encode() for i in range(5, 7)))
+        run.stdin.close()
+        assert run.wait() == 1
+        assert run.stderr.read().decode().strip().endswith("linkpose: the reader of the output has gone; stopped")
 
 
 def test_turn_rates_of_a_carmen_log_are_not_degrees(indoor, linkpose, tmp_path):

@@ -310,9 +310,9 @@ def test_consistency_and_outliers_underwater(name):
         rows = track.time_s > 2.0
         error = track.position_m[rows] - run.motion.truth.position_at(track.time_s[rows])
         nees.append(np.mean(np.einsum("ij,ijk,ik->i", error, np.linalg.inv(track.covariance[rows][:, :3, :3]), error)))
-        hits = len(track.rejected_ranges & run.outliers)
+        hits = len(track.rejected_sightings & run.outliers)
         found, injected = found + hits, injected + len(run.outliers)
-        refused, good = refused + len(track.rejected_ranges) - hits, good + sum(map(len, run.ranges_m.values()))
+        refused, good = refused + len(track.rejected_sightings) - hits, good + sum(map(len, run.ranges_m.values()))
         assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.15
     assert found == injected == 60
     assert refused / good < 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.carmen import Reading, as_log, flaser_angles, format_reading, is_carmen, read_carmen
-from linkpose.localization.events import Event, Scan, format_event, read_events
+from linkpose.localization.carmen import Reading, as_log, flaser_angles, format_reading
+from linkpose.localization.events import Event, Scan, format_event
+from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.measuring import thesis_beams
 from linkpose.localization.plausibility import check_units
@@ -37,7 +39,7 @@ def test_every_kind_is_read_and_written_alike(tmp_path):
         Event(0.3, "attitude", (0.0, 0.125, 3.0)),
     ]
     text = "# a comment\n" + HEADER + "".join(f"{format_event(event)}\n" for event in events)
-    read = read_events(written(tmp_path, text)).events
+    read = read_log(written(tmp_path, text)).events
     assert [(e.time_s, e.kind, e.values, e.beacon) for e in read] == [
         (e.time_s, e.kind, e.values, e.beacon) for e in events
     ]
@@ -61,18 +63,17 @@ def test_every_kind_is_read_and_written_alike(tmp_path):
 )
 def test_a_bad_row_is_named_with_its_line(tmp_path, text, reason):
     with pytest.raises(LinkposeError, match=reason) as failure:
-        read_events(written(tmp_path, text))
+        read_log(written(tmp_path, text))
     assert "log.csv" in str(failure.value)
 
 
 def test_what_is_no_text_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     path.write_bytes(b"\xff\xfe\x00\x81" * 40)
-    assert not is_carmen(path)
-    with pytest.raises(LinkposeError, match="not a CSV file"):
-        read_events(path)
+    with pytest.raises(LinkposeError, match="it must be time_s,kind,a,b,c"):
+        read_log(path)
     with pytest.raises(LinkposeError, match="No such file"):
-        read_events(tmp_path / "gone.csv")
+        read_log(tmp_path / "gone.csv")
 
 
 RANGES = " ".join(f"{1 + 0.01 * i:.2f}" for i in range(181))
@@ -87,8 +88,8 @@ ROBOTLASER = (
 
 def test_carmen_lines(tmp_path):
     path = written(tmp_path, f"# comment\nPARAM robot_length 40\n{ODOM}\n{FLASER}\n{ROBOTLASER}\n", "run.log")
-    assert is_carmen(path)
-    read = read_carmen(path)
+    read = read_log(path)
+    assert read.is_carmen
     log, start = read.events, read.start
     assert start == (1.0, 2.0, 0.0)
     first, second, scan, third, wide = log
@@ -143,7 +144,7 @@ def test_odometry_between_two_poses_is_the_arc_that_joins_them():
 )
 def test_a_damaged_carmen_line_is_named(tmp_path, text, reason):
     with pytest.raises(LinkposeError, match=reason):
-        read_carmen(written(tmp_path, text, "run.log"))
+        read_log(written(tmp_path, text, "run.log"))
 
 
 def test_formatted_readings_read_back(tmp_path):
@@ -151,7 +152,7 @@ def test_formatted_readings_read_back(tmp_path):
         Reading(5.0, (1.0, 2.0, 0.25)),
         Reading(5.5, (1.5, 2.0, 0.25), np.linspace(1, 9, 181), flaser_angles(181), (1.5, 2.0, 0.25)),
     ]
-    read = read_carmen(written(tmp_path, "\n".join(map(format_reading, readings)) + "\n", "run.log"))
+    read = read_log(written(tmp_path, "\n".join(map(format_reading, readings)) + "\n", "run.log"))
     log, start = read.events, read.start
     assert start == (1.0, 2.0, 0.25)
     assert [event.time_s for event in log] == [5.0, 5.5, 5.5]
@@ -215,7 +216,7 @@ WORDS = st.sampled_from(
 def test_whatever_a_file_holds_it_is_read_or_refused(tmp_path, words):
     """No other exception than the one that the user reads."""
     path = written(tmp_path, "".join(words))
-    for read in (read_events, read_carmen, read_beacons, read_truth, load_map):
+    for read in (read_log, read_beacons, read_truth, load_map):
         try:
             read(path)
         except LinkposeError as failure:
@@ -229,8 +230,8 @@ def test_disorder_and_lines_without_a_time(tmp_path):
     lines.insert(4, "ODOM 9 9 9 0 0 0 0.0 h 0")
     path = tmp_path / "run.log"
     path.write_bytes(b"PARAM robot_name caf\xe9\n" + "\n".join(lines).encode() + b"\nODOM 7.0 0")
-    assert is_carmen(path)
-    read = read_carmen(path)
+    read = read_log(path)
+    assert read.is_carmen
     assert [event.time_s for event in read.events] == [1000.0 + i for i in range(6)]
     assert all(event.values == pytest.approx((1.0, 0.0)) for event in read.events[:-1])
     assert "1 line moved" in " ".join(read.remarks)
@@ -247,7 +248,7 @@ def test_motion_between_lines_of_one_instant_is_kept():
 
 def test_rows_are_sorted_and_negative_ranges_left_out(tmp_path):
     text = HEADER + "1,depth,1,,\n0.5,depth,2,,\n1.5,range,7,-0.02,\n"
-    read = read_events(written(tmp_path, text))
+    read = read_log(written(tmp_path, text))
     assert [event.time_s for event in read.events] == [0.5, 1.0]
     assert [remark.split(": ")[1] for remark in read.remarks] == [
         "1 negative range left out",
@@ -261,7 +262,7 @@ def test_beacon_names_are_strings(tmp_path):
     path = written(tmp_path, "id,x_m,y_m\n" + "".join(f"{name},{i},0\n" for i, name in enumerate(names)), "b.csv")
     assert list(read_beacons(path)) == names
     log = written(tmp_path, HEADER + "".join(f"0,range,{name},1,\n" for name in [*names, "05", "5.0"]))
-    assert [event.beacon for event in read_events(log).events] == [*names, "5", "5"]
+    assert [event.beacon for event in read_log(log).events] == [*names, "5", "5"]
 
 
 @pytest.mark.parametrize(
@@ -289,10 +290,39 @@ def test_sparse_truth_is_compared_at_its_own_times():
     assert result.rows == result.possible == 10
 
 
-@pytest.mark.parametrize(("separator", "comma"), [(";", ","), (";", "."), ("\t", ",")])
-def test_logs_as_spreadsheets_save_them_are_read(tmp_path, separator, comma):
-    text = "# drive 1\ntime_s,kind,a,b,c\n0.0,pose,1.5,2,0.25\n0.5,odometry,0.5,0.1,\n0.5,range,A1,3.25,\n"
-    plain, saved = tmp_path / "plain.csv", tmp_path / "saved.csv"
-    plain.write_text(text)
-    saved.write_text(text.replace(",", separator).replace(".", comma).replace("\n", "\r\n"), newline="")
-    assert read_events(saved).events == read_events(plain).events
+SPREADSHEET = "# drive 1\ntime_s,kind,a,b,c\n0.0,pose,1.5,2,0.25\n0.5,odometry,0.5,0.1,\n0.5,range,A1,3.25,\n"
+
+
+@pytest.mark.parametrize(
+    ("separator", "comma", "encoding", "first"),
+    [
+        (";", ",", "utf-8", ""),
+        (";", ",", "cp1252", "sep=;\n"),
+        (";", ".", "utf-8-sig", ""),
+        ("\t", ",", "utf-16", ""),  # Excel's "Unicode text"
+        ("\t", ".", "utf-16-le", ""),
+        (",", ".", "utf-16-be", ""),
+    ],
+)
+def test_logs_as_spreadsheets_save_them_are_read(tmp_path, separator, comma, encoding, first):
+    """Log and beacons."""
+    places = "id,x_m,y_m\nA1,1.5,2.25\n"
+
+    def saved(text, name):
+        text = first + text.replace(",", separator).replace(".", comma).replace("\n", "\r\n")
+        path = tmp_path / name
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    plain = read_log(written(tmp_path, SPREADSHEET)).events
+    shift = len(first.splitlines())
+    assert [replace(e, line=e.line - shift) for e in read_log(saved(SPREADSHEET, "a.csv")).events] == plain
+    assert read_beacons(saved(places, "b.csv")) == {"A1": (1.5, 2.25, 0.0)}
+
+
+@pytest.mark.parametrize("row", ["1.234,5", "1,5\n1;range;A1;2.5"])
+def test_numbers_that_can_be_read_in_two_ways_are_refused(tmp_path, row):
+    text = f"time_s;kind;a;b;c\n0;range;A1;{row};\n"
+    with pytest.raises(LinkposeError, match="can be read in two ways") as failure:
+        read_log(written(tmp_path, text))
+    assert "\n" not in str(failure.value)

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import serial
 from cobs import cobs
+from message_producers import MORE
 from pty_board import PtyBoard
 
 from linkpose import errors, plotting
@@ -237,6 +238,7 @@ PRODUCERS: list[Producer] = [
     # evaluation
     scored(rows(ESTIMATE), rows("time_s,height_m,roll_deg,pitch_deg", 3.0)),
     scored("time_s,tilt_height_m\n0,1\n1,1\n", "time_s,height_m\n5,1\n6,1\n"),
+    scored("time_s,joint_height_m\n0,\n1,\n", "time_s,height_m\n0,1\n1,1\n"),
     scored(f"# linkpose recording 1\n# {{}}\n{IMU}\n0,{ROW}\n", rows("time_s,height_m")),
     scored(rows("time_s,length_m"), rows("time_s,height_m")),
     scored(rows(ESTIMATE), rows("time_s,length_m")),
@@ -295,10 +297,14 @@ def pattern(message: str) -> str:
 
 
 def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    more = {message: produce for section in MORE.values() for message, produce in section.items()}
     shown = messages()
-    assert len(shown) == len(PRODUCERS) == len(set(shown))
+    first = len(shown) - len(more)
+    assert shown[first:] == list(more)
+    assert first == len(PRODUCERS)
+    producers = [*PRODUCERS, *(lambda folder, _, produce=produce: produce(folder) for produce in more.values())]
     found, kinds = [], set()
-    for number, (message, produce) in enumerate(zip(shown, PRODUCERS, strict=True)):
+    for number, (message, produce) in enumerate(zip(shown, producers, strict=True)):
         (folder := tmp_path / str(number)).mkdir()
         with monkeypatch.context() as patch, pytest.raises(LinkposeError) as raised:
             produce(folder, patch)
@@ -311,6 +317,66 @@ def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytes
     assert {kind.__name__ for kind in CURES} - ELSEWHERE <= {kind.__name__ for kind in kinds}
 
 
+# The promises of the page, and the tests that prove each. A computer that loses its power has none.
+PROMISES = {
+    "the program is killed (`kill -9`, a crash)": [
+        "test_recording.py::test_kill_9_at_any_moment_leaves_a_readable_file"
+    ],
+    "the computer loses its power": [],
+    "Ctrl-C, `SIGTERM`, a closed terminal (`SIGHUP`)": [
+        "test_recording.py::test_ctrl_c_ends_a_recording_well",
+        "test_streams.py::test_sighup_ends_a_recording_with_its_closing_line_unless_it_is_ignored",
+    ],
+    "the cable is unplugged": [
+        "test_device.py::test_a_pulled_cable_is_waited_for_and_the_gap_is_marked",
+        "test_device.py::test_a_board_that_returns_under_another_name_is_found",
+        "test_device.py::test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts",
+    ],
+    "the board resets or is replaced": [
+        "test_device.py::test_a_reset_board_goes_on_with_the_settings_of_before",
+        "test_device.py::test_a_reset_between_configure_and_start_is_noticed",
+        "test_device.py::test_another_board_behind_the_same_port_ends_the_recording",
+    ],
+    "the board's clock jumps, stands still or runs at a wrong rate": [
+        "test_time.py::test_a_board_clock_that_jumps_is_replaced_by_its_ticks",
+        "test_time.py::test_live_and_replay_place_samples_alike_where_the_board_clock_jumps",
+    ],
+    "a sensor disappears, freezes or returns": [
+        "test_health.py::test_a_faulty_imu_is_left_out_counted_and_reported",
+        "test_health.py::test_a_sensor_that_freezes_while_recording_is_reported_and_stored",
+    ],
+    "the disk is full": ["test_recording.py::test_a_full_disk_leaves_whole_rows_and_says_so"],
+    "the file is removed while it is written": [
+        "test_device.py::test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence"
+    ],
+    "the terminal or a pipe behind standard error goes away": [
+        "test_streams.py::test_a_message_that_cannot_be_shown_does_not_end_the_recording"
+    ],
+    "the computer sleeps or the program is suspended": [
+        "test_device.py::test_a_suspended_program_does_not_report_a_silent_board"
+    ],
+    "two programs use one port or one file": [
+        "test_device.py::test_absent_busy_and_impossible_ports",
+        "test_recording.py::test_an_existing_file_is_kept_unless_forced",
+        "test_board_reports.py::test_another_program_at_the_same_socket_is_reported_once",
+    ],
+    "an output file exists": ["test_recording.py::test_an_existing_file_is_kept_unless_forced"],
+    "an input is a pipe or a device": [
+        "test_inputs.py::test_a_pipe_is_read_like_a_file",
+        "test_inputs.py::test_what_is_no_file_is_refused_in_time",
+    ],
+}
+
+
+def test_each_promise_of_the_page_has_its_tests() -> None:
+    text = PAGE.read_text(encoding="utf-8").split("## Messages and cures")[0]
+    assert re.findall(r"^\| ([^|]+?) \|", text, re.MULTILINE)[1:] == list(PROMISES)
+    for name in (name for tests in PROMISES.values() for name in tests):
+        file, function = name.split("::")
+        source = (Path(__file__).parent / file).read_text(encoding="utf-8")
+        assert f"def {function}(" in source, f"there is no test {name}"
+
+
 # With a cure, and produced by the tests of localization and of the magnetometer.
 ELSEWHERE = {
     "MissingMap", "MissingBeacons", "MissingStart", "NothingToEstimate", "NeedsScans", "NotPositiveDefinite",
@@ -319,17 +385,18 @@ ELSEWHERE = {
 
 
 RAISED = ("FileFormatError", "LinkposeError", "FileError")
+# Parts of the program of which the page has all sentences.
+COMPLETE = [
+    "recording/*.py", "streams.py", "convert/*.py", "flashing/image.py",
+    *(f"localization/{name}.py" for name in ("carmen", "events", "maps", "noise", "plausibility", "tables", "ukf")),
+]  # fmt: skip
 
 
 def sentences() -> Iterator[str]:
     """The sentences of the errors in these parts of the program, `…` for what is put in."""
-    for path in [*(PACKAGE / "recording").glob("*.py"), PACKAGE / "streams.py", *(PACKAGE / "convert").glob("*.py")]:
+    for path in [path for part in COMPLETE for path in PACKAGE.glob(part)]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
-                "FileFormatError",
-                "LinkposeError",
-                "FileError",
-            ):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in RAISED:
                 yield from (text for argument in node.args if len(text := text_of(argument)) > 20)
 
 

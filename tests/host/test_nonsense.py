@@ -70,12 +70,32 @@ def test_a_plausible_recording_has_no_remark(tmp_path: Path) -> None:
         (scale(1000.0, "accel"), "is it in mm/s²? multiply it by 0.001"),
         (scale(0.0, "accel"), "the IMU reads all zeros"),
         (scale(180 / np.pi, "gyro"), "is it in °/s?"),
+        (scale(2.0, "gyro"), "multiply it by 0.5"),
+        (scale(0.5, "gyro"), "check the range (gyro_range_deg_s) and the unit, or multiply it by 2"),
+        (scale(0.01, "gyro"), "multiply it by 1e+02"),
+        (scale(-1.0, "gyro"), "gyro_* turns gravity backwards"),
+        (scale(0.0, "gyro"), "gyro_* is 0 in all rows"),
         (scale(10.0, "time"), "multiply time_s by 0.1"),
         (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
         (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
         (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
     ],
-    ids=["twice", "half", "mm/s²", "zero", "°/s", "time", "mmHg", "hPa", "thousands"],
+    ids=[
+        "twice",
+        "half",
+        "mm/s²",
+        "zero",
+        "°/s",
+        "twice the rate",
+        "half the rate",
+        "a hundredth",
+        "backwards",
+        "no gyro",
+        "time",
+        "mmHg",
+        "hPa",
+        "thousands",
+    ],
 )
 def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str) -> None:
     assert sentence in remarks(tmp_path, change)
@@ -85,10 +105,11 @@ def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.nd
     ("change", "sentence"),
     [
         (put("time_s", slice(None), 1.0), "time_s is 1 in all rows; it must increase"),
-        (put("time_s", N - 1, np.inf), f"line {N + 3}: time_s"),
+        (put("time_s", N - 1, np.inf), f"line {N + 3}: time_s is inf; it must be a number of seconds"),
+        (put("time_s", N - 1, 1e300), f"line {N + 3}: time_s is 1e"),
         (put("baro_fresh", 10, 2.0), "line 14: baro_fresh is 2; it must be 0 or 1"),
     ],
-    ids=["one stamp", "inf", "fresh"],
+    ids=["one stamp", "inf", "huge", "fresh"],
 )
 def test_an_impossible_value_is_refused_with_its_line(
     tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str

@@ -44,7 +44,18 @@ LINK = ["time_s", *(f"tilt_{q}{std}_{unit}" for q, unit in (("height", "m"), ("r
 CHAIN = ["time_s", "tilt_roll_deg", "tilt_pitch_deg", "chain_qw", "chain_qx", "chain_qy", "chain_qz",
          "chain_rotation_std_deg", "chain_angle_deg", "chain_angle_std_deg"]  # fmt: skip
 HOST = Path(__file__).parents[2] / "host"
-ROBOT = ["time_s", "mice_x_m", "mice_x_std_m", "mice_y_m", "mice_y_std_m", "mice_heading_rad", "mice_excluded"]
+# A robot's tilt filter has a column of the height, without a value: J2S is unknown.
+ROBOT = [
+    "time_s",
+    "tilt_height_m",
+    "tilt_roll_deg",
+    "mice_x_m",
+    "mice_x_std_m",
+    "mice_y_m",
+    "mice_y_std_m",
+    "mice_heading_rad",
+    "mice_excluded",
+]
 
 
 def link_rows(count: int = 200) -> np.ndarray:
@@ -97,7 +108,7 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
     with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
         page.show(rows, status())
         browser.open(page.url)
-        browser.wait_for_text(f"{rows[-1, 1]:.4f} m ±2.0 cm")
+        browser.wait_for_text(f"{rows[-1, 1]:.3f} m ±2.0 cm")
         browser.wait_for_text("IMU ok")
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
         browser.wait_for(f"{chart_data('height')}[3].length > 150")
@@ -109,6 +120,13 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         browser.wait_for(alarm)
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
         assert "IMU ok" not in browser.evaluate("document.body.innerText")
+        found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
+        page.show(np.empty(0), lambda: Status(status()().health, found))
+        browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
+        browser.open("about:blank")  # and back: the page goes on
+        browser.open(page.url)
+        browser.wait_for_text("not excited yet")
+        browser.wait_for(f"{chart_data('height')}[3].length > 150")
         browser.screenshot(tmp_path / "page.png")
         leave_without_error(browser)
 
@@ -180,14 +198,41 @@ def test_a_path_is_played_among_map_and_beacons(browser: Browser, tmp_path: Path
         assert process.wait(60) == 0
 
 
+def test_localize_shows_the_path_that_it_found(browser: Browser, tmp_path: Path) -> None:
+    log, beacons, truth = (tmp_path / name for name in ("log.csv", "b.csv", "truth.csv"))
+    at = 0.1 * np.arange(60)
+    log.write_text("time_s,kind,a,b,c\n" + "".join(
+        f"{t:.2f},odometry,1,0,\n{t:.2f},range,A,{np.hypot(t - 3, 2):.4f},\n{t:.2f},range,B,{np.hypot(t, 4):.4f},\n"
+        for t in at
+    ))  # fmt: skip
+    beacons.write_text("id,x_m,y_m\nA,3,2\nB,0,-4\n")
+    truth.write_text("time_s,x_m,y_m,heading_rad\n0,0,0,0\n5.9,5.9,0,0\n")
+    typed = ["localize", log, "--beacons", beacons, "--truth", truth, "--start", "0,0,0", "--view"]
+    with command(*typed) as (process, url):
+        browser.open(url)
+        browser.wait_for_text("place and heading, ekf")
+        browser.wait_for_text("5.9 s")
+        x_m = float(browser.evaluate("document.body.innerText.match(/x (\\d\\.\\d+) m ±/)[1]"))
+        assert x_m == pytest.approx(5.9, abs=0.1)
+        browser.screenshot(tmp_path / "localize.png")
+        leave_without_error(browser)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0
+
+
 def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
     time = 0.1 * np.arange(50)
-    rows = np.column_stack([time, time, 0 * time + 0.01, 0.1 * time, 0 * time + 0.02, 0 * time, 2.0 * (time > 3.05)])
+    tilt = [np.full(50, np.nan), 0 * time]
+    rows = np.column_stack(
+        [time, *tilt, time, 0 * time + 0.01, 0.1 * time, 0 * time + 0.02, 0 * time, 2.0 * (time > 3.05)]
+    )
     with Page(ROBOT, Rig(), "sim://mice") as page:
         page.show(rows, status())
         browser.open(page.url)
         browser.wait_for_text("x 4.900 m ±1.0 cm")
         browser.wait_for_text("mouse 2 LEFT OUT since 3.1 s")
+        browser.wait_for(f"{chart_data('heading (°)')}[3].length == 50")
+        browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
         leave_without_error(browser)
     angle = np.radians(30.0)
     chain = np.array([[0.0, 20.0, 10.0, np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 1.5, 30.0, 1.2]])
@@ -336,8 +381,8 @@ def test_the_cone_is_as_wide_as_two_sigma() -> None:
 
 def test_history_keeps_the_newest_row_and_stays_small() -> None:
     history = History(["time_s", "x_m"])
-    for at in range(50_000):
-        history.add(np.array([0.01 * at, float(at)]))
+    for at in range(0, 50_000, 50):
+        history.add(np.array([[0.01 * row, float(row)] for row in range(at, at + 50)]))
     window, path = history.window(), history.path()
     assert window[-1, 1] == path[-1, 1] == 49_999
     assert window[0, 0] >= window[-1, 0] - SPAN_S and len(window) > 300

@@ -57,7 +57,7 @@ def test_a_link_with_its_truth_shows_height_error_and_tilt(tmp_path):
     figure, remarks = plotting.plot_tables(link_files(tmp_path))
     labels = [axes.get_ylabel() for axes in figure.axes]
     assert labels == [
-        "height over the joint (m)",
+        "height over the joint\n(m)",
         *["height error (cm)"] * 2,
         "roll (°)",
     ]  # no filter estimates the yaw
@@ -100,7 +100,7 @@ def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
 def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["height over the joint (m)", "from best (cm)", "roll (°)"]
+    assert labels == ["height over the joint\n(m)", "from best (cm)", "roll (°)"]
     assert drawn(figure.axes[1])[0] == "joint-inertial (best)"
 
 
@@ -129,13 +129,18 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     columns = {"time_s": t, **{f"planar_ekf_{k}": v for k, v in (pose | motion).items()}}
     columns |= {"planar_ekf_x_std_m": np.full(400, 0.01), "planar_ekf_y_std_m": np.full(400, 0.02)}
     columns |= {"mice_excluded": np.where((t > 1) & (t < 2), 2.0, 0.0)}
+    columns |= {"tilt_roll_deg": 0 * t, "tilt_height_m": np.full(400, np.nan)}  # J2S is unknown
     paths = (write(tmp_path / "e.csv", columns), write(tmp_path / "t.csv", {"time_s": t} | pose | motion, "truth"))
-    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
-    path, speed, heading, mice = figure.axes
+    figure, remarks = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    path, error, speed, heading, mice = figure.axes
+    assert remarks == ["not drawn beside a path: tilt (add --filter tilt)"]
+    assert (error.get_ylabel(), drawn(error)) == ("position error (m)", ["planar-ekf 0 m rms", "2σ planar-ekf"])
+    band = error.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == pytest.approx(2 * np.hypot(0.01, 0.02)) and error.get_ylim()[0] == 0.0
     assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x (m)", "y (m)", 1.0)
     assert drawn(path) == ["truth", "planar-ekf", "±2σ planar-ekf"]
     assert {(e.width, e.height) for e in path.patches if hasattr(e, "width")} == {(0.04, 0.08)}
-    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped (°)")
+    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped\n(°)")
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
     (bar,) = mice.collections[1].get_paths()  # of mouse 2
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)

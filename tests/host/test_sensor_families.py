@@ -97,6 +97,9 @@ def test_hello_names_what_is_there():
         ({"accel_range_g": 0}, "accel_range_g = 0"),
         ({"gyro_range_deg_s": 255}, "gyro_range_deg_s = 255"),
         ({"i2c_khz": 0}, "i2c_khz = 0"),
+        ({"sample_rate_hz": 51}, "sample_rate_hz = 51"),
+        ({"streaming": 2}, "streaming = 2"),
+        ({"sections": 0x53}, "5 mice"),
         ({"mice": (HelloMouse(9, 0, 0, 8, 200, 0),)}, "state 9 for mouse port 1"),
     ],
 )

@@ -37,6 +37,20 @@ def poses(run: ChainRun, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_with_a_free_first_joint_both_sensors_feel_one_more_acceleration(joint: str) -> None:
+    fixed, free = (ChainRun(joint, 3, 30.0, errors="none", first_joint=first) for first in ("fixed", "free"))
+    one, two = fixed.measurements(), free.measurements()
+    assert np.array_equal(one.gyro_rad_s, two.gyro_rad_s) and np.array_equal(one.gyro2_rad_s, two.gyro2_rad_s)
+    q = np.column_stack([free.truth_columns(one.time_s + LATER_S)[name] for name in ("qw", "qx", "qy", "qz")])
+    carried = two.accel_m_s2 - one.accel_m_s2
+    seen = np.einsum("nij,nj->ni", matrices(q), two.accel2_m_s2 - one.accel2_m_s2)
+    assert 0.7 < np.sqrt(np.mean(np.sum(carried[1000:2000] ** 2, axis=1))) < 3.0 and np.abs(carried[:150]).max() == 0
+    assert np.abs(seen - carried).max() < 0.05  # two quantisations and 0.65 ms between the sensors
+    truth = free.truth_columns(one.time_s)
+    assert free.rig.joint.j2s_m is None and not {"height_m", "height1_m", "height2_m", "x_m"} & set(truth)
+
+
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
 def test_sensor_2_measures_what_its_path_demands(joint: str) -> None:
     """Against numerical derivatives of the truth's quaternions and positions."""
     run, step = ChainRun(joint, seed=3, duration_s=30.0, errors="none"), 1e-4
@@ -82,3 +96,5 @@ def test_the_filter_runs_by_default_where_a_second_sensor_is_and_only_there() ->
 def test_a_joint_that_does_not_exist_is_refused() -> None:
     with pytest.raises(LinkposeError, match="take ball or hinge"):
         ChainRun("saddle")
+    with pytest.raises(LinkposeError, match="take fixed or free"):
+        ChainRun("ball", first_joint="slider")

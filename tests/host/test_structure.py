@@ -16,6 +16,7 @@ PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 LEVELS = [
     {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
+    {"inputs"},
     {"wire", "presentation"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 import pytest
 
 from linkpose.device.clock import DeviceClock
+from linkpose.recording.reader import load_recording
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.timeline import BoardClock, Timeline
+from linkpose.simulation import board
 from linkpose.wire import frames
 from linkpose.wire.messages import Sample
 
@@ -116,3 +120,64 @@ def test_samples_lost_before_the_first_one_count():
     place = timeline.place(sample(3, 0), BoardClock(), 0.0)
     assert place == (0.0, 3, 1 | GAP_BEFORE)
     assert timeline.lost == 3
+
+
+def placed(t_us: Callable[[int], int], ticks: Iterable[int] = range(400)) -> tuple[list[float], list[str]]:
+    """Times of samples with these stamps at 100 Hz, and the faults of the board's clock that were found."""
+    timeline, clock = Timeline(100.0), BoardClock()
+    times, faults = [], []
+    for tick in ticks:
+        place = timeline.place(sample(tick, t_us(tick)), clock, 0.0)
+        assert place is not None
+        times.append(place.time_s)
+        faults += [timeline.stamps.fault] * bool(timeline.stamps.fault)
+    return times, faults
+
+
+@pytest.mark.parametrize("jump_us", [50_000_000, 3_000_000, 300_000, -500_000, -3_000_000])
+def test_a_board_clock_that_jumps_is_replaced_by_its_ticks(jump_us):
+    times, faults = placed(lambda tick: 10_000 * tick + jump_us * (tick > 100))
+    assert times == pytest.approx([tick / 100 for tick in range(400)], abs=1e-6)
+    assert faults == [f"jumped by {jump_us * 1e-6:.2f} s"]
+
+
+def test_one_stamp_that_is_wrong_moves_no_other():
+    times, _ = placed(lambda tick: 10_000 * tick + 300_000 * (tick == 100))
+    assert times == pytest.approx([tick / 100 for tick in range(400)], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rate", "fault", "lost_s"),
+    [(0.0, "stands still", 0.06), (0.1, "runs at 0.10 of its rate", 0.06), (3.0, "runs at 3.00 of its rate", -0.06)],
+)
+def test_a_board_clock_that_stands_still_or_runs_at_a_wrong_rate_is_replaced_by_its_ticks(rate, fault, lost_s):
+    times, faults = placed(lambda tick: 10_000 * min(tick, 100) + round(10_000 * rate * max(0, tick - 100)))
+    assert faults == [fault]
+    assert times[-1] == pytest.approx(3.99 - lost_s, abs=0.011)
+    assert np.diff(times[120:]) == pytest.approx(np.full(279, 0.01), abs=1e-6)
+
+
+def test_a_board_clock_that_jumps_at_every_tick_is_replaced_by_its_ticks():
+    times, faults = placed(lambda tick: 100_000 * tick)
+    assert times == pytest.approx([tick / 100 for tick in range(400)], abs=1e-6)
+    assert set(faults) == {"jumped by 0.09 s"}
+
+
+def test_a_clock_within_its_tolerance_raises_no_fault_over_losses_and_wraps():
+    rng = np.random.default_rng(4)
+    ticks = np.cumsum(rng.choice([1, 1, 1, 2, 40, 3000], 400)).tolist()
+    _, faults = placed(lambda tick: int(10_050 * tick + rng.integers(-2000, 2000)) + WRAP - 5_000_000, ticks)
+    assert not faults
+    _, faults = placed(lambda tick: 10_000 * tick, [0, 1, 65538, 65539])  # away for exactly one wrap of seq
+    assert not faults
+
+
+def test_live_and_replay_place_samples_alike_where_the_board_clock_jumps(tmp_path):
+    samples = [sample(tick, 10_000 * tick + 3_000_000 * (tick > 50) - 7_000_000 * (tick > 80)) for tick in range(120)]
+    capture = tmp_path / "jumps.bin"
+    capture.write_bytes(b"".join(map(frames.encode, [board.hello(board.DEFAULTS), *samples])))
+    replayed = load_recording(capture)
+    timeline, clock = Timeline(100.0), BoardClock()
+    live = [timeline.place(each, clock, 0.0).time_s for each in samples]
+    assert replayed.measurements.time_s == pytest.approx(live, abs=1e-6)
+    assert any("clock jumped 2 times" in remark for remark in replayed.remarks)

@@ -16,9 +16,9 @@ import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
-from linkpose.cli.view import Extremes, Screen
+from linkpose.cli.view import Extremes, Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
-from linkpose.presentation import with_std
+from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
 
@@ -100,9 +100,26 @@ def test_the_path_ends_at_the_robot() -> None:
 
 
 def test_standard_deviations_are_shown_in_fitting_units() -> None:
-    assert with_std(1.5906, 0.0004, "m", 4) == "1.5906 m ±0.4 mm"
-    assert with_std(1.5, 0.12, "m", 2) == "1.50 m ±12.0 cm"
-    assert with_std(math.nan, 0.1, "m", 2) == "not known yet"
+    assert length_with_std(1.5906, 0.0004) == "1.5906 m ±0.4 mm"
+    assert length_with_std(math.nan, 0.1) == "not known yet"
+    assert length_with_std(1.5906, math.nan) == "1.591 m"
+
+
+@pytest.mark.parametrize("std", [0.0, 4e-5, 0.00009499, 0.000095, 0.0004, 0.0099, 0.00996, 0.12, 0.994, 0.996, 12.0])
+def test_a_value_and_its_deviation_end_at_the_same_digit(std: float) -> None:
+    value, unit, bound, bound_unit = length_with_std(12.345678, std).replace("±", "").split()
+    size = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+    assert unit == "m" and float(bound) > 0
+    last_digits = [10.0 ** -len(text.partition(".")[2]) * size[of] for text, of in ((value, unit), (bound, bound_unit))]
+    assert last_digits[0] == pytest.approx(last_digits[1])
+    assert aligned_length(12.345678, std).index(".") == 2
+    angle, bound = angle_with_std(-12.345678, 10 * std).replace("°", "").split(" ±")
+    assert len(angle.partition(".")[2]) == len(bound.partition(".")[2]) and float(bound) > 0
+
+
+def test_errors_in_a_row_end_at_the_same_digit() -> None:
+    assert same_digits(0.0486, 0.0172, 1.3, -5.07e-6) == ["0.0486", "0.0172", "1.3000", "0.0000"]
+    assert same_digits(123.4, 5.0) == ["123", "5"] and same_digits(0.0, 0.0) == ["0", "0"]
 
 
 def measurements(rows: int) -> lp.Measurements:
@@ -164,6 +181,15 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
     assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
 
 
+def test_a_terminal_that_cannot_move_its_cursor_shows_a_line() -> None:
+    command = ["estimate", "--live", "--port", "sim://link?speed=0", "--filter", "tilt", "--duration", 2]
+    with Terminal(*command, kind="dumb") as terminal:
+        assert terminal.wait() == 0, terminal.text
+    assert "200 samples" in terminal.text and "lowest" in terminal.text
+    line = link_screen().line(health(imu={"state": "not answering"}))
+    assert line.startswith("25.0 s   IMU NOT ANSWERING: check VCC") and "HEIGHT" in line and len(line) <= 78
+
+
 def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
     marks: list[float] = []
     marker, block = Marker(marks.append), LinkRun(1, 0, 1.0).measurements()
@@ -200,6 +226,31 @@ def test_a_narrow_screen_drops_the_slow_columns_first() -> None:
     assert "IMU ok BARO ok" in narrow and "0 lost" in narrow and "±0.4 mm" in narrow
 
 
+def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> None:
+    """A barometer starts at once, a better filter later: its curve does not begin with the barometer's noise."""
+    screen = Screen("sim://link", ["joint", "baro"])
+    for at in range(100):
+        joint = 1.5 + 0.001 * at if at >= 50 else math.nan
+        screen.add(0.05 * at, {"joint": {quantities.HEIGHT: (joint, 0.01)}, "baro": {quantities.HEIGHT: (9.0, 0.3)}})
+    curve_lines = [line for line in screen.render(health(), 80, 24).plain.splitlines() if "┤" in line]
+    assert [float(line.split("┤")[0]) for line in (curve_lines[0], curve_lines[-1])] == pytest.approx(
+        [1.6, 1.55], abs=0.01
+    )
+    robot = Screen("sim://mice", ["tilt", "mice"])
+    pose = {quantities.X: (1.0, 0.01), quantities.Y: (2.0, 0.01), quantities.HEADING: (0.1, 0.01)}
+    robot.add(0.0, {"tilt": {quantities.HEIGHT: (math.nan, math.nan)}, "mice": pose})
+    shown = robot.render(health(), 80, 24).plain
+    assert "HEIGHT" not in shown and "x 1.000 m ±1.0 cm   y 2.000 m ±1.0 cm   heading +5.7° ±0.6°" in shown
+    assert all(len(line) <= 40 for line in robot.render(health(), 40, 24).plain.splitlines())
+    assert "heading +5.7° ±0.6°" in robot.render(health(), 40, 24).plain
+
+
+def test_the_final_table_fits() -> None:
+    summary = {"joint-inertial": (1.2, 1.65, 0.001), "baro": (0.9, 2.0, 0.3)}
+    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
+    assert final_table({}, 80) == []
+
+
 def test_the_next_filter_is_shown_with_its_own_curve() -> None:
     screen = link_screen()
     before = screen.render(health(), 80, 24).plain
@@ -207,7 +258,8 @@ def test_the_next_filter_is_shown_with_its_own_curve() -> None:
         screen.next_filter()
     chosen = screen.render(health(), 80, 24).plain
     assert "▸ joint-inertial" in before and "▸ tilt" in chosen
-    assert f"{float(before.split('joint   ')[1].split()[0]) - 0.02:.4f}" in chosen.splitlines()[1]
+    height_m = float(before.split("joint   ")[1].split()[0])
+    assert f"{height_m - 0.02:.3f}" in chosen.splitlines()[1]
     screen.next_filter()
     assert screen.render(health(), 80, 24).plain == before
 

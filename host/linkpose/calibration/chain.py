@@ -51,6 +51,7 @@ from linkpose.errors import LinkposeError
 from linkpose.recording.reader import Recording
 from linkpose.rotations import of_matrices, rotation_vectors
 from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Rig, Vector, to_vector
 
 Kind = Literal["ball", "hinge"]
@@ -76,6 +77,9 @@ LARGE_RESIDUAL_M_S2, _NO_JOINT_M_S2 = 0.5, 3.0
 # Share of the residual that may follow the motion and shift r_k. On diodem_chain, whose residuals are 0.01 to 0.07
 # m/s², results from four starting times differ by as much as 0.2 predicts. Doubled, σ of a clear direction doubles.
 _COHERENT_SHARE = 0.2
+_STILL_RAD_S = 0.05  # rms rate below which a sensor does not turn: its noise, and the trembling of a hand
+# Difference from a rig's r1 and r2 that a sensor taken off and put on again has (m); 99.9 % of χ² with 6 degrees.
+_SAME_M, _CHI2_6 = 0.02, 22.5
 WEAK_M = 0.03  # σ of r_k along a direction from which on it counts as not observable
 
 # Kind of the joint, by the rms rotation about the best axis and the rms angle that this axis leaves (its play).
@@ -88,6 +92,7 @@ _AXIS_PRIOR_STD_RAD = 1.0  # of each component of an axis: no knowledge
 _AXIS_STARTS, _SEEL_STEPS, _HINGE_STEPS = 12, 10, 10
 WEAK_AXIS_DEG = 15.0  # σ of an axis from which on it counts as not observable
 _LEAST_AXIS_STD_DEG = 0.7  # axes of a gyro: the data sheet allows 2 % between two of them
+_TURNS_ITSELF = 0.3  # share of the other sensor's rate from which on a sensor's own rate gives its axis
 _SIDE = np.array([1.0, 0.77, 0.61])  # the sense of an axis is arbitrary: j_2 lies on this side, as in the filter
 
 
@@ -116,6 +121,7 @@ class ChainCalibration:
     covariance_m2: Floats  # (6, 6) of both
     residual_m_s2: float  # rms, by axis, of the force at the joint's centre that the two sensors do not agree on
     samples: int  # in motion
+    turning_rad_s: tuple[float, float]  # rms rate of either sensor while one of them moves
 
     @property
     def std_m(self) -> Floats:
@@ -174,6 +180,42 @@ def with_calibration(rig: Rig, found: ChainCalibration) -> Rig:
     return replace(rig, chain=chain)
 
 
+def remarks(found: ChainCalibration, stated: Kind | None, before: Rig) -> list[str]:
+    """What contradicts the calibration, a sentence each. `stated` is the kind that the user gave, `before` the rig that
+    was in force.
+    """
+    of = []
+    shown = _kind(found.motion)
+    if stated is not None and shown not in (stated, None):
+        words = {"hinge": "a hinge", "ball": "a ball joint"}
+        of.append(
+            f"The motion is that of {words[shown or stated]}, not of {words[stated]}: the links turn by "
+            f"{found.motion.turn_deg:.1f}° rms about the best axis and by {found.motion.play_deg:.1f}° about others. "
+            "Leave out --joint, or move only the joint between the two sensors."
+        )
+    still = [k + 1 for k, rate in enumerate(found.turning_rad_s) if rate < _STILL_RAD_S]
+    of += [f"Sensor {k} does not turn, so r{k} is not observable: move both links." for k in still]
+    if _are_swapped(found, before):
+        of.append(
+            "The sensors look swapped: r1 found here is r2 of the rig file, and r2 is r1. Sensor 1 (0x68) belongs on "
+            "link 1."
+        )
+    return of
+
+
+def _are_swapped(found: ChainCalibration, before: Rig) -> bool:
+    """Whether the vectors agree with those that the rig has stated, but in the other order."""
+    r1, r2 = before.chain.r1_m, before.chain.r2_m
+    if r1 is None or r2 is None:
+        return False
+    variance = found.covariance_m2 + _SAME_M**2 * np.eye(6)
+    straight, swapped = (
+        float(off @ np.linalg.solve(variance, off))
+        for off in (found.levers_m.ravel() - np.concatenate(order) for order in ((r1, r2), (r2, r1)))
+    )
+    return swapped < _CHI2_6 < straight
+
+
 def _std_of(std_m: Floats) -> float | Vector:
     """As a rig file states it: one for all axes, or one for each where r_k is not observable along all."""
     std_m = np.maximum(np.round(std_m, 5), 1e-5)
@@ -194,19 +236,19 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
     if not chosen:
         raise LinkposeError(f"{names}: nowhere is a second with {1 / LONGEST_STEP_S:.0f} samples or more; record again")
     fit = _fit(chosen, _prior(parts))
-    samples = _samples_in_motion(parts, fit.unknowns)
+    samples, turning = _in_motion(parts, fit.unknowns)
     if fit.residual_m_s2 > _NO_JOINT_M_S2:
         raise LinkposeError(
             f"the readings fit no joint between the two sensors ({fit.residual_m_s2:.1f} m/s² rms are left over): fix "
             "each sensor firmly on its own link, on either side of one joint"
         )
-    motion = _relative_motion(chosen, fit)
+    motion = _with_common_errors(_relative_motion(chosen, fit), fit, turning)
     kind = joint or _kind(motion)
     levers = fit.unknowns[_LEVERS].reshape(2, 3)
     covariance = fit.covariance[np.ix_(_LEVERS, _LEVERS)] + _coherent_errors(chosen, fit)
     if kind == "hinge" and motion.std_deg.max() < WEAK_AXIS_DEG:
         levers, covariance = _nearest_on_axis(levers, covariance, motion.axes)
-    return ChainCalibration(kind, motion, levers, covariance, fit.residual_m_s2, samples)
+    return ChainCalibration(kind, motion, levers, covariance, fit.residual_m_s2, samples, turning)
 
 
 # ---- least squares ----
@@ -343,20 +385,25 @@ def _coherent_errors(chosen: Sequence[_Piece], fit: _Fit) -> Floats:
     return np.asarray(vectors @ np.diag(coherent / np.maximum(values, coherent / LEVER_STD_M**2)) @ vectors.T)
 
 
-def _samples_in_motion(parts: Sequence[tuple[Stretch, Stretch]], unknowns: Floats) -> int:
-    """Number of samples in motion. Raises LinkposeError where they are too few."""
-    samples, seconds = 0, 0.0
+def _in_motion(parts: Sequence[tuple[Stretch, Stretch]], unknowns: Floats) -> tuple[int, tuple[float, float]]:
+    """Number of samples in motion, and the rms rate of either sensor in them (rad/s).
+
+    Raises LinkposeError where they are too few.
+    """
+    samples, seconds, squares = 0, 0.0, np.zeros(2)
     for first, second in parts:
         rates = (first.rate - unknowns[GYRO_BIAS:ACCEL_BIAS], second.rate - unknowns[UNKNOWNS:][GYRO_BIAS:ACCEL_BIAS])
         moving = np.maximum(*(np.linalg.norm(rate, axis=1) for rate in rates)) > _MOVING_RAD_S
         samples += int(moving.sum())
+        squares += [float(np.sum(rate[moving] ** 2)) for rate in rates]
         seconds += float(np.diff(first.time_s)[moving[1:]].sum())
     if seconds < _LEAST_MOTION_S:
         raise LinkposeError(
             f"only {seconds:.1f} s show motion; move both links for half a minute or more, in all directions that the "
             "joint allows"
         )
-    return samples
+    one, two = np.sqrt(squares / samples).tolist()
+    return samples, (one, two)
 
 
 # ---- kind of the joint, and its axis ----
@@ -380,6 +427,23 @@ def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> Motion:
     parts = [_rotations(piece, fit) for piece in chosen]
     found = [_fit_hinge(parts, axes) for axes in _first_axes(parts)]
     return min(found, key=lambda each: each[0])[1]
+
+
+def _with_common_errors(motion: Motion, fit: _Fit, turning_rad_s: tuple[float, float]) -> Motion:
+    """The motion with errors of its axes that all pieces have in common.
+
+    Play that follows the motion turns the axes by as much as itself. Errors of the accelerometers tilt R. They reach
+    the axis of a sensor that hardly turns: the other sensor's rate and R give that axis.
+    """
+    of_bias = (slice(at, at + 3) for at in (ACCEL_BIAS, UNKNOWNS + ACCEL_BIAS))
+    tilt_square = sum(float(np.linalg.eigvalsh(fit.covariance[at, at])[-1]) for at in of_bias) / STANDARD_GRAVITY**2
+    covariance, (one, two) = motion.covariance.copy(), turning_rad_s
+    relies = [max(1 - (own / (_TURNS_ITSELF * other + 1e-12)) ** 2, 0.0) for own, other in ((one, two), (two, one))]
+    for k in range(2):
+        at, axis = slice(3 * k, 3 * k + 3), motion.axes[k]
+        square = np.radians(motion.play_deg) ** 2 + relies[k] * tilt_square
+        covariance[at, at] += square * (np.eye(3) - np.outer(axis, axis))
+    return motion._replace(covariance=covariance)
 
 
 def _rotations(piece: _Piece, fit: _Fit) -> _Rotations:

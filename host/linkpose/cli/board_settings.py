@@ -8,8 +8,6 @@ from typing import Any
 
 import click
 
-LEGAL_RATES_HZ = tuple(rate for rate in range(50, 501) if 2_000_000 % rate == 0)  # a tick is a whole number of 0.5 µs
-
 
 class RateType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
     """A sample rate that the board's timer can produce."""
@@ -17,6 +15,8 @@ class RateType(click.ParamType):  # type: ignore[type-arg]  # generic only in ne
     name = "HZ"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        from linkpose.sensors.devices import LEGAL_RATES_HZ
+
         if str(value) not in map(str, LEGAL_RATES_HZ):
             self.fail(
                 f"{value!r} is not a rate of the board; choose from {', '.join(map(str, LEGAL_RATES_HZ))}", param, ctx

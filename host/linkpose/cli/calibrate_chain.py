@@ -39,7 +39,7 @@ def command(
     more, in all directions that the joint allows. What the motion does not show is written with a large standard
     deviation (r1, r2) or not at all (the axis).
     """
-    from linkpose.calibration.chain import LARGE_RESIDUAL_M_S2, calibrate_chain, with_calibration
+    from linkpose.calibration.chain import LARGE_RESIDUAL_M_S2, calibrate_chain, remarks, with_calibration
 
     loaded, rig = options.recordings_and_rig(recordings, rig_file)
     found = calibrate_chain(loaded, rig, joint)
@@ -48,6 +48,8 @@ def command(
         click.echo(json.dumps(found.as_dict()))
     else:
         _show(found, joint, rig.chain.joint)
+    for remark in remarks(found, joint, rig):
+        click.echo(remark, err=True)
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
         click.echo("The residual is large. Check that each sensor is firm on its own link.", err=True)
     options.show_rig_written(rig_file, quiet, f"estimate {recordings[0]} --rig {rig_file} -o estimate.csv")

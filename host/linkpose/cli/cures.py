@@ -18,6 +18,12 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.TooFewRows: lambda e: (
         f"to score the common part alone, add --from {e.common_s[0]:.6g} --to {e.common_s[1]:.6g}"
     ),
+    errors.NoEstimate: lambda e: (
+        "the height needs J2S: estimate with --j2s X,Y,Z, or with --j2s auto from a recording that turns the link "
+        "about all axes"
+        if "height" in e.quantities
+        else "`linkpose info RECORDING` shows which sensors work"
+    ),
     errors.PortNotFound: lambda e: _nearest_port(e.port) + "`linkpose ports` lists the ports",
     errors.NotASerialPort: lambda e: "`linkpose ports` lists the ports",
     errors.NoBoardFound: lambda e: (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import shutil
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from linkpose.cli.board_settings import board_settings
 from linkpose.cli.cures import sentence
 from linkpose.cli.page import PageOptions, show_newest
 from linkpose.errors import LinkposeError, MissingJ2S, NoUsableData
+from linkpose.presentation import counted
 from linkpose.sensors.rig import Joint
 
 if TYPE_CHECKING:
@@ -195,7 +197,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _report_mice(estimator, console)
     _report_field(estimator, console)
     if request.output:
-        console.report(f"{rows} rows of {', '.join(head['filters'])}{options.written(request.output)}")
+        console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
         options.show_next(console.is_quiet, f"plot {request.output}")
 
 
@@ -304,6 +306,8 @@ class _LiveRun:
             self._view.show(newest, lambda: self.health, self._compiling.progress)
         else:
             self._view.redraw(lambda: self.health, self._compiling.progress)
+        if not self._view.is_shown:
+            self._console.progress(lambda: self._compiling.progress or self._view.line(self.health))
         shown = newest if len(block) else newest[:0]
         show_newest(self._page, shown, lambda: self.health, self._estimator, self._compiling)
 
@@ -328,7 +332,7 @@ class _LiveRun:
         for remark in self._sink.dropped:
             self._console.report(remark)
         if self._console.shows_progress:
-            for line in final_table(self._extremes.summary()):
+            for line in final_table(self._extremes.summary(), shutil.get_terminal_size().columns):
                 self._console.report(line)
         _report_j2s(self._estimator, self._console)
         _report_mice(self._estimator, self._console)

@@ -79,6 +79,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from linkpose.presentation import same_digits
     from linkpose.quantities import unit_text
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
@@ -91,7 +92,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
         for name, value in score.statistics().items():
             of = score.errors[name]
             unit = unit_text(of.unit)
-            figures = [f"{v:.3g}" for v in (value.rmse, value.mean, value.worst, value.p95)]
+            figures = same_digits(value.rmse, value.mean, value.worst, value.p95)
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from linkpose import __version__
 from linkpose.cli import options
-from linkpose.cli.live import Console
+from linkpose.cli.live import Console, ending_well
+from linkpose.cli.page import PageOptions
 from linkpose.errors import LinkposeError
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.localization.events import Log
@@ -19,7 +22,7 @@ if TYPE_CHECKING:
     from linkpose.localization.settings import Settings
     from linkpose.localization.tables import Beacons, Score
     from linkpose.localization.track import Track
-    from linkpose.plotting import Scene
+    from linkpose.recording.table import Table
 
 # The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
 # value for streams, laser scans, and logs of fewer than 100 measurements.
@@ -29,10 +32,6 @@ NOISES = {
     "acceleration_std": ("acceleration", 1.0),
 }  # fmt: skip
 FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
-LANDMARK_ERROR_TIME_S = 0.5
-# With fewer beacons a bias looks like a shift of position. On three public recordings of radio ranges (tests/bench),
-# both constants take the error from 4.7, 0.14 and 0.17 m to 0.44, 0.05 and 0.09 m.
-BEACONS_FOR_CONSTANTS = 3
 POSITIVE = options.FiniteRange(min=0, min_open=True)
 
 
@@ -173,7 +172,20 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "--error-time",
     type=options.FiniteRange(min=0),
     help="Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
-    f"count less. {FROM_LOG} 0, and 0.5 for landmarks.",
+    "count less. Default: estimated for landmarks and in streams; with few measurements 0, and 0.5 for landmarks.",
+)
+@click.option(
+    "--drift-std",
+    type=options.FiniteRange(min=0),
+    help="σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose. "
+    f"{FROM_LOG} 0.",
+)
+@click.option(
+    "--drift-time",
+    type=POSITIVE,
+    default=10.0,
+    show_default=True,
+    help="Time for which this part persists (s); estimated with it.",
 )
 @click.option(
     "--motion-correlation",
@@ -233,8 +245,10 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
+@options.page
 @options.force
 @options.as_json
+@options.quiet
 def command(
     log: Path,
     map_path: Path | None,
@@ -244,39 +258,49 @@ def command(
     output: Path | None,
     picture: Path | None,
     truth_path: Path | None,
+    has_page: bool,
+    view_host: str,
+    view_port: int | None,
     force: bool,
     json_lines: bool,
+    quiet: bool,
     **settings: Any,
 ) -> None:
     """Estimate a robot's path from a LOG of odometry and measurements, and a map or beacons.
 
     LOG is a CARMEN log (ODOM, FLASER, ROBOTLASER1) or a CSV with one measurement a row: time_s,kind,a,b,c, where kind
     is odometry, range, bearing_range, depth, velocity, attitude or pose. With `-`, rows of the CSV are read from
-    standard input, and poses are written to standard output as they come.
+    standard input, and poses are written to standard output as they come. With --view, the path is then played in the
+    browser until Ctrl-C.
     """
+    page = PageOptions(has_page, view_host, view_port)
+    page.check()
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
-    from linkpose.localization.carmen import is_carmen, read_carmen
-    from linkpose.localization.events import read_events
+    from linkpose import precompile
     from linkpose.localization.localizer import check, localize, most_at_once
+    from linkpose.localization.logs import read_log
     from linkpose.localization.maps import load_map
     from linkpose.localization.plausibility import check_units
     from linkpose.localization.tables import read_beacons, read_truth, score_track
 
+    console = Console(quiet, verbose=False)
+    if str(log) == "-":
+        given: dict[str, object] = {"--map": map_path, "--odometry": odometry_path, "--plot": picture}
+        given |= {"--truth": truth_path, "--json": json_lines or None, "--view": has_page or None}
+        _refuse_in_stream(given | {"-o": None if str(output) == "-" else output})
+        _stream(settings, filters, read_beacons(beacons_path) if beacons_path else {}, console)
+        return
     grid = load_map(map_path) if map_path else None
     beacons = read_beacons(beacons_path) if beacons_path else {}
-    if str(log) == "-":
-        _stream(settings, filters, beacons)
-        return
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
         from linkpose.plotting import check_output
 
         check_output(picture, force)
-    carmen = is_carmen(log)
-    read = read_carmen(log) if carmen else read_events(log)
+    read = read_log(log)
     for remark in read.remarks:
-        click.echo(remark, err=True)
+        console.report(remark)
     events = read.events
     if odometry_path is not None:
         from linkpose.localization.odometry import with_mice_odometry
@@ -285,24 +309,23 @@ def command(
     has_scans = any(event.kind == "scan" for event in events)
     default: Method = "scan-match" if has_scans else "ekf"
     names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
-    settings["estimate"] = _estimated(settings["estimate"], events)
+    settings["estimate"] = _estimated(settings["estimate"], events, console)
     free = _free_noises(settings)
     chosen = {name: _settings(settings, name, read.start) for name in names}
-    if not carmen:  # its units are defined, and poses a millisecond apart give any turn rate
+    if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
         check_units(events, beacons, str(log))
     for method in names:
         check(events, method, chosen[method], grid, beacons, str(log))
     if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
-        click.echo("no two ranges of this log are of one instant: --correlation changes nothing", err=True)
+        console.report("no two ranges of this log are of one instant: --correlation changes nothing")
     if _has_no_odometry(events):
-        click.echo(
+        console.report(
             "the log has no odometry: a constant-velocity model is used (--acceleration-std), "
-            "at the mean height of the beacons",
-            err=True,
+            "at the mean height of the beacons"
         )
-    Console(quiet=False, verbose=False).compile(names)
+    console.compile([*names, precompile.NOISES] if beacons and not has_scans else names)
     if beacons and not has_scans:
-        chosen = _tuned(events, chosen, beacons, free, quiet=json_lines)
+        chosen = _tuned(events, chosen, beacons, free, console)
     tracks: dict[str, Track] = {
         method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
     }
@@ -310,71 +333,87 @@ def command(
         _require_measurements(log, name, track)
     options.refuse_mixed_output(output, json_lines)
     if output is not None:
+        from linkpose.localization.output import write_tracks
+
         write_tracks(output, tracks, log, force)
     if picture is not None:
-        from linkpose.plotting import Scene
+        from linkpose import plotting
 
-        _draw(picture, tracks, log, [truth_path] if truth_path else [], Scene(grid, beacons), force)
+        scene = plotting.Scene(grid, beacons, tracks[names[0]].rejected_xy_m)
+        figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], scene)
+        plotting.save(figure, picture, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
+    if has_page:
+        from linkpose.page.scene import Surroundings
+
+        page.play(_tables(tracks, log, truth_path), [], Surroundings(grid, beacons), console)
 
 
-def _draw(
-    picture: Path, tracks: dict[str, Track], log: Path, references: list[Path], scene: Scene, force: bool
-) -> None:
-    """Draws the paths as `plot` draws them from their file."""
-    import tempfile
-
-    from linkpose import plotting
+def _tables(tracks: dict[str, Track], log: Path, truth: Path | None) -> list[Table]:
+    """The paths and the truth as `plot` reads them from their files."""
     from linkpose.evaluation.references import read_for_picture
+    from linkpose.localization.output import table_of
 
-    with tempfile.TemporaryDirectory() as folder:
-        estimates = Path(folder) / "path.csv"
-        write_tracks(estimates, tracks, log, force=False)
-        tables = [read_for_picture(path, "z", lambda share: None) for path in (estimates, *references)]
-        figure, _ = plotting.plot_tables(tables, [], scene)
-        plotting.save(figure, picture, force)
+    return [table_of(tracks, log), *([read_for_picture(truth, "z")] if truth is not None else [])]
 
 
-def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons) -> None:
-    """Reads rows from standard input and writes a row of CSV for each."""
+def _refuse_in_stream(given: dict[str, object]) -> None:
+    """Raises UsageError for options that a stream does not use."""
+    if unused := [option for option, value in given.items() if value is not None]:
+        raise click.UsageError(f"a stream from standard input does not use {', '.join(unused)}; leave it out")
+
+
+def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons, console: Console) -> None:
+    """Reads rows from standard input and writes a row of CSV for each, until the input ends or the user interrupts."""
     import sys
 
-    from linkpose.localization.stream import localize_stream
+    from linkpose import precompile
+    from linkpose.localization.output import header_line, row_line
+    from linkpose.localization.stream import Stream
 
     name = filters[0] if filters else "ekf"
     if len(filters) > 1 or name not in ("ekf", "ukf") or not beacons or settings["smooth"]:
         raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth")
-    if settings["estimate"] == ("none",):
-        settings["estimate"] = ()
-    _free_noises(settings)
+    words = settings["estimate"]
+    settings["estimate"] = () if words == ("none",) else words
+    free = _free_noises(settings)
     method = cast("Method", name)
-    header = False
-    for names, row in localize_stream(sys.stdin, method, _settings(settings, method, None), beacons):
-        if not header:
-            columns = [f"{name}_{state}" for state in names] + [f"{name}_{_std_name(state)}" for state in names]
-            click.echo(",".join(["time_s", *columns]))
-            header = True
-        std = [max(float(value), 0.0) ** 0.5 for value in row.covariance.diagonal()]
-        click.echo(",".join([f"{row.time_s:.6f}", *(f"{value:.9g}" for value in (*row.state.tolist(), *std))]))
-        sys.stdout.flush()
+    console.compile([name, precompile.NOISES])
+    stream = Stream(method, _settings(settings, method, None), beacons, free, not words, console.report)
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")
+    last = None
+    with contextlib.suppress(KeyboardInterrupt), ending_well():
+        for row in stream.rows(sys.stdin):
+            if last is None:
+                click.echo(header_line(name, stream.states))
+            click.echo(row_line(row))
+            sys.stdout.flush()
+            last = row
+    for remark in stream.remarks():
+        console.report(remark)
+    if stream.run is not None and last is not None:
+        track = stream.run.track([last])
+        _require_measurements(Path("standard input"), name, track)
+        console.report(_sentence(name, track, None))
 
 
-def _estimated(words: tuple[str, ...], events: Log) -> tuple[str, ...]:
-    """The constants to estimate: as given, or scale and bias where the ranges to enough beacons determine them."""
+def _estimated(words: tuple[str, ...], events: Log, console: Console) -> tuple[str, ...]:
+    """The constants to estimate: as given, or those that the ranges determine."""
     from linkpose.localization.events import Event
-    from linkpose.localization.kalman import SUBMERSIBLE
-    from linkpose.localization.vehicle import kinds_of, vehicle_of
+    from linkpose.localization.measuring import default_constants
+    from linkpose.localization.vehicle import kinds_of
 
     if words:
         return () if words == ("none",) else words
     beacons = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
-    if len(beacons) < BEACONS_FOR_CONSTANTS or vehicle_of(kinds_of(events)) is SUBMERSIBLE:
-        return ()
-    click.echo("scale error and bias of the ranges are estimated, too (--estimate none: not)", err=True)
-    return ("scale", "bias")
+    found = default_constants(kinds_of(events), len(beacons))
+    if found:
+        console.report("scale error and bias of the ranges are estimated, too (--estimate none: not)")
+    return found
 
 
 def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
@@ -384,11 +423,13 @@ def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
         given[option] = value if given[option] is None else given[option]
     if given["noise"] != "affine" and "growth" in free:
         free.remove("growth")
-    return (*free, "yaw", *(("error_time",) if given["error_time"] is None else ()))
+    free += [name for option, name in (("error_time", "error_time"), ("drift_std", "drift")) if given[option] is None]
+    given["drift_std"] = given["drift_std"] or 0.0
+    return (*free, "yaw")
 
 
 def _tuned(
-    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], quiet: bool
+    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], console: Console
 ) -> dict[Method, Settings]:
     """The settings of all filters with the free noises estimated from the log, and a line that reports them."""
     from linkpose.localization.tuning import described, tune
@@ -397,8 +438,7 @@ def _tuned(
     tuned = tune(events, first, beacons, free)
     if tuned is first:
         return chosen
-    if not quiet:
-        click.echo(f"noises estimated from the log: {described(tuned, events)}", err=True)
+    console.report(f"noises estimated from the log: {described(tuned, events)}")
     return dict.fromkeys(chosen, tuned)
 
 
@@ -413,7 +453,7 @@ def _require_measurements(log: Path, name: str, track: Track) -> None:
     """Raises LinkposeError where no measurement was applied: the path would be dead reckoning."""
     if track.applied == 0:
         raise LinkposeError(
-            f"{log}: {name} applied none of {track.rejected} measurements, so there is no estimate; "
+            f"{log}: {name} applied none of {counted(track.rejected, 'measurement')}, so there is no estimate; "
             "check the units (m, s, rad), --start, and the places of the beacons or the map"
         )
 
@@ -452,6 +492,8 @@ def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float
         start_std=given["start_std"],
         acceleration_std_m_s2=given["acceleration_std"],
         error_time_s=given["error_time"],
+        drift_std_m=given["drift_std"],
+        drift_time_s=given["drift_time"],
         smooth=given["smooth"],
         particles=given["particles"],
         seed=given["seed"],
@@ -481,7 +523,7 @@ def _summary(name: str, track: Track, result: Score | None) -> dict[str, object]
 
 
 def _sentence(name: str, track: Track, result: Score | None) -> str:
-    text = f"{name}: {track.applied} measurements applied, {track.rejected} rejected"
+    text = f"{name}: {counted(track.applied, 'measurement')} applied, {track.rejected} rejected"
     known = track.known
     if not known.all():
         first = f" (first at {track.time_s[known][0]:.6g} s)" if known.any() else ""
@@ -493,9 +535,10 @@ def _sentence(name: str, track: Track, result: Score | None) -> str:
         )
         text += f"\n  at the end {last}"
     if track.widened:
-        text += f"\n  {track.widened} times most measurements were rejected, so the pose was made uncertain again"
+        often = counted(track.widened, "time")
+        text += f"\n  {often} most measurements were rejected, so the pose was made uncertain again"
     if track.relocated:
-        text += f"\n  {track.relocated} times the pose was lost and found anew"
+        text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found anew"
     for verdict in track.consistency.verdicts():
         text += f"\n  {verdict.sentence()} (mean NIS {verdict.mean_nis:.2f}, 1 is consistent)"
     if result is not None:
@@ -508,37 +551,3 @@ def _sentence(name: str, track: Track, result: Score | None) -> str:
         if result.within_2_sigma is not None:
             text += f"; {100 * result.within_2_sigma:.0f} % of the errors within 2σ"
     return text
-
-
-def write_tracks(path: Path, tracks: dict[str, Track], log: Path, force: bool) -> None:
-    """The estimate CSV: `time_s`, then for each filter its states and their standard deviations."""
-    import numpy as np
-
-    from linkpose.recording.csvfile import CsvFile
-
-    first = next(iter(tracks.values()))
-    columns, parts = ["time_s"], [first.time_s[:, np.newaxis]]
-    for name, track in tracks.items():
-        prefix = name.replace("-", "_")
-        columns += [f"{prefix}_{state}" for state in track.names]
-        columns += [f"{prefix}_{_std_name(state)}" for state in track.names]
-        pairs = [(i, j) for i in range(2) for j in range(i + 1, min(3, len(track.names)))]
-        columns += [f"{prefix}_cov_{track.names[i]}_{track.names[j]}" for i, j in pairs]
-        parts += [track.state, track.std, *(track.covariance[:, i, j, np.newaxis] for i, j in pairs)]
-    table = np.hstack(parts)
-    line = ",".join(["%.6f"] + ["%.9g"] * (len(columns) - 1)) + "\n"
-    with CsvFile(
-        path, "estimate", {"software": __version__, "log": log.name, "filters": list(tracks)}, columns, force
-    ) as file:
-        file.write("".join(line % tuple(row) for row in table.tolist()).replace("nan", ""))
-        rejected = {f"{name.replace('-', '_')}_rejected": track.rejected for name, track in tracks.items()}
-        file.close({"rows": len(table), **rejected})
-
-
-def _std_name(state: str) -> str:
-    """The unit stays last: x_m -> x_std_m."""
-    for unit in ("rad_s", "rad", "m"):
-        if state.endswith(f"_{unit}"):
-            quantity = state.removesuffix(f"_{unit}")
-            return f"{quantity}_std_{unit}"
-    return f"{state}_std"

@@ -1,11 +1,11 @@
-"""The page of `estimate --live`, `record` and `plot` with `--view`."""
+"""The page of `estimate --live`, `record`, `plot` and `localize` with `--view`."""
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import click
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from linkpose.page.history import Replay
     from linkpose.page.scene import Surroundings
     from linkpose.precompile import Precompilation
+    from linkpose.recording.table import Table
     from linkpose.sensors.measurements import Floats, Measurements
     from linkpose.sensors.rig import Rig
 
@@ -62,6 +63,34 @@ class PageOptions:
                 report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
             report(f"page: {page.url}")
             yield page
+
+    def play(
+        self, tables: Sequence[Table], wanted: Sequence[str], surroundings: Surroundings, console: Console
+    ) -> None:
+        """Plays the first estimate, with the reference if there is one, until Ctrl-C.
+
+        `wanted` names filters; without any, all are shown.
+        """
+        from linkpose.cli.live import ending_well
+        from linkpose.page.history import Replay
+        from linkpose.page.tables import corners_of, rig_of, rows_of
+
+        columns, values = rows_of(tables, wanted)
+        surroundings = replace(surroundings, places=corners_of(columns, values))
+        title = "  ".join(table.path.name for table in tables)
+        opened = self.open(
+            columns,
+            rig_of(tables),
+            title,
+            lambda text: click.echo(text, err=True),
+            replay=Replay(values),
+            surroundings=surroundings,
+        )
+        with ending_well(), opened as page:
+            console.report("Ctrl-C ends")
+            with contextlib.suppress(KeyboardInterrupt):
+                while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
+                    pass
 
     @contextlib.contextmanager
     def follow(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -74,8 +74,9 @@ def command(
     if has_page:
         if output:
             raise click.UsageError("--view shows a page; leave out --output")
-        scene = _scene(map_file, beacons)
-        _serve([read_any(path, up) for path in files], [name.replace("_", "-") for name in wanted], page, scene, quiet)
+        tables = [read_any(path, up) for path in files]
+        names = [name.replace("_", "-") for name in wanted]
+        page.play(tables, names, _surroundings(_scene(map_file, beacons)), Console(quiet, verbose=False))
         return
     output = output or files[0].with_suffix(".png")
     plotting.check_output(output, force, (*plotting.FORMATS, _ANIMATION))
@@ -102,16 +103,17 @@ def command(
 def _save_animation(tables: list[Table], wanted: list[str], output: Path, scene: Scene | None) -> None:
     """Writes the first estimate, with the reference if there is one, as an animation in 3-D."""
     from linkpose.page.animation import save_animation
-    from linkpose.page.tables import rig_of, rows_of
+    from linkpose.page.tables import corners_of, rig_of, rows_of
 
     columns, values = rows_of(tables, wanted)
-    save_animation(output, columns, values, rig_of(tables), _surroundings(scene))
+    surroundings = replace(_surroundings(scene), places=corners_of(columns, values))
+    save_animation(output, columns, values, rig_of(tables), surroundings)
 
 
-def _surroundings(scene: Scene | None) -> Surroundings | None:
+def _surroundings(scene: Scene | None) -> Surroundings:
     from linkpose.page.scene import Surroundings
 
-    return Surroundings(scene.grid, scene.beacons) if scene is not None else None
+    return Surroundings(scene.grid, scene.beacons) if scene is not None else Surroundings()
 
 
 def _show_progress(console: Console, path: Path) -> Callable[[float], None]:
@@ -129,30 +131,3 @@ def _scene(map_file: Path | None, beacons: Path | None) -> Scene | None:
     grid = load_map(map_file) if map_file else None
     places = read_beacons(beacons) if beacons else {}
     return Scene(grid, {str(name): place for name, place in places.items()})
-
-
-def _serve(tables: list[Table], wanted: list[str], page_options: PageOptions, scene: Scene | None, quiet: bool) -> None:
-    """Plays the first estimate, with the reference if there is one, until Ctrl-C or "stop"."""
-    from linkpose.cli.live import Console, ending_well
-    from linkpose.page.history import Replay
-    from linkpose.page.tables import rig_of, rows_of
-
-    console = Console(quiet, verbose=False)
-    columns, values = rows_of(tables, wanted)
-    rig = rig_of(tables)
-    title = "  ".join(table.path.name for table in tables)
-    with (
-        ending_well(),
-        page_options.open(
-            columns,
-            rig,
-            title,
-            lambda text: click.echo(text, err=True),
-            replay=Replay(values),
-            surroundings=_surroundings(scene),
-        ) as page,
-    ):
-        console.report("Ctrl-C ends")
-        with contextlib.suppress(KeyboardInterrupt):
-            while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
-                pass

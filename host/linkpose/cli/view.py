@@ -10,7 +10,7 @@ import textwrap
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -21,15 +21,15 @@ from linkpose.presentation import (
     Exclusions,
     Row,
     RowReader,
+    aligned_length,
     best_filter,
     fault_lines,
     joint_angle,
     joint_texts,
-    number_text,
+    length_with_std,
     pose_text,
     signed_angle,
     std_text,
-    with_std,
 )
 from linkpose.quantities import Quantity
 from linkpose.sensors.measurements import Floats
@@ -47,6 +47,7 @@ WIDEST = 78
 BLOCKS = 250  # of estimates whose extremes are found at once
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 LEAST_ANGLE_DEG = 5.0  # ditto, of a joint angle
+_FAULTS, _HEADLINE = 10, 8  # priorities of sections
 
 Points = deque[tuple[float, float]]  # time (s) and value
 
@@ -61,6 +62,7 @@ class View:
         self._live: Live | None = None
         self._size: tuple[int, int] = (0, 0)
         self._drawn_at = -math.inf
+        self._is_wanted = is_shown
         if is_shown:
             self._start()
 
@@ -68,9 +70,12 @@ class View:
         from rich.console import Console
         from rich.live import Live
 
+        console = Console(stderr=True)
+        if console.is_dumb_terminal:
+            return
         # Results go to stdout untouched: rich must not redirect it.
         self._live = Live(
-            console=Console(stderr=True), auto_refresh=False, transient=True, redirect_stdout=False,
+            console=console, auto_refresh=False, transient=True, redirect_stdout=False,
             redirect_stderr=False,
         )  # fmt: skip
         self._size = self._live.console.size
@@ -78,8 +83,12 @@ class View:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the view is on the screen."""
+        """Whether the view is on the screen. A terminal that cannot move its cursor (TERM=dumb) shows none."""
         return self._live is not None
+
+    def line(self, health: Health) -> str:
+        """The faults and the headline in one line, where the view is not on the screen."""
+        return self._screen.line(health)
 
     def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""
@@ -97,7 +106,7 @@ class View:
 
         `status` is a line on what is not ready yet, such as filters that are being compiled.
         """
-        if self._live is None:
+        if not self._is_wanted:
             return
         self._screen.add(float(estimates[0]), self._rows.read(estimates.tolist()))
         self.redraw(health, status)
@@ -140,10 +149,11 @@ class Screen:
         self._time_s = 0.0
         self._row: Row = {}
         self._chosen: str | None = None  # None: the best filter
-        # By filter; None is the best one at each instant.
-        self._heights: dict[str | None, Points] = {}
+        # By filter: the curve of one filter shows no jump where another one was the best before.
+        self._heights: dict[str, Points] = {}
+        self._has_height = False  # ever; without J2S, a link's filters have a height without a value
         self._angles: dict[str, Points] = {}  # of a chain's joint
-        self._paths: dict[str | None, list[tuple[float, float]]] = {}
+        self._paths: dict[str, list[tuple[float, float]]] = {}
         self._exclusions = Exclusions()
 
     def next_filter(self) -> None:
@@ -154,22 +164,18 @@ class Screen:
     def add(self, time_s: float, row: Row) -> None:
         """Adds a row of estimates."""
         self._time_s, self._row = time_s, row
-        for name, values in [(None, self._best(quantities.HEIGHT)), *row.items()]:
+        for name, values in row.items():
             if quantities.HEIGHT in values:
-                _add_point(self._heights, name, time_s, values[quantities.HEIGHT][0])
-        for filter_name, values in row.items():
+                height_m = values[quantities.HEIGHT][0]
+                self._has_height |= math.isfinite(height_m)
+                _add_point(self._heights, name, time_s, height_m)
             if (angle := joint_angle(values)) is not None:
-                _add_point(self._angles, filter_name, time_s, angle[0])
-        for name, values in [(None, self._best(quantities.HEADING)), *row.items()]:
+                _add_point(self._angles, name, time_s, angle[0])
             if quantities.HEADING in values and quantities.X in values and quantities.Y in values:
                 self._add_place(name, values[quantities.X][0], values[quantities.Y][0])
         self._exclusions.follow(time_s, row)
 
-    def _best(self, quantity: Quantity) -> Mapping[Quantity, tuple[float, float]]:
-        name = best_filter(self._row, self._filters, quantity)
-        return {} if name is None else self._row[name]
-
-    def _add_place(self, name: str | None, x_m: float, y_m: float) -> None:
+    def _add_place(self, name: str, x_m: float, y_m: float) -> None:
         path = self._paths.setdefault(name, [])
         path.append((x_m, y_m))
         if len(path) > PATH_POINTS:
@@ -192,6 +198,12 @@ class Screen:
         text.rstrip()
         return text
 
+    def line(self, health: Health) -> str:
+        """Time, faults and headlines, as far as they fit one line."""
+        sections = self._sections(health, WIDEST, "")
+        parts = [lines[0][0] for wanted in (_FAULTS, _HEADLINE) for priority, lines in sections if priority == wanted]
+        return "   ".join([f"{self._time_s:.1f} s", *parts])[:WIDEST]
+
     @staticmethod
     def _fit(sections: list[tuple[int, list[tuple[str, str]]]], height: int) -> list[tuple[str, str]]:
         """The lines of the sections; those of the lowest priority go first when there are too many."""
@@ -204,12 +216,12 @@ class Screen:
         """(priority, [(line, style), …]) from top to bottom."""
         faults = [(part, "bold red") for line in fault_lines(health) for part in textwrap.wrap(line, width)]
         faults += [(part, "bold red") for line in self._exclusions.lines() for part in textwrap.wrap(line, width)]
-        sections = [(9, [(self._head(health, width), "bold")]), (10, faults)]
+        sections = [(9, [(self._head(health, width), "bold")]), (_FAULTS, faults)]
         chain = next((name for name in self._filters if joint_angle(self._row.get(name, {})) is not None), None)
         link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
         if chain is not None:
             sections += self._chain_sections(chain, width)
-        if link is not None:
+        if link is not None and (self._has_height or robot is None):
             sections += self._link_sections(link, width)
         if robot is not None:
             sections += self._robot_sections(robot, width)
@@ -217,14 +229,18 @@ class Screen:
         return [section for section in sections if section[1]]
 
     def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        points = self._heights.get(name if name == self._chosen else None, ())
+        points = self._heights.get(name, ())
         table = (5, self._height_table(name, width))
-        return [(8, [(self._headline(name, width), "")]), (6, _curve_lines(points, width, LEAST_HEIGHT_M)), table]
+        return [
+            (_HEADLINE, [(self._headline(name, width), "")]),
+            (6, _curve_lines(points, width, LEAST_HEIGHT_M)),
+            table,
+        ]
 
     def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        path = self._paths.get(name if name == self._chosen else None, ())
+        path = self._paths.get(name, ())
         lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
-        head = (8, [("   ".join(pose_text(self._row[name])), "")])
+        head = (_HEADLINE, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
         return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
@@ -233,11 +249,11 @@ class Screen:
         parts = joint_texts(values)
         for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
             if quantity in values:
-                parts.append(f"height {number} {with_std(*values[quantity], 'm', 3)}")
+                parts.append(f"height {number} {length_with_std(*values[quantity])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
         lines = _curve_lines(self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
-        return [(8, [("   ".join(parts), "")]), (7, lines)]
+        return [(_HEADLINE, [("   ".join(parts), "")]), (7, lines)]
 
     def _head(self, health: Health, width: int) -> str:
         """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
@@ -254,14 +270,14 @@ class Screen:
     def _headline(self, name: str, width: int) -> str:
         """Height, roll, pitch and yaw; narrow screens drop the last ones."""
         values = self._row[name]
-        parts = [f"HEIGHT over joint   {with_std(*values[quantities.HEIGHT], 'm', 4)}"]
+        parts = [f"HEIGHT over joint   {length_with_std(*values[quantities.HEIGHT])}"]
         for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
             if quantity in values:
                 parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
         if len(parts[0]) > width:
-            parts[0] = f"HEIGHT {with_std(*values[quantities.HEIGHT], 'm', 4)}"
+            parts[0] = f"HEIGHT {length_with_std(*values[quantities.HEIGHT])}"
         return "   ".join(parts)
 
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
@@ -273,7 +289,7 @@ class Screen:
             if quantities.HEIGHT not in self._row.get(name, {}):
                 continue
             value, std = self._row[name][quantities.HEIGHT]
-            line = f"{'▸' if name == best else ' '} {name:<16} {number_text(value, 'm', 4):>10} {std_text(std):>9}"
+            line = f"{'▸' if name == best else ' '} {name:<16} {aligned_length(value, std):>10} {std_text(std):>9}"
             if name != best and width >= 60 and math.isfinite(value - reference):
                 line += f"   {_signed_length(value - reference)}"
             lines.append((line, "bold" if name == best else ""))
@@ -283,16 +299,28 @@ class Screen:
         rows = [(name, self._row[name]) for name in self._filters if quantities.HEADING in self._row.get(name, {})]
         if len(rows) < 2:
             return []
-        lines = [(f"  {'filter':<16} {'x':>9} {'y':>9} {'heading':>9}", "dim")]
+        lines = [(f"  {'filter':<16} {'x':>10} {'y':>10} {'heading':>9}", "dim")]
         for name, values in rows:
-            x, y, heading = (values[q][0] for q in (quantities.X, quantities.Y, quantities.HEADING))
+            x, y = (aligned_length(*values[q]) for q in (quantities.X, quantities.Y))
+            heading = values[quantities.HEADING][0]
             angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
-            line = f"{number_text(x, 'm', 3):>9} {number_text(y, 'm', 3):>9} {angle:>9}"
+            line = f"{x:>10} {y:>10} {angle:>9}"
             lines.append((f"{'▸' if name == shown else ' '} {name:<16} {line}", "bold" if name == shown else ""))
         return lines
 
 
-def _add_point(curves: dict[Any, Points], name: str | None, time_s: float, value: float) -> None:
+def _packed(parts: Iterable[str], width: int) -> list[str]:
+    """Texts side by side, on as many lines of this width as they need."""
+    lines: list[str] = []
+    for part in parts:
+        if lines and len(f"{lines[-1]}   {part}") <= width:
+            lines[-1] += f"   {part}"
+        else:
+            lines.append(part)
+    return lines
+
+
+def _add_point(curves: dict[str, Points], name: str, time_s: float, value: float) -> None:
     """Adds a point to a filter's curve, unless it is close to the one before."""
     points = curves.setdefault(name, deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1))
     # A stamp lies a little before or after its tick: some slack keeps the points evenly spaced.
@@ -306,11 +334,17 @@ def _curve_lines(points: Iterable[tuple[float, float]], width: int, least: float
     return [(line, "cyan") for line in curve(times, values, CURVE_S, width, CURVE_ROWS, least)]
 
 
-def final_table(summary: Mapping[str, tuple[float, float, float]]) -> list[str]:
-    """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m."""
-    lines = [f"  {'filter':<16} {'lowest':>10} {'highest':>10} {'rms σ':>9}"]
+def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -> list[str]:
+    """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m.
+
+    The last column is left out where they would be wider than `width` characters.
+    """
+    rows = [("filter", "lowest", "highest", "rms σ")]
     for name, (low, high, std) in summary.items():
-        lines.append(f"  {name:<16} {number_text(low, 'm', 4):>10} {number_text(high, 'm', 4):>10} {std_text(std):>9}")
+        rows.append((name, aligned_length(low, std), aligned_length(high, std), std_text(std)))
+    lines = [f"  {name:<16} {low:>10} {high:>10}" for name, low, high, _ in rows]
+    if len(lines[0]) + 10 <= width:
+        lines = [f"{line} {row[3]:>9}" for line, row in zip(lines, rows, strict=True)]
     return lines if summary else []
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
-from linkpose.device.clock import DeviceClock
+from linkpose.device.clock import WRAP_US, DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.device.ports import find_again, usb_identity
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
@@ -19,7 +19,7 @@ from linkpose.sensors.conversion import BoardSettings, Placed
 from linkpose.sensors.devices import Sensors, check_hello, found, mouse_remarks
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Timeline
-from linkpose.wire.frames import Corrupt, OtherProtocol
+from linkpose.wire.frames import Corrupt, OtherProtocol, StreamDecoder
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
     PROTOCOL_MINOR,
@@ -59,8 +59,6 @@ SILENCE_S = 1.5  # of a board that should be streaming
 LATE_S = 0.5  # after the end of the duration, a sample may still be on its way
 RECEIVE_TIMEOUT_S = 0.1
 MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
-STILL_SAMPLES = 10  # with the same time stamp
-JUMP_S = 0.2  # of the board's clock against its ticks
 RETRY_INTERVAL_S = 0.25
 WAIT_STEP_S = 0.05
 OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
@@ -137,9 +135,7 @@ class Session:
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
-        self._last_stamp: tuple[int, int] | None = None  # seq and t_us of the last sample
         self._arrived_s = 0.0  # s, the connection's clock: of the last sample
-        self._still = 0  # samples in a row with the same t_us
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
             0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
@@ -190,12 +186,12 @@ class Session:
                 if isinstance(message, OtherProtocol):
                     raise _other_protocol(message)
                 refused += isinstance(message, Nak)
-                if isinstance(message, Hello) and not message.streaming:
+                if isinstance(message, Hello) and message.streaming != 1:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        reason = _why_no_hello(bytes(received), connection.decoder.corrupt)
+        reason = _why_no_hello(bytes(received), connection.decoder)
         if refused:
             reason = "the board refuses every command, also the request for its version; its firmware is damaged"
         raise NoFirmware(self.port, bytes(received), reason)
@@ -315,7 +311,9 @@ class Session:
     def _hear_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
         if sent is not None:
-            self._clock.pong(pong.t_us, sent, time_s)
+            t_us = (pong.t_us + self.timeline.stamps.shift_us) % WRAP_US
+            if self.timeline.stamps.is_trusted:
+                self._clock.pong(t_us, sent, time_s)
         elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
             self._report_intruder()
 
@@ -366,6 +364,8 @@ class Session:
             yield placements
             if self._silent_s > LATE_S:
                 self._end_when_due(timeline)
+        if not timeline.samples:
+            raise BoardError("the board accepted START, but no sample arrived; check the cable, and reset the board")
         if timeline.missing_at_end:
             self.notify(
                 f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
@@ -394,8 +394,7 @@ class Session:
             raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
         self._pinged_at = self._looked_s = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
-        self._unread_bytes = self._still = 0
-        self._last_stamp = None
+        self._unread_bytes = 0
 
     def _start(self, wanted: Configure) -> Arrival | None:
         """Starts the stream and checks that the board streams with the settings that its values are scaled by.
@@ -436,8 +435,8 @@ class Session:
                 self._silent_s = self._asked_s = 0.0
                 self._unread_bytes = 0
                 self._arrived_s = arrival.time_s
-                self._check_clock(message, timeline)
                 place = timeline.place(message, self._clock, arrival.time_s)
+                self._report_clock_fault(timeline)
                 if place is not None:
                     placements.append(Placement(message, place))
             elif placements and isinstance(message, Hello | OtherProtocol):
@@ -457,23 +456,14 @@ class Session:
             "Use a shorter USB cable or another port, or supply the mice separately"
         )
 
-    def _check_clock(self, sample: Sample, timeline: Timeline) -> None:
-        """Report a board clock that stands still or jumps against its own count of ticks, once each."""
-        seq, t_us = self._last_stamp or (sample.seq, sample.t_us)
-        self._last_stamp = (sample.seq, sample.t_us)
-        ticks = (sample.seq - seq) % (1 << 16)
-        off_s = ((sample.t_us - t_us + (1 << 31)) % (1 << 32) - (1 << 31)) * 1e-6 - ticks / self.hello.sample_rate_hz
-        self._still = self._still + 1 if ticks and sample.t_us == t_us else 0
-        fault = ""
-        if self._still == STILL_SAMPLES:
-            fault = "stands still"
-        elif abs(off_s) > JUMP_S and ticks < JUMP_S * self.hello.sample_rate_hz:
-            fault = f"jumped by {off_s:.2f} s"
+    def _report_clock_fault(self, timeline: Timeline) -> None:
+        """Report a board clock that jumps, stands still or runs at a wrong rate against its own ticks, once each."""
+        fault = timeline.stamps.fault
         if fault and fault.split()[0] not in self._clock_faults:
             self._clock_faults.add(fault.split()[0])
             self.notify(
-                f"{timeline.duration_s:.2f} s: the board's clock {fault}; the times from here on are unreliable. "
-                "Replace the board if it happens again"
+                f"{timeline.duration_s:.2f} s: the board's clock {fault}; its count of ticks gives the times from here "
+                "on. Replace the board if it happens again"
             )
 
     def _ask_when_silent(self) -> None:
@@ -654,8 +644,15 @@ def _other_schema(hello: Hello) -> WrongFirmware:
     return WrongFirmware(text, True)
 
 
-def _why_no_hello(received: bytes, corrupt: Corrupt) -> str:
+def _why_no_hello(received: bytes, decoder: StreamDecoder) -> str:
     """What came instead of a HELLO, and what to do about it."""
+    corrupt = decoder.corrupt
+    if decoder.misfit is not None:
+        kind, length = decoder.misfit
+        return (
+            f"a frame of type {kind:#04x} with {length} bytes arrived intact, which protocol {PROTOCOL_MAJOR} does not "
+            "have; the firmware is damaged or not linkpose's"
+        )
     if not received:
         return "the board is silent; it may never have had this firmware, or another port is the board's"
     printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in received)

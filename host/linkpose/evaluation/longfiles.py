@@ -27,7 +27,7 @@ from linkpose.evaluation.scores import (
     pairs_of,
     window_of,
 )
-from linkpose.evaluation.scoring import Compared, Score, Scorer, Window
+from linkpose.evaluation.scoring import Compared, Score, Scorer, Window, scores_of
 from linkpose.evaluation.series import SPARSER, Lag, interval, paired, strongest_lag, usual
 from linkpose.quantities import HEIGHT, by_filter, split
 from linkpose.recording import thinned
@@ -256,7 +256,8 @@ class _Comparison:
         compared = pairs_of(*tables)
         offset_s, residual = common_offset(compared.values(), near)
         remarks = mismatches(*tables, compared.values(), offset_s, residual)
-        return Evaluation(self._score(compared, offset_s, window), remarks)
+        scores, without = self._score(compared, offset_s, window)
+        return Evaluation(scores, remarks + without)
 
     def _share(self, done: int, of: int) -> Progress:
         """The progress of one of `of` equal parts of the work, after `done` of them."""
@@ -309,8 +310,10 @@ class _Comparison:
 
     # ---- scores ----
 
-    def _score(self, compared: Mapping[str, Compared], offset_s: float, window: Window) -> list[Score]:
-        """Scores all filters over all rows."""
+    def _score(
+        self, compared: Mapping[str, Compared], offset_s: float, window: Window
+    ) -> tuple[list[Score], list[str]]:
+        """Scores all filters over all rows, as `scores_of`."""
         starts = self._common_starts(compared, offset_s)
         present = pairs_of(*self._tables(*(scan.presence for scan in self._scans)))
         instants = self._scans[self._sparser].rows
@@ -325,7 +328,7 @@ class _Comparison:
         for piece in self._pieces(offset_s, self._share(2, 3)):
             for name, both in piece.items():
                 scorers[name].add(both)
-        return [scorer.score() for scorer in scorers.values()]
+        return scores_of(scorers.values())
 
     def _common_starts(self, compared: Mapping[str, Compared], offset_s: float) -> dict[str, CommonStart]:
         """Of each filter. They are near the beginning of the files as a rule."""

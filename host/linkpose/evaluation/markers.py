@@ -19,7 +19,7 @@ import numpy as np
 from linkpose.errors import FileFormatError, LinkposeError, MissingLibrary
 from linkpose.evaluation.c3dcheck import Damaged, check_sizes
 from linkpose.evaluation.takes import reference_of, take_of_markers
-from linkpose.recording.chunks import read_bytes
+from linkpose.inputs import read_bytes
 from linkpose.recording.delimited import text_lines, to_utf8
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats

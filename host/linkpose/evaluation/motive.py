@@ -19,7 +19,7 @@ import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.takes import Take, reference_of, take_of_markers
-from linkpose.recording.chunks import read_bytes
+from linkpose.inputs import read_bytes
 from linkpose.recording.delimited import to_utf8
 from linkpose.recording.table import Table, check_times
 from linkpose.rotations import matrices
@@ -135,7 +135,7 @@ def _unit(path: Path, head: list[str]) -> float:
     pairs = dict(zip(head[::2], head[1::2], strict=False))
     name = pairs.get("Length Units", "Meters").strip().lower()
     if name not in _METRES:
-        raise LinkposeError(f"{path}, line 1: unknown length unit {name!r}; export in {', '.join(_METRES)}")
+        raise LinkposeError(f"{path}, line 1: unknown length unit {name[:60]!r}; export in {', '.join(_METRES)}")
     return _METRES[name]
 
 

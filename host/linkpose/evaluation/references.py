@@ -7,7 +7,7 @@ from pathlib import Path
 
 from linkpose.evaluation.markers import is_c3d, is_trc, read_c3d, read_trc
 from linkpose.evaluation.motive import is_motive, read_motive
-from linkpose.recording.chunks import open_binary
+from linkpose.inputs import open_binary
 from linkpose.recording.table import Progress, Table, read_table
 from linkpose.recording.thinned import read_thinned
 

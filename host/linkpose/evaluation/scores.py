@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from linkpose.errors import LinkposeError
-from linkpose.evaluation.scoring import CHAIN, LINK, Compared, Score, Scorer, Window
+from linkpose.errors import LinkposeError, listed
+from linkpose.evaluation.scoring import CHAIN, LINK, Compared, Score, Scorer, Window, scores_of
 from linkpose.evaluation.series import Lag, Pair, Series, find_offset, paired
 from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.quantities import (
@@ -58,14 +58,14 @@ def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_
     reference.require("time_s")
     compared = pairs_of(estimate, reference)
     offset_s, residual = common_offset(compared.values())
-    scores = []
+    scorers = []
     for name, both in compared.items():
         most = max(len(estimate), len(reference))
         paths = estimate.path, reference.path
-        scorer = Scorer(name, paths, offset_s, window_of(from_s, to_s), most, both.empty)
-        scorer.add(both)
-        scores.append(scorer.score())
-    return Evaluation(scores, mismatches(estimate, reference, compared.values(), offset_s, residual))
+        scorers.append(Scorer(name, paths, offset_s, window_of(from_s, to_s), most, both.empty))
+        scorers[-1].add(both)
+    scores, without = scores_of(scorers)
+    return Evaluation(scores, mismatches(estimate, reference, compared.values(), offset_s, residual) + without)
 
 
 def window_of(from_s: float | None, to_s: float | None) -> Window:
@@ -82,7 +82,7 @@ def pairs_of(estimate: Table, reference: Table) -> dict[str, Compared]:
     known = {q: column for q in SCORED if (column := _reference_column(reference, q))}
     if not known:
         raise LinkposeError(
-            f"{reference.path} is no reference: it has {', '.join(reference.columns)}, "
+            f"{reference.path} is no reference: it has {listed(reference.columns)}, "
             f"and none of {', '.join(q.column for q in SCORED)}"
         )
     compared: dict[str, Compared] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError, TooFewRows
+from linkpose.errors import LinkposeError, NoEstimate, TooFewRows
 from linkpose.evaluation.errors import COMPONENTS, CommonStart, Drift, Errors, errors_of, scored
 from linkpose.evaluation.series import Pair, Series, is_sparser, paired
 from linkpose.evaluation.statistics import Collector, Statistics
@@ -87,6 +87,22 @@ def _details(unit: str, value: Statistics) -> dict[str, Any]:
     return details
 
 
+def scores_of(scorers: Iterable[Scorer]) -> tuple[list[Score], list[str]]:
+    """The scores of the filters that estimated something, and a sentence for each other one.
+
+    Raises NoEstimate if no filter did; otherwise as `Scorer.score`.
+    """
+    found, without = [], []
+    for scorer in scorers:
+        try:
+            found.append(scorer.score())
+        except NoEstimate as reason:
+            without.append(reason)
+    if not found:
+        raise without[0]
+    return found, [str(reason) for reason in without]
+
+
 class Scorer:
     """Collects the errors of one filter over consecutive stretches of time."""
 
@@ -118,10 +134,12 @@ class Scorer:
         self._share = 1.0  # instants for one stamp of the estimate
         self._counted_to_s = -np.inf
         self._common_s: tuple[float, float] | None = None
+        self._quantities: tuple[Quantity, ...] = ()
 
     def add(self, compared: Compared) -> None:
         """The next stretch of time."""
         both = compared.pairs
+        self._quantities = tuple(both)
         at = {q: paired(*pair, self._offset_s) for q, pair in both.items()}
         ours, theirs = ({q: values[side] for q, values in at.items()} for side in (0, 1))
         time_s = _instants(*next(iter(both.values())), self._offset_s)
@@ -137,8 +155,14 @@ class Scorer:
         self._collect(time_s, scored(time_s, errors, std, self._is_planar))
 
     def score(self) -> Score:
-        """Of all stretches. Raises LinkposeError where less than half of the filter's rows have a reference."""
+        """Of all stretches.
+
+        Raises NoEstimate for a filter whose columns are empty, TooFewRows where less than half of its rows have a
+        reference, LinkposeError where none has.
+        """
         found = {name: collector.statistics() for name, collector in self._collectors.items() if collector.rows}
+        if self._empty_stamps and not self._stamps:
+            raise NoEstimate(self._name, self._paths[0], [q.name for q in self._quantities])
         if not found or self._common_s is None:
             raise LinkposeError(
                 f"{self._paths[0]} and {self._paths[1]} have no instant in common for {self._name}: "

@@ -67,7 +67,7 @@ def path_of(name: str, label: str, track: Track, truth: Truth, heading_rad: Floa
         np.sqrt(np.sum(std[:, axes] ** 2, axis=1)),
         wrapped(turned),
         std[:, heading],
-        np.array(sorted(time_s for time_s, _ in track.rejected_ranges)),
+        np.array(sorted(time_s for time_s, _ in track.rejected_sightings)),
     )
 
 

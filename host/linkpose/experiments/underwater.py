@@ -50,11 +50,11 @@ class Detection:
     def add(self, run: UnderwaterRun, track: Track) -> None:
         """Counts one run."""
         ranges = sum(len(values) for values in run.ranges_m.values())
-        found = len(track.rejected_ranges & run.outliers)
+        found = len(track.rejected_sightings & run.outliers)
         self.injected += len(run.outliers)
         self.found += found
         self.good += ranges - len(run.outliers)
-        self.false_alarms += len(track.rejected_ranges) - found
+        self.false_alarms += len(track.rejected_sightings) - found
 
     def as_row(self) -> dict[str, object]:
         """The part of the JSON object that reports how well outliers were detected."""

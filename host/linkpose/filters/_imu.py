@@ -25,6 +25,8 @@ LONGEST_STEP_S = 0.025
 # s: without a usable rate for longer, the tilt of a moving link is unknown: it is aligned to gravity again. Doubled, a
 # swing of 1 s period is propagated with the wrong sign.
 LONGEST_BLIND_S = 0.3
+# s: identical readings for less than this are one reading of a slower sensor, held by the logger.
+LONGEST_HOLD_S = 0.1
 LONGEST_GAP_S = (
     2.0  # s: after a longer gap the attitude is unknown; doubled, an arbitrary attitude is propagated longer
 )

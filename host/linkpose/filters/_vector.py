@@ -15,6 +15,8 @@ from linkpose.compiling import inner
 Floats = NDArray[np.float64]
 Vec = tuple[float, float, float]
 Sym = tuple[float, float, float, float, float, float]
+# Of the rotation r: r (rad), and the factors of [r×] and [r×]² in exp(−[r×]) = I − sine [r×] + cosine [r×]².
+Turn = tuple[Vec, float, float]
 
 
 @inner
@@ -63,6 +65,12 @@ def apply(s: Sym, v: Vec) -> Vec:
 def plus_diagonal(s: Sym, value: float) -> Sym:
     """s + value · I"""
     return (s[0] + value, s[1], s[2], s[3] + value, s[4], s[5] + value)
+
+
+@inner
+def add_diagonal(s: Sym, v: Vec) -> Sym:
+    """S + diag(v)"""
+    return s[0] + v[0], s[1], s[2], s[3] + v[1], s[4], s[5] + v[2]
 
 
 @inner
@@ -185,8 +193,8 @@ def parallel(a: Sym, b: Sym, a_plus_b_inverse: Sym) -> Sym:
 
 
 @inner
-def turn_back(rotation: Vec, v: Vec) -> Vec:
-    """exp(−[rotation×]) v: a fixed vector, expressed in a frame that has turned by `rotation` (rad)."""
+def turn_of(rotation: Vec) -> Turn:
+    """The coefficients of exp(−[rotation×]), computed once for all that turns by this rotation (rad)."""
     square = dot(rotation, rotation)
     if square < 0.01:  # series: relative error below 1e-10
         sine = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0))
@@ -195,6 +203,13 @@ def turn_back(rotation: Vec, v: Vec) -> Vec:
         angle = math.sqrt(square)
         sine = math.sin(angle) / angle
         cosine = (1.0 - math.cos(angle)) / square
+    return rotation, sine, cosine
+
+
+@inner
+def turn_back(turn: Turn, v: Vec) -> Vec:
+    """exp(−[rotation×]) v: a fixed vector, expressed in a frame that has turned by the rotation."""
+    rotation, sine, cosine = turn
     first = cross(rotation, v)
     second = cross(rotation, first)
     return (

@@ -80,7 +80,7 @@ class JointFilter:
         self.state = TiltState.fresh()
         self._history = History.fresh()
         self._imu = ImuCalibration.of(rig.imu)
-        self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.largest_std_m
+        self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.std_of_axes_m
 
     @property
     def rejected(self) -> int:
@@ -160,7 +160,7 @@ def _process(
     samples: ImuSamples,
     imu: ImuCalibration,
     parameters: TiltParameters,
-    joint: tuple[Vec, float],
+    joint: tuple[Vec, Vec],
     state: TiltState,
     history: History,
     out: Floats,

@@ -66,6 +66,9 @@ class InertialParameters(NamedTuple):
     # Least residual of the constraint, as a share of ‖ω×d‖: the sampling error of a trapezoid at 100 Hz.
     least_residual: float = 0.0013
     first_residual: float = 0.03  # the same share before it has been measured
+    # Correlation time of what the constraint leaves over (s): 1/w of a swing of 0.8 Hz. Doubled, the tilt of a real
+    # pendulum is 1 % worse, that of `--smooth` 0.5 % better.
+    residual_correlation_s: float = 0.2
     residual_time_s: float = 4.0  # averaging time of its measurement (s): some swings
     # Play of the joint, bending of the link. At 1 mm/s the NEES of an uncalibrated height is 2.4, at 2.5 mm/s 1.4.
     velocity_floor_m_s: float = 0.0025

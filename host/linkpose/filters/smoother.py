@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.filters.inertial.process import LONGEST_HOLD_S
+from linkpose.filters._imu import LONGEST_HOLD_S
 from linkpose.filters.inertial.state import roll_pitch
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats, Measurements

@@ -17,10 +17,10 @@ the error of the accelerometer. An equal accelerometer error perpendicular to Z 
 error m of a calibrated accelerometer (r and m in g), the variances beyond P are
 
     σ² = ½ (‖r‖² + (r·Z)²) + m²                          about each axis perpendicular to Z
-    std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)² + σ_d²           of the height Zᵀd
+    std² = dᵀPd + σ² ‖d×Z‖² + 2σ⁴ (d·Z)² + Σ Z_i² σ_d,i²   of the height Zᵀd
 
-where 2σ⁴ is the second-order term (1 − cos) of an upright link and σ_d the standard deviation of d = J2S, the vector
-from the joint centre to the sensor. They change the standard deviation only, never the estimate.
+where 2σ⁴ is the second-order term (1 − cos) of an upright link and σ_d,i the standard deviation of d = J2S, the vector
+from the joint centre to the sensor, along axis i. They change the standard deviation only, never the estimate.
 
 Sources: [Link], equations (2)-(8); J. K. Lee, E. J. Park, S. N. Robinovitch, "Estimation of attitude and external
 acceleration using inertial sensor measurement during various dynamic conditions", IEEE Trans. Instrum. Meas. 61(8),
@@ -117,7 +117,7 @@ class TiltFilter:
         self.state = TiltState.fresh()
         self._imu = ImuCalibration.of(rig.imu)
         self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
-        self._j2s_std = rig.joint.largest_std_m
+        self._j2s_std = rig.joint.std_of_axes_m
 
     @property
     def rejected(self) -> int:
@@ -147,11 +147,12 @@ def predict(now: Registers, time_s: float, step_s: float, rate: Vec, held_s: flo
     """(5) over `step_s`, from the rates at its ends; the last of them has been held for `held_s`."""
     half, before = 0.5 * step_s, now.rate
     rotation = (half * (rate[0] + before[0]), half * (rate[1] + before[1]), half * (rate[2] + before[2]))
-    tilt = vec.turn_back(rotation, now.tilt)
+    turn = vec.turn_of(rotation)
+    tilt = vec.turn_back(turn, now.tilt)
     covariance = vec.turn_back_sym(rotation, now.covariance)
     covariance = vec.add(covariance, rotation_variance(step_s, held_s, imu), vec.cross_square(tilt, 1.0))
     span = min(now.residual.span + step_s, _RESIDUAL_S)
-    residual = MeanResidual(vec.turn_back(rotation, now.residual.mean), span, step_s / span)
+    residual = MeanResidual(vec.turn_back(turn, now.residual.mean), span, step_s / span)
     return Registers(time_s, rate, held_s, tilt, covariance, now.accel, residual)
 
 
@@ -215,13 +216,14 @@ def average_accel(now: Registers) -> Registers:
 
 
 @inner
-def height_std(now: Registers, j2s: Vec, j2s_std: float) -> float:
+def height_std(now: Registers, j2s: Vec, j2s_std: Vec) -> float:
     """Standard deviation of the height (m) from P, the low-frequency residual and J2S: std in the module docstring."""
     mean, z = now.residual.mean, now.tilt
     along, height = vec.dot(mean, z), vec.dot(z, j2s)
     variance = 0.5 * (vec.dot(mean, mean) + along * along) + (_ACCEL_ERROR_M_S2 / GRAVITY) ** 2
     beyond = variance * (vec.dot(j2s, j2s) + (2.0 * variance - 1.0) * height * height)
-    return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0) + j2s_std * j2s_std)
+    lever = (z[0] * j2s_std[0], z[1] * j2s_std[1], z[2] * j2s_std[2])
+    return math.sqrt(max(vec.quadratic(now.covariance, j2s) + beyond, 0.0) + vec.dot(lever, lever))
 
 
 @inner
@@ -239,7 +241,7 @@ def describe(now: Registers, delay_s: float, j2s: Vec) -> Vec:
     """
     tilt = now.tilt
     if delay_s > 0.0:
-        tilt = vec.turn_back(vec.scale(delay_s, now.rate), tilt)
+        tilt = vec.turn_back(vec.turn_of(vec.scale(delay_s, now.rate)), tilt)
     roll, pitch = vec.roll_pitch(tilt)
     return vec.dot(tilt, j2s), roll, pitch
 
@@ -304,7 +306,7 @@ def _process(
     imu: ImuCalibration,
     parameters: TiltParameters,
     j2s: Vec,
-    j2s_std: float,
+    j2s_std: Vec,
     state: TiltState,
     out: Floats,
 ) -> None:

@@ -23,7 +23,9 @@ from linkpose.filters.inertial.state import (
     BG,
     ESTIMATE,
     HEIGHT,
+    PITCH,
     ROLL,
+    SIGMA,
     YAW,
     Floats,
     SensorErrors,
@@ -42,6 +44,13 @@ _LARGEST_DISTANCE = 150.0
 PARAMETERS = InertialParameters(
     has_joint=0.0, gyro_bias_walk_rad_s=3e-4, gyro_misfit=0.002, accel_misfit=0.01, largest_bias_rad_s=0.5
 )
+
+
+_WIDTH = ESTIMATE.itemsize // 8
+# Of ESTIMATE's values and σ, in the order of the columns below; their largest value, and their unit.
+_COLUMNS = np.array([HEIGHT, SIGMA + HEIGHT, ROLL, PITCH, SIGMA + ROLL, SIGMA + PITCH, YAW, SIGMA + YAW])
+_MOST = np.where(_COLUMNS > SIGMA, np.pi, np.inf)
+_UNITS = np.where(np.isin(_COLUMNS, [HEIGHT, SIGMA + HEIGHT]), 1.0, 180.0 / np.pi)
 
 
 class TiltInertialFilter:
@@ -91,13 +100,11 @@ class TiltInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
-        estimates, table = np.empty(len(block), ESTIMATE), np.empty((len(block), 8))
+        estimates = np.empty(len(block), ESTIMATE)
         process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
-        values, stds = estimates["value"], np.minimum(estimates["std"], np.pi)
-        height, height_std = values[:, HEIGHT], estimates["std"][:, HEIGHT]
-        table[:, 0], table[:, 1] = (height, height_std) if self._has_height else (np.nan, np.nan)
-        np.degrees(values[:, ROLL:YAW], out=table[:, 2:4])
-        np.degrees(stds[:, ROLL:YAW], out=table[:, 4:6])
-        np.degrees(values[:, YAW], out=table[:, 6])
-        np.degrees(stds[:, YAW], out=table[:, 7])
+        table: Floats = estimates.view(np.float64).reshape(len(block), _WIDTH).take(_COLUMNS, axis=1)
+        np.minimum(table, _MOST, out=table)
+        table *= _UNITS
+        if not self._has_height:
+            table[:, :2] = np.nan
         return table

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from linkpose.errors import LinkposeError
+from linkpose.inputs import read_bytes
 from linkpose.wire.messages import PROTOCOL_MAJOR, SCHEMA_CRC, VERSION
 
 PREBUILT = Path(__file__).with_name("firmware.hex")
@@ -65,9 +66,7 @@ def read_image(path: Path) -> Image:
     record), too large for the UNO, or not the firmware of this linkpose.
     """
     try:
-        text = path.read_text(encoding="ascii")
-    except OSError as error:
-        raise LinkposeError(f"cannot read the firmware {path}: {error.strerror}; nothing was written") from error
+        text = read_bytes(path, "the firmware").decode("ascii")
     except UnicodeDecodeError as error:
         raise LinkposeError(f"{path} is not an Intel HEX file; nothing was written") from error
     data = _parse(path, text)

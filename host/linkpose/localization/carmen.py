@@ -14,15 +14,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import Event, Log, LogFile, Scan, count, in_order, read_number
+from linkpose.localization.events import Event, Log, LogFile, Scan, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
+from linkpose.presentation import counted
 
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams
@@ -50,21 +52,17 @@ class Reading:
     line: int = 0
 
 
-def is_carmen(path: Path) -> bool:
-    """Whether a file's first line that is no comment begins with a CARMEN keyword or another log's parameter line."""
-    try:
-        with path.open(encoding="latin-1") as file:
-            for text in itertools.islice(file, HEAD_LINES):
-                words = text[:LONGEST_HEAD].split(maxsplit=1)
-                if words and not text.startswith("#"):
-                    return words[0].isascii() and words[0].isupper() and "," not in text
-    except OSError as error:
-        raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
+def is_carmen(lines: Sequence[str]) -> bool:
+    """Whether the first line that is no comment begins with a CARMEN keyword or another log's parameter line."""
+    for text in lines[:HEAD_LINES]:
+        words = text[:LONGEST_HEAD].split(maxsplit=1)
+        if words and not text.startswith("#"):
+            return words[0].isascii() and words[0].isupper() and "," not in text
     return False
 
 
-def read_carmen(path: Path) -> LogFile:
-    """Reads a log into events in order of time, with the odometry's first pose as `start`.
+def read_carmen(path: Path, lines: Sequence[str]) -> LogFile:
+    """The log in the lines of a file, in order of time, with the odometry's first pose as `start`.
 
     Lines of other sensors are passed over. Lines that are not in order of time are sorted, lines without a time (0) and
     a last line that is cut short are left out; `remarks` has the counts. Raises LinkposeError with file, line and cure
@@ -72,30 +70,26 @@ def read_carmen(path: Path) -> LogFile:
     """
     readings: list[Reading] = []
     remarks: list[str] = []
-    try:
-        with path.open(encoding="latin-1") as file:  # parameter lines of public logs hold Latin-1
-            for number, text in enumerate(file, 1):
-                words = text.split()
-                if words and words[0] in KEYWORDS:
-                    try:
-                        readings.append(_read_line(path, number, words))
-                    except LinkposeError:
-                        if text.endswith("\n"):
-                            raise
-                        remarks.append(f"{path}: the last line is cut short and left out")
-    except OSError as error:
-        raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
+    for number, text in enumerate(lines, 1):
+        words = text.split()
+        if words and words[0] in KEYWORDS:
+            try:
+                readings.append(_read_line(path, number, words))
+            except LinkposeError:
+                if number < len(lines):
+                    raise
+                remarks.append(f"{path}: the last line is cut short and left out")
     timed = _timed(readings)
     if not timed:
         raise LinkposeError(
             f"{path} holds no {', '.join(KEYWORDS[:-1])} or {KEYWORDS[-1]} lines; give a CARMEN log or a CSV log"
         )
     if len(timed) < len(readings):
-        remarks.append(f"{path}: {count(len(readings) - len(timed), 'line')} without a time left out")
+        remarks.append(f"{path}: {counted(len(readings) - len(timed), 'line')} without a time left out")
     ordered, moved = in_order(timed)
     if moved:
-        remarks.append(f"{path}: {count(moved, 'line')} moved into the order of time")
-    return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks))
+        remarks.append(f"{path}: {counted(moved, 'line')} moved into the order of time")
+    return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks), is_carmen=True)
 
 
 def _timed(readings: list[Reading]) -> list[Reading]:
@@ -208,7 +202,7 @@ class _Words:
         value = self.number(index)
         if value < 0 or not value.is_integer():
             raise LinkposeError(
-                f"{self.path} line {self.line}: {self.words[index]!r} is no number of readings; "
+                f"{self.path} line {self.line}: {self.words[index][:60]!r} is no number of readings; "
                 "correct or delete the line"
             )
         return int(value)

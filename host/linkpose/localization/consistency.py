@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from linkpose.localization.gate import chi_square_quantile
+from linkpose.presentation import counted
 
 FEWEST = 20  # innovations of a sensor below which there is no verdict
 # The stated noise is called too small or too large beyond this factor. The median of 100 innovations scatters by 15 %.
@@ -41,7 +42,7 @@ class Verdict:
         """The verdict in words."""
         name = NAMES.get(self.sensor.split(":")[0], self.sensor)
         if self.count < FEWEST:
-            return f"{name} noise: only {self.count} measurements, no verdict"
+            return f"{name} noise: only {counted(self.count, 'measurement')}, no verdict"
         if self.noise_factor > FACTOR:
             return f"{name} noise is set {self.noise_factor:.1f} times too small"
         if self.noise_factor < LEAST_FACTOR:

@@ -7,13 +7,14 @@ import itertools
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol, TypeVar
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
+from linkpose.presentation import counted
 from linkpose.recording.csvfile import create, write_all
 
 HEADER = ("time_s", "kind", "a", "b", "c")
@@ -69,16 +70,15 @@ Timed = TypeVar("Timed", bound=_Timed)
 
 @dataclass(frozen=True, slots=True)
 class LogFile:
-    """A log as read from a file: its events, the start that it states (x m, y m, heading rad), and what was changed."""
+    """A log as read from a file: its events, the start that it states (x m, y m, heading rad), and what was changed.
+
+    `is_carmen`: the file is a CARMEN log, whose units are defined.
+    """
 
     events: Log
     start: tuple[float, float, float] | None
     remarks: tuple[str, ...]
-
-
-def count(number: int, noun: str) -> str:
-    """1 line, 2 lines."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+    is_carmen: bool = False
 
 
 def in_order(items: list[Timed]) -> tuple[list[Timed], int]:
@@ -90,19 +90,11 @@ def in_order(items: list[Timed]) -> tuple[list[Timed], int]:
     return (sorted(items, key=lambda item: item.time_s) if moved else items), moved
 
 
-def read_events(path: Path) -> LogFile:
-    """Reads a CSV log. Rows that are not in order of time are sorted, negative ranges are left
-    out; `remarks` has the counts. Raises LinkposeError with file, line and cure for whatever cannot be a measurement.
+def read_events(path: Path, lines: Sequence[str]) -> LogFile:
+    """The log in the lines of a CSV file. Rows that are not in order of time are sorted, negative ranges are left out;
+    `remarks` has the counts. Raises LinkposeError with file, line and cure for whatever cannot be a measurement.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            events = list(stream_events(file, path))
-    except UnicodeDecodeError as error:
-        raise LinkposeError(
-            f"{path} is not a CSV file: {error}; give a log with the header {','.join(HEADER)}"
-        ) from error
-    except OSError as error:
-        raise LinkposeError(f"cannot read the log {path}: {error.strerror}") from error
+    events = list(stream_events(lines, path))
     kept = [event for event in events if not is_negative(event)]
     if not kept:
         raise LinkposeError(
@@ -110,10 +102,10 @@ def read_events(path: Path) -> LogFile:
         )
     remarks = []
     if len(kept) < len(events):
-        remarks.append(f"{path}: {count(len(events) - len(kept), 'negative range')} left out")
+        remarks.append(f"{path}: {counted(len(events) - len(kept), 'negative range')} left out")
     ordered, moved = in_order(kept)
     if moved:
-        remarks.append(f"{path}: {count(moved, 'row')} moved into the order of time")
+        remarks.append(f"{path}: {counted(moved, 'row')} moved into the order of time")
     return LogFile(list(ordered), None, tuple(remarks))
 
 
@@ -126,18 +118,19 @@ def stream_events(lines: Iterable[str], path: Path) -> Iterator[Event]:
     lines = iter(lines)
     head: list[str] = []
     for text in lines:  # up to the header, which shows the separator
+        if text.lower().startswith("sep="):  # Excel's own first line
+            text = "\n"
         head.append(text)
         if text.strip() and not text.lstrip('"').startswith("#"):
             break
     separator = max((",", ";", "\t"), key=head[-1].count) if head else ","
+    numbers = _Numbers(path, separator != ",")
     try:
         for line, row in enumerate(csv.reader(itertools.chain(head, lines), delimiter=separator), 1):
             if not row or not "".join(row).strip() or row[0].startswith("#"):
                 continue
-            if separator != ",":  # decimal commas
-                row = [cell.replace(",", ".") for cell in row]
             if header_seen:
-                yield _read_row(path, line, row)
+                yield _read_row(path, line, row, numbers)
             else:
                 _check_header(path, line, row)
                 header_seen = True
@@ -176,18 +169,41 @@ def _check_header(path: Path, line: int, row: list[str]) -> None:
         )
 
 
-def _read_row(path: Path, line: int, row: list[str]) -> Event:
+@dataclass(slots=True)
+class _Numbers:
+    """Reads the numbers of one log, in which either all decimal marks are commas or none is."""
+
+    path: Path
+    may_have_commas: bool  # commas do not separate the cells
+    comma: str = ""  # the first number with a comma, and the first with a point
+    point: str = ""
+
+    def read(self, cell: str, line: int) -> float:
+        """A finite number. Raises LinkposeError with file and line for anything else."""
+        if not self.may_have_commas:
+            return read_number(cell, self.path, line)
+        self.comma = self.comma or (cell if "," in cell else "")
+        self.point = self.point or (cell if "." in cell else "")
+        if self.comma and self.point:
+            raise LinkposeError(
+                f"{self.path} line {line}: {self.comma[:30]!r} and {self.point[:30]!r} can be read in two ways; "
+                "save the log with one decimal mark and without separators of thousands"
+            )
+        return read_number(cell.replace(",", "."), self.path, line)
+
+
+def _read_row(path: Path, line: int, row: list[str], numbers: _Numbers) -> Event:
     kind = row[1].strip() if len(row) > 1 else ""
     if kind not in KINDS:
-        found = f"unknown kind {kind!r}" if kind else "the row is cut short"
+        found = f"unknown kind {kind[:60]!r}" if kind else "the row is cut short"
         raise LinkposeError(f"{path} line {line}: {found}; known kinds are {', '.join(KINDS)}")
     fields = KINDS[kind]
     cells = [cell.strip() for cell in row[2 : 2 + len(fields)]]
     if len(cells) < len(fields) or "" in cells:
         raise LinkposeError(f"{path} line {line}: {kind} needs {', '.join(fields)}; complete or delete the row")
     beacon = beacon_name(cells.pop(0)) if kind in NAMED else ""
-    values = tuple(read_number(cell, path, line) for cell in cells)
-    return Event(read_number(row[0], path, line), kind, values, beacon, line)
+    time_s = numbers.read(row[0].strip(), line)
+    return Event(time_s, kind, tuple(numbers.read(cell, line) for cell in cells), beacon, line)
 
 
 def beacon_name(cell: str) -> str:
@@ -204,5 +220,5 @@ def read_number(cell: str, path: Path, line: int) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise LinkposeError(f"{path} line {line}: {cell.strip()!r} is not a number; correct or delete the row")
+        raise LinkposeError(f"{path} line {line}: {cell.strip()[:60]!r} is not a number; correct or delete the row")
     return value

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError, NotPositiveDefinite
 from linkpose.localization import models
+from linkpose.localization.drift import drift
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
@@ -82,6 +83,7 @@ class KalmanFilter:
     gate: float | None = None
     transform: Transform = field(default_factory=Transform)
     grid: GridMap = field(default_factory=no_map)
+    drifts: Floats | None = None  # (n, 2) as in `drift`; None: no state drifts
     d2: Floats = field(init=False, default_factory=lambda: np.empty(0))  # νᵀ S⁻¹ ν of the last step's blocks
     _angle_rows: dict[tuple[tuple[bool, ...], int], Bools] = field(init=False, default_factory=dict)
 
@@ -101,6 +103,8 @@ class KalmanFilter:
         root = self.noise_root
         if interval_s > 0.0:
             root = root * np.sqrt(hold_s / interval_s)[:, np.newaxis]
+            if self.drifts is not None:
+                drift(Gaussian(self.state, self.covariance), interval_s, self.drifts)
         if measurement is None:
             measurement = _NOTHING
         blocks = len(measurement.values) // measurement.block

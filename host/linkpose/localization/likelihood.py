@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
+from linkpose.localization.drift import drift
 from linkpose.localization.ekf import ekf_predict, ekf_step
 from linkpose.localization.grid import GridMap
 from linkpose.localization.linalg import Floats, add_to, product, product_transposed, subtract_from
@@ -24,7 +25,7 @@ class Rows(NamedTuple):
     """A log as arrays; row k moves the state for `intervals_s[k]` and then corrects it with a measurement or nothing.
 
     `controls` (N, c) act over the interval and their noises hold for `holds_s` (N, q). `sizes` (N,) counts the rows of
-    each measurement, 0 to 3, whose `values` are (N, 3) and whose model's `parameters` are (N, 3, 6). `is_angle`
+    each measurement, 0 to 3, whose `values` are (N, 3) and whose model's `parameters` are (N, 3, 7). `is_angle`
     (N, n + 3) is as in `Correction`. Rows with `is_direct` read states; rows with `counts` enter the likelihood.
     """
 
@@ -47,6 +48,7 @@ def run_filter(
     noise_root: Floats,
     rows: Rows,
     variances: Floats,
+    drifts: Floats,
     thresholds: Floats,
     grid: GridMap,
     innovations: Floats,
@@ -55,8 +57,8 @@ def run_filter(
     where the covariance ceases to be positive definite.
 
     Changes `estimate` and fills `innovations` (N, 2) with ν_i / √S_ii. `motion` is the motion model's number,
-    `noise_root` (q, q) the lower Cholesky factor of Q, `variances` (N, 3) the diagonal of R, and `thresholds` (3,) the
-    gate for a measurement of one, two and three rows.
+    `noise_root` (q, q) the lower Cholesky factor of Q, `variances` (N, 3) the diagonal of R, `drifts` (n, 2) as in
+    `drift`, and `thresholds` (3,) the gate for a measurement of one, two and three rows.
     """
     q = noise_root.shape[0]
     root, d2, total = np.empty((q, q)), np.empty(1), 0.0
@@ -67,6 +69,7 @@ def run_filter(
                 for j in range(q):
                     root[i, j] = noise_root[i, j] * math.sqrt(rows.holds_s[k, i] / interval)
             ekf_predict(estimate, Prediction(motion, rows.controls[k], root, interval))
+            drift(estimate, interval, drifts)
         m = rows.sizes[k]
         if m == 0:
             continue

@@ -15,10 +15,10 @@ from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
 from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.measuring import Sensors, constant_states, thesis_beams
+from linkpose.localization.measuring import Sensors, constant_states, drift_state, thesis_beams
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.relocation import Relocator
-from linkpose.localization.settings import Pose, Settings
+from linkpose.localization.settings import DRIFT, Pose, Settings
 from linkpose.localization.smoother import History
 from linkpose.localization.tables import Beacons
 from linkpose.localization.track import Track
@@ -27,6 +27,7 @@ from linkpose.localization.vehicle import (
     DIVING,
     at_their_height,
     control_holds,
+    drifts_of,
     first_pose,
     kinds_of,
     noise_root,
@@ -135,7 +136,8 @@ class Localizer:
         if self.vehicle is CONSTANT_VELOCITY:
             beacons = at_their_height(beacons)
         self.control_kind = CONTROLS.get(self.vehicle.model, "")
-        motion = self.vehicle.extended(constant_states(settings.estimate, list(beacons)))
+        drifting = [drift_state(beacon) for beacon in beacons] if settings.drift_std_m else []
+        motion = self.vehicle.extended((*constant_states(settings.estimate, list(beacons)), *drifting))
         self.prior = first_pose(head) if settings.start is None else None
         start = settings.start if self.prior is None else _pose_of(self.prior)
         if start is None and self.vehicle is CONSTANT_VELOCITY:
@@ -152,6 +154,7 @@ class Localizer:
             settings.gate,
             settings.transform,
             grid or no_map(),
+            drifts_of(settings, motion),
         )
         self.sensors = Sensors(settings, motion, beacons)
         self.control, self.hold = np.zeros(motion.controls), np.ones(motion.noises)
@@ -159,7 +162,7 @@ class Localizer:
         self.last_control_s: float | None = None
         self.lately_rejected: dict[str, deque[bool]] = {}
         self.applied = self.rejected = self.widened = self.relocated = 0
-        self.rejected_ranges: set[tuple[float, str]] = set()
+        self.rejected_sightings: set[tuple[float, str]] = set()
         self.consistency = Consistency()
         self.relocator = Relocator(motion, self.sensors) if beacons else None
         self.is_replaced = False  # by the last measurement
@@ -208,9 +211,20 @@ class Localizer:
             self.history.correct(self.filter, self.known, self.is_replaced)
         return self._row()
 
+    def use(self, settings: Settings) -> None:
+        """Continues with other noises; what is estimated stays the same."""
+        self.settings = self.sensors.settings = settings
+        self.filter.noise_root = noise_root(settings, self.vehicle)
+        self.filter.drifts = drifts_of(settings, self.filter.motion)
+
     def track(self, rows: Sequence[Row]) -> Track:
-        """The path of all rows, with the counts so far. Raises LinkposeError for an estimate that is infinite."""
-        state = np.array([row.state for row in rows])
+        """The path of all rows, with the counts so far, without the drifts of the ranges.
+
+        Raises LinkposeError for an estimate that is infinite.
+        """
+        states = self.filter.motion.states
+        size = sum(not name.startswith(DRIFT) for name in states)  # drifts come last
+        state = np.array([row.state[:size] for row in rows])
         time = np.array([row.time_s for row in rows])
         lost = np.flatnonzero(np.isinf(state).any(axis=1))
         if len(lost):
@@ -219,13 +233,13 @@ class Localizer:
                 "correct the odometry or velocity before it"
             )
         return Track(
-            self.filter.motion.states,
+            states[:size],
             time,
             state,
-            np.array([row.covariance for row in rows]),
+            np.array([row.covariance[:size, :size] for row in rows]),
             self.applied,
             self.rejected,
-            frozenset(self.rejected_ranges),
+            frozenset(self.rejected_sightings),
             self.widened,
             self.relocated,
             self.consistency,
@@ -247,6 +261,8 @@ class Localizer:
             state[:] = np.inf
         elif self.laser:
             self.laser.add_map_error(self.filter, covariance)
+        elif self.filter.drifts is not None:
+            covariance[[0, 1], [0, 1]] += self.settings.drift_std_m**2
         return Row(time_s, state, covariance)
 
     def steer(self, event: Event, hold_s: float | None) -> None:
@@ -305,9 +321,11 @@ class Localizer:
             self.consistency.add(kind, block, float(d2))
             if isinstance(event, Event) and event.beacon:
                 self.consistency.add(f"{kind}:{event.beacon}", block, float(d2))
-        if kind == "range":
+        if kind in NAMED:
             rejected = [event for event, fits in zip(events, passed, strict=True) if not fits]
-            self.rejected_ranges.update((event.time_s, event.beacon) for event in rejected if isinstance(event, Event))
+            self.rejected_sightings.update(
+                (event.time_s, event.beacon) for event in rejected if isinstance(event, Event)
+            )
         lately = self.lately_rejected.setdefault(kind, deque(maxlen=PATIENCE))
         lately.append(2 * good <= len(passed))
         if len(lately) == PATIENCE and 2 * sum(lately) > PATIENCE:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError
+from linkpose.inputs import open_binary
 from linkpose.localization.grid import FREE, OCCUPIED, UNKNOWN, GridMap
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             return node
 
     try:
-        with path.open("rb") as file:
+        with open_binary(path, "the map") as file:
             data = file.read(MAX_YAML_BYTES + 1)
         if len(data) > MAX_YAML_BYTES:
             raise LinkposeError(

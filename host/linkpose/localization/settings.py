@@ -15,6 +15,7 @@ CONSTANTS = {"scale": ("range_scale_error", "", 0.1), "bias": ("range_bias", "_m
 # How long the error of a range, or of a range with bearing, persists (s): a camera repeats its error of a landmark,
 # with a lag-one correlation of 0.5 to 0.95 in the public log MRCLAM 7; radio ranges of Plaza 1 are independent.
 ERROR_TIME_S = {"range": 0.0, "bearing_range": 0.5}
+DRIFT = "range_drift"  # begins the name of a state with the drifting error of one beacon's ranges
 ESTIMATED = ("scale", "bias", "scale:each", "bias:each")
 
 
@@ -26,7 +27,10 @@ class Settings:
     sample on each axis; each holds until the next sample. `acceleration_std_m_s2` drives the constant-velocity model of
     a log without odometry, on each axis. `start` is the pose at the log's start, with `start_std` (m, rad); without it
     the filter searches for the pose. `estimate` names constants of the range sensor, for all beacons together or, with
-    `:each`, for each beacon.
+    `:each`, for each beacon. `error_time_s` is how long the error of a sighting persists; None: as ERROR_TIME_S.
+
+    With `drift_std_m` above 0, the ranges of each beacon have an error of this standard deviation that persists for
+    `drift_time_s` (a first-order Gauss-Markov process). It is estimated beside the pose.
     """
 
     ranges: RangeNoise = field(default_factory=RangeNoise)
@@ -48,3 +52,5 @@ class Settings:
     particles: int = 2000
     seed: int = 0
     error_time_s: float | None = None
+    drift_std_m: float = 0.0
+    drift_time_s: float = 10.0

@@ -42,6 +42,8 @@ class History:
             slopes = np.zeros((n, n))
             by_noise = np.zeros((n, len(run.noise_root)))
             models.motion_jacobians(run.motion.model, run.state, control, interval_s, slopes, by_noise)
+            if run.drifts is not None:
+                slopes *= np.exp(-run.drifts[:, :1] * interval_s)
             run.step(interval_s, control, hold_s)
         state, covariance = run.state.copy(), run.covariance.copy()
         self.steps.append(_Step(slopes, state, covariance, state, covariance))

@@ -1,44 +1,150 @@
-"""Localises from a stream of rows as they come, for `linkpose localize -`."""
+"""Localizes from a stream of rows as they come, for `linkpose localize -`."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import Event, is_negative, stream_events
+from linkpose.localization.events import NAMED, Event, Log, is_negative, stream_events
 from linkpose.localization.localizer import Localizer, Method, Row, check
+from linkpose.localization.measuring import default_constants
+from linkpose.localization.plausibility import check_units
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons
+from linkpose.localization.tuning import described, tune
+from linkpose.localization.vehicle import kinds_of
+from linkpose.presentation import counted
 
+ORIGIN = "standard input"
 # The beginning of the stream from which the motion model and the start follow (s of the log, and rows at the most).
 # Longer delays the first pose; shorter may miss a slow sensor.
 HEAD_S, HEAD_ROWS = 1.0, 500
+# After so many ranges and bearings the noises are estimated from the rows so far, and in use this much later: a fixed
+# number, so that the same rows give the same poses however fast they come. The estimate takes up to 3 s.
+TUNED_AFTER, USED_AFTER = (100, 300, 1200), 1.5
+UNITS_CHECKED_AFTER = (20, 200)  # rows: a median needs some
 
 
-def localize_stream(
-    lines: Iterable[str], method: Method, settings: Settings, beacons: Beacons
-) -> Iterator[tuple[tuple[str, ...], Row]]:
-    """Yields the names of the states and the estimate after each row, as soon as the head of the stream is read.
+class Stream:
+    """One pass of rows through a filter. `run` is None until the head of the stream is complete."""
 
-    Negative ranges, and rows older than the one before, are left out. Raises LinkposeError for what cannot be a
-    measurement, as `localize` does.
-    """
-    events = (event for event in stream_events(lines, Path("-")) if not is_negative(event))
-    head: list[Event] = []
-    for event in events:
-        head.append(event)
-        if event.time_s >= head[0].time_s + HEAD_S or len(head) >= HEAD_ROWS:
-            break
-    if not head:
-        raise LinkposeError("standard input holds no measurements; send the header time_s,kind,a,b,c and rows")
-    head.sort(key=lambda event: event.time_s)
-    check(list(head), method, settings, None, beacons, "standard input")
-    run = Localizer(list(head), method, settings, None, beacons)
-    for event in itertools.chain(head, events):
-        if event.time_s < run.now:
-            continue
-        if event.beacon and event.beacon not in beacons:
-            raise LinkposeError(f"standard input line {event.line}: beacon {event.beacon} is not in the beacon file")
-        yield run.filter.motion.states, run.feed([event])
+    def __init__(
+        self,
+        method: Method,
+        settings: Settings,
+        beacons: Beacons,
+        free: tuple[str, ...],
+        constants: bool,
+        report: Callable[[str], None],
+    ) -> None:
+        """`free` names the noises that are estimated from the rows; with `constants`, the constants of the ranges that
+        the beacons determine are estimated too. `report` receives a line when other noises are in use.
+        """
+        self.report = report
+        # States cannot be added to a filter under way: errors that drift have a correlation time only.
+        self.free = tuple(name for name in free if name != "drift")
+        self.method, self.settings, self.beacons = method, settings, beacons
+        self.constants = constants
+        self.run: Localizer | None = None
+        self.late = self.negative = 0
+        self.is_cut = False
+        self._rows: Log = []  # for the noises
+        self._sightings = 0
+        self._tuning: Future[Settings] | None = None
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states; empty until the head of the stream is complete."""
+        return self.run.filter.motion.states if self.run else ()
+
+    def rows(self, lines: Iterable[str]) -> Iterator[Row]:
+        """The estimate after each row, as soon as the head of the stream is read.
+
+        Negative ranges, rows older than the one before, and a last row that is cut short are left out and counted.
+        Raises LinkposeError for what cannot be a measurement, as `localize` does.
+        """
+        events = self._valid(lines)
+        head: list[Event] = []
+        for event in events:
+            head.append(event)
+            if event.time_s >= head[0].time_s + HEAD_S or len(head) >= HEAD_ROWS:
+                break
+        if not head:
+            raise LinkposeError(f"{ORIGIN} holds no measurements; send the header time_s,kind,a,b,c and rows")
+        head.sort(key=lambda event: event.time_s)
+        self.run = self._start(list(head))
+        with ThreadPoolExecutor(1) as pool:
+            for event in itertools.chain(head, events):
+                if event.time_s < self.run.now:
+                    self.late += 1
+                    continue
+                self._tune(self.run, event, pool)
+                yield self.run.feed([event])
+        if len(self._rows) < max(UNITS_CHECKED_AFTER):
+            check_units(self._rows, self.beacons, ORIGIN)
+
+    def remarks(self) -> list[str]:
+        """What was left out, with counts."""
+        found = [counted(self.negative, "negative range") + " left out"] if self.negative else []
+        if self.late:
+            found.append(counted(self.late, "row") + " older than the one before left out")
+        return found + (["the last row is cut short and left out"] if self.is_cut else [])
+
+    def _valid(self, lines: Iterable[str]) -> Iterator[Event]:
+        """The measurements of the lines."""
+        ended = _Ended()
+        try:
+            for event in stream_events(ended.watch(lines), Path("-")):
+                if event.beacon and event.beacon not in self.beacons:
+                    raise LinkposeError(f"{ORIGIN} line {event.line}: beacon {event.beacon} is not in the beacon file")
+                if is_negative(event):
+                    self.negative += 1
+                else:
+                    yield event
+        except LinkposeError:
+            if not ended.within_a_line:
+                raise
+            self.is_cut = True
+
+    def _start(self, head: Log) -> Localizer:
+        kinds = kinds_of(head)
+        if self.constants and not self.settings.estimate and "bearing_range" not in kinds:
+            self.settings = replace(self.settings, estimate=default_constants(kinds, len(self.beacons)))
+        check(head, self.method, self.settings, None, self.beacons, ORIGIN)
+        return Localizer(head, self.method, self.settings, None, self.beacons)
+
+    def _tune(self, run: Localizer, event: Event, pool: ThreadPoolExecutor) -> None:
+        """Checks the units of the first rows, and estimates the noises from them in another thread."""
+        if self._sightings > USED_AFTER * TUNED_AFTER[-1]:
+            return
+        self._rows.append(event)
+        if len(self._rows) in UNITS_CHECKED_AFTER:
+            check_units(self._rows, self.beacons, ORIGIN)
+        if event.kind not in NAMED:
+            return
+        self._sightings += 1
+        if self.free and self._sightings in TUNED_AFTER:
+            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self.free)
+        elif self._tuning is not None and self._sightings in [int(USED_AFTER * after) for after in TUNED_AFTER]:
+            tuned = self._tuning.result()
+            run.use(tuned)
+            self.report(f"noises estimated from the rows until {event.time_s:.6g} s: {described(tuned, self._rows)}")
+            self._tuning = None
+        if self._sightings > USED_AFTER * TUNED_AFTER[-1]:
+            self._rows.clear()
+
+
+class _Ended:
+    """Whether the lines of a stream ended within a line."""
+
+    within_a_line = False
+
+    def watch(self, lines: Iterable[str]) -> Iterator[str]:
+        """The lines."""
+        for line in lines:
+            self.within_a_line = not line.endswith("\n")
+            yield line

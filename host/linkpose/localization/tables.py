@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.inputs import read_bytes
 from linkpose.localization.events import beacon_name, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.track import Track
-from linkpose.recording.chunks import read_bytes
 from linkpose.recording.delimited import split_cells, to_utf8
 from linkpose.recording.table import Table, read_table
 

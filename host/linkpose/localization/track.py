@@ -16,10 +16,10 @@ class Track:
     """A row for each instant with a measurement.
 
     `state` (N, n) in the order of `names`, `covariance` (N, n, n); NaN while the pose is not known yet. `applied` and
-    `rejected` count measurements: a range, a beam, a landmark, a depth, an attitude. `rejected_ranges` holds time and
-    beacon of each range outside the gate. `widened` counts how often the standard deviations of the pose were raised
-    because most measurements were rejected, `relocated` how often the pose was found anew. `consistency` holds the
-    normalised innovations squared by sensor.
+    `rejected` count measurements: a range, a beam, a landmark, a depth, an attitude. `rejected_sightings` holds time
+    and beacon of each range and each landmark outside the gate. `widened` counts how often the standard deviations of
+    the pose were raised because most measurements were rejected, `relocated` how often the pose was found anew.
+    `consistency` holds the normalized innovations squared by sensor.
     """
 
     names: tuple[str, ...]
@@ -28,7 +28,7 @@ class Track:
     covariance: Floats
     applied: int
     rejected: int
-    rejected_ranges: frozenset[tuple[float, str]]
+    rejected_sightings: frozenset[tuple[float, str]]
     widened: int
     relocated: int = 0
     consistency: Consistency = field(default_factory=Consistency)
@@ -42,6 +42,13 @@ class Track:
     def heading_rad(self) -> Floats | None:
         """(N,), or None for a model without a heading."""
         return self.state[:, self.names.index("heading_rad")] if "heading_rad" in self.names else None
+
+    @property
+    def rejected_xy_m(self) -> Floats:
+        """(M, 2) the estimated places at the times of rejected ranges and landmarks, where the pose is known."""
+        times = np.array(sorted({time for time, _ in self.rejected_sightings}))
+        places = self.position_m[np.searchsorted(self.time_s, times), :2] if len(times) else np.empty((0, 2))
+        return places[np.isfinite(places).all(axis=1)]
 
     @property
     def known(self) -> NDArray[np.bool_]:

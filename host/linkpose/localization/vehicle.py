@@ -18,7 +18,7 @@ from linkpose.localization.kalman import (
 )
 from linkpose.localization.linalg import Floats
 from linkpose.localization.noise import equicorrelated
-from linkpose.localization.settings import CONSTANTS, Pose, Settings
+from linkpose.localization.settings import CONSTANTS, DRIFT, Pose, Settings
 from linkpose.localization.tables import Beacons
 
 DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehicle's log has
@@ -109,12 +109,23 @@ def start_state(pose: Pose, depth_m: float, settings: Settings, motion: Motion) 
         "y_rate_m_s": (0.0, FASTEST_M_S),
     }
     for i, name in enumerate(motion.states):
-        state[i], std[i] = prior[name] if name in prior else (0.0, _constant_std(name))
+        state[i], std[i] = prior[name] if name in prior else (0.0, _nuisance_std(name, settings))
     return state, std
 
 
-def _constant_std(name: str) -> float:
+def _nuisance_std(name: str, settings: Settings) -> float:
+    """Standard deviation at the start of a state that is no motion: a constant of the ranges, or their drift."""
+    if name.startswith(DRIFT):
+        return settings.drift_std_m
     return next(std for stem, _, std in CONSTANTS.values() if name.startswith(stem))
+
+
+def drifts_of(settings: Settings, motion: Motion) -> Floats | None:
+    """Rates (1/s) and variances (n, 2) of the states that drift; None where none does."""
+    if settings.drift_std_m == 0.0:
+        return None
+    is_drift = np.array([name.startswith(DRIFT) for name in motion.states])
+    return np.outer(is_drift, (1.0 / settings.drift_time_s, settings.drift_std_m**2))
 
 
 def noise_root(settings: Settings, vehicle: Motion) -> Floats:

@@ -11,13 +11,14 @@ import numpy as np
 from linkpose.errors import CannotWrite
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
-from linkpose.page.page import LOOPBACK, UPDATE_INTERVAL_S, free_port, serve
+from linkpose.page.page import LOOPBACK, free_port, serve
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     from linkpose.page.scene import Surroundings
 
+FRAME_INTERVAL_S = 0.05  # motion looks smooth at 20 Hz
 MOST_FRAMES = 2400  # two minutes at 20 Hz, about 1 MB; a longer recording gets fewer frames per second
 
 
@@ -32,7 +33,7 @@ def save_animation(
     try:
         drawing, replay = Drawing(server, columns, rig, surroundings), Replay(values)
         start, end = replay.span_s
-        frames = int(np.clip(round((end - start) / UPDATE_INTERVAL_S), 1, MOST_FRAMES)) + 1
+        frames = int(np.clip(round((end - start) / FRAME_INTERVAL_S), 1, MOST_FRAMES)) + 1
         recorded = server.get_scene_serializer()
         for time_s in np.linspace(start, end, frames):
             replay.seek(float(time_s))

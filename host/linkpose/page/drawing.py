@@ -11,8 +11,8 @@ import numpy as np
 from linkpose import quantities
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
-from linkpose.presentation import Row, RowReader, best_filter
-from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, X, Y
+from linkpose.presentation import Row, RowReader
+from linkpose.quantities import HEADING, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     import viser
 
     from linkpose.page.scene import Surroundings
-
-_SHOWN_BY = (QW, HEIGHT, HEADING, ROLL)  # the first that is known selects the best filter
 
 
 class Drawing:
@@ -40,6 +38,12 @@ class Drawing:
             if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
         ]
         self._scene = scene_of(server, self._of_filter.values(), rig, surroundings)
+        self._candidates = [(q, name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of]
+
+    @property
+    def charted(self) -> tuple[Quantity, ...]:
+        """The quantities that belong to what the scene shows."""
+        return self._scene.charted
 
     def read(self, newest: Floats) -> Row:
         """A row (columns,) by filter and quantity."""
@@ -47,9 +51,8 @@ class Drawing:
 
     def best(self, row: Row) -> str | None:
         """The best filter with a value in this row; without any value, the best filter at all."""
-        found = [(q, name) for q in _SHOWN_BY if (name := best_filter(row, self._rows.filters, q)) is not None]
-        known = [name for q, name in found if math.isfinite(row[name][q][0])]
-        return next(iter(known + [name for _, name in found]), None)
+        known = (name for q, name in self._candidates if math.isfinite(row[name][q][0]))
+        return next(known, self._candidates[0][1] if self._candidates else None)
 
     def draw(self, newest: Floats, row: Row, name: str, history: History | Replay, j2s_m: Floats | None = None) -> None:
         """Draws the newest row as the filter `name` estimates it; `j2s_m` (3,) is J2S if it is being estimated."""

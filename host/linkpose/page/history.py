@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
@@ -18,20 +17,32 @@ class History:
     """Rows as they arrive, thinned out in time, and all of the path (thinned out in number)."""
 
     def __init__(self, columns: Sequence[str]) -> None:
-        self._width = len(columns)
-        self._rows: deque[Floats] = deque(maxlen=round(SPAN_S / POINT_INTERVAL_S) + 1)
+        self._most = round(SPAN_S / POINT_INTERVAL_S) + 1
+        # Rows [start, end) are kept. At the end of the array, the kept rows move to its beginning.
+        self._rows: Floats = np.empty((4 * self._most, len(columns)))
+        self._start = self._end = 0
         self._path: list[Floats] = []
         self._step = 1  # rows between two of the path
         self._count = 0
 
-    def add(self, row: Floats) -> None:
-        """Takes the next row (columns,). The newest row replaces the one before when they are close in time."""
-        if len(self._rows) > 1 and row[0] - self._rows[-2][0] < POINT_INTERVAL_S:
-            self._rows[-1] = row
-            return
-        self._rows.append(row)
+    def add(self, rows: Floats) -> None:
+        """Adds rows (N, columns). A row replaces the one before when they are close in time."""
+        for row, time_s in zip(rows, rows[:, 0].tolist(), strict=True):
+            if self._end - self._start > 1 and time_s - self._rows[self._end - 2, 0] < POINT_INTERVAL_S:
+                self._rows[self._end - 1] = row
+            else:
+                self._append(row)
+
+    def _append(self, row: Floats) -> None:
+        if self._end == len(self._rows):
+            kept = self._rows[self._start : self._end].copy()
+            self._start, self._end = 0, len(kept)
+            self._rows[: self._end] = kept
+        self._rows[self._end] = row
+        self._end += 1
+        self._start = max(self._start, self._end - self._most)
         if self._count % self._step == 0:
-            self._path.append(row)
+            self._path.append(row.copy())
         self._count += 1
         if len(self._path) > PATH_POINTS:
             self._path, self._step = self._path[::2], 2 * self._step
@@ -39,16 +50,17 @@ class History:
     @property
     def newest(self) -> Floats | None:
         """The newest row (columns,)."""
-        return self._rows[-1] if self._rows else None
+        return self._rows[self._end - 1] if self._end else None
 
     def window(self) -> Floats:
-        """The rows (N, columns) of the last SPAN_S seconds."""
-        rows = np.array(self._rows).reshape(-1, self._width)
-        return rows[rows[:, 0] >= rows[-1, 0] - SPAN_S] if len(rows) else rows
+        """The rows (N, columns) of the last SPAN_S seconds; a view that the next `add` may change."""
+        rows: Floats = self._rows[self._start : self._end]
+        return rows[rows[:, 0] >= rows[-1, 0] - SPAN_S] if len(rows) and rows[0, 0] < rows[-1, 0] - SPAN_S else rows
 
     def path(self) -> Floats:
         """Rows (N, columns) along the whole path, with the newest as the last."""
-        return np.array([*self._path, *list(self._rows)[-1:]]).reshape(-1, self._width)
+        newest = [] if self.newest is None else [self.newest]
+        return np.array([*self._path, *newest]).reshape(-1, self._rows.shape[1])
 
 
 class Replay:

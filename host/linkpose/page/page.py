@@ -30,9 +30,11 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
-UPDATE_INTERVAL_S = 0.05  # between two updates of the page: motion looks smooth at 20 Hz
-CHART_INTERVAL = 8  # updates between two of the charts, which are the largest messages
-STATUS_INTERVAL = 10  # blocks between two looks at the health, which counts over all sensors
+# Seconds between two updates of the page. Whatever its size, an update costs 1 to 2 ms of CPU (tests/bench/page.py),
+# most of it in viser's server: twice the interval halves the cost, and a sample takes up to 0.12 s more to the screen.
+UPDATE_INTERVAL_S = 0.12
+CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
+STATUS_INTERVAL = 25  # blocks between two looks at the health, which counts over all sensors
 J2S_GOAL_M = 0.03  # 1σ in the worst direction from which on the guide asks for no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
 _PORTS_TRIED = 100
@@ -79,15 +81,15 @@ class Page:
         self._exclusions = Exclusions()
         self._queue: deque[Floats] = deque(maxlen=QUEUE_BLOCKS)
         self._status, self._blocks = Status(), 0
+        self._updates = 0
+        self._clients: set[int] = set()
         self._marks: list[float] = []
-        self._changed = threading.Event()
+        self._is_changed = self._is_status_changed = True  # since the last update
         self._closing = threading.Event()
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._follows_mice = any(EXCLUDED in of for of in quantities.by_filter(columns).values())
         self._build(rig, surroundings)
-        self._updates = 0
-        self._clients: set[int] = set()
         self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
         self._thread.start()
 
@@ -97,11 +99,12 @@ class Page:
         `status` is called now and then, in the thread of the caller.
         """
         if estimates.size:
-            self._queue.append(np.atleast_2d(estimates))
+            self._queue.append(estimates)
         if self._blocks % STATUS_INTERVAL == 0 or not estimates.size:
             self._status = status()
+            self._is_status_changed = True
         self._blocks += 1
-        self._changed.set()
+        self._is_changed = True
 
     def raise_if_stopped(self) -> None:
         """Raises KeyboardInterrupt once the user has pressed "stop", which ends a run as Ctrl-C does."""
@@ -127,8 +130,8 @@ class Page:
         server = self._server
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        self._panel = Panel(server, self._columns, self._changed.set)
         self._drawing = Drawing(server, self._columns, rig, surroundings)
+        self._panel = Panel(server, self._columns, self._drawing.charted, self._redraw)
         if self._replay is not None:
             self._build_player(self._replay)
         elif self._on_mark is not None:
@@ -139,9 +142,14 @@ class Page:
             stop.on_click(lambda _: self.stopped.set())
         self._panel.add_charts()
 
+    def _redraw(self) -> None:
+        """Draws everything with the next update."""
+        self._is_changed = self._is_status_changed = True
+        self._updates = 0
+
     def _build_player(self, replay: Replay) -> None:
         """A slider over the time of the file, and "play"."""
-        start, end = replay.span_s
+        start, end = (round(time_s, 2) for time_s in replay.span_s)
         replay.seek(start)
         self._place_s = start
         self._slider: Any = self._server.gui.add_slider("time (s)", start, max(end, start + 0.01), 0.01, start)
@@ -150,7 +158,7 @@ class Page:
         def jump(event: viser.GuiEvent[Any]) -> None:
             if event.client is not None:  # moved by the user, not by the player
                 self._place_s = float(self._slider.value)
-                self._changed.set()
+                self._redraw()
 
         self._slider.on_update(jump)
 
@@ -159,30 +167,33 @@ class Page:
         if newest is not None and self._on_mark is not None:
             self._marks.append(float(newest[0]))
             self._on_mark(self._marks[-1])
-            self._changed.set()
+            self._redraw()
 
     def _send(self) -> None:
         """The sender: everything that arrived since the last update, as one update."""
         while not self._closing.wait(UPDATE_INTERVAL_S):
             self._take()
             clients = set(self._server.get_clients())
-            if clients and self._replay is not None:
-                self._advance(self._replay)
             if clients - self._clients:
-                self._changed.set()
+                self._redraw()
             self._clients = clients
-            if clients and self._changed.is_set():
-                self._changed.clear()
-                self._draw()
-            elif clients and self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
+            if not clients:
+                continue
+            if self._replay is not None:
+                self._advance(self._replay)
+            if self._is_changed or self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
+                self._is_changed = False
                 self._draw()
 
     def _take(self) -> None:
-        while self._queue and isinstance(self._history, History):
-            for row in self._queue.popleft():
-                self._history.add(row)
-                if self._follows_mice:
-                    self._exclusions.follow(float(row[0]), self._drawing.read(row))
+        blocks = [self._queue.popleft() for _ in range(len(self._queue))]
+        if not blocks or not isinstance(self._history, History):
+            return
+        rows = np.vstack(blocks)
+        self._history.add(rows)
+        if self._follows_mice:
+            for row in rows:
+                self._exclusions.follow(float(row[0]), self._drawing.read(row))
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -192,7 +203,7 @@ class Page:
             if self._place_s >= end:
                 self._place_s, self._play.value = end, False
             self._slider.value = round(self._place_s, 2)
-            self._changed.set()
+            self._is_changed = self._is_status_changed = True
         replay.seek(self._place_s)
 
     def _draw(self) -> None:
@@ -202,9 +213,12 @@ class Page:
             self._exclusions.follow(self._place_s, row)
         name = self._panel.chosen or self._drawing.best(row)
         with self._server.atomic():
-            self._draw_health(newest, status)
+            if self._is_status_changed:
+                self._is_status_changed = False
+                self._draw_health(newest, status)
             if newest is not None and name is not None:
                 self._draw_estimates(newest, row, name, status)
+        self._server.flush()  # at once: viser would wait for more
         self._updates += 1
 
     def _draw_estimates(self, newest: Floats, row: Any, name: str, status: Status) -> None:

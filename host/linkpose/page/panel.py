@@ -9,29 +9,23 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from linkpose import quantities
-from linkpose.presentation import Row, angle_with_std, joint_texts, pose_text, with_std
+from linkpose.presentation import Row, angle_with_std, joint_texts, length_with_std, pose_text
 from linkpose.quantities import (
-    ANGLE,
-    BALL_ANGLES,
     HEADING,
     HEIGHT,
-    HEIGHT1,
-    HEIGHT2,
     PITCH,
-    QW,
     ROLL,
     YAW,
     Quantity,
-    X,
-    Y,
 )
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     import viser
 
-Nullable = list[float | None]
+Nullable = Floats | list[float | None]  # values of a chart; None is a gap
 
+GAP_S = 0.5  # the shortest gap of a curve
 BEST = "best"  # the choice that follows the best filter
 _BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
 _CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
@@ -42,22 +36,27 @@ _OK, _FAULT = "#2b8a3e", "#c92a2a"
 class Panel:
     """The elements of the panel, and how they are brought up to date."""
 
-    def __init__(self, server: viser.ViserServer, columns: Sequence[str], on_choice: Callable[[], None]) -> None:
-        """`on_choice` is called when another filter is chosen."""
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        columns: Sequence[str],
+        charted: Sequence[Quantity],
+        on_choice: Callable[[], None],
+    ) -> None:
+        """`charted` are the quantities with a chart if a filter estimates them.
+
+        `on_choice` is called when another filter is chosen.
+        """
         gui = self._gui = server.gui
         self._columns = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
         self._health = gui.add_html("")
         self._headline = gui.add_html("")
         able = {quantity for of in self._of_filter.values() for quantity in of}
-        wanted: tuple[Quantity, ...] = (HEIGHT, ROLL, PITCH) if {HEIGHT, ROLL} & able else (X, Y, HEADING)
-        if {ANGLE, QW} & able:
-            wanted = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2)
-        shown = [quantity for quantity in wanted if quantity in able]
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
             self._choice.on_update(lambda _: on_choice())
-        self._shown = shown
+        self._shown = [quantity for quantity in charted if quantity in able]
         self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
 
     def add_charts(self) -> None:
@@ -95,22 +94,25 @@ class Panel:
 
     def draw_charts(self, window: Floats, name: str) -> None:
         """Draws the rows (N, columns) of the last seconds as the filter `name` sees them."""
+        rows = with_gap_rows(window)
         for quantity, chart in self._charts.items():
             column = self._of_filter.get(name, {}).get(quantity)
             chart.visible = column is not None
             if column is not None:
-                self._send(chart, self._chart_data(window, quantity, column))
+                self._send(chart, self._chart_data(rows, quantity, column))
 
     @staticmethod
     def _send(chart: viser.GuiUplotHandle, data: tuple[Nullable, ...]) -> None:
-        """Gives a chart its data. viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null."""
+        """Gives a chart its data: arrays travel as binary, lists where there are gaps.
+
+        viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null.
+        """
         cast(Any, chart._impl.props).data = data
         chart._queue_update("data", data)
 
-    def _chart_data(self, window: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
+    def _chart_data(self, rows: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
         """Time, value − 2σ, value + 2σ, value, and the reference if there is one, with None in gaps."""
         scale = quantity.value.scale
-        rows = with_gap_rows(window)
         value = rows[:, self._columns[column]] * scale
         if quantity.period is not None:
             known = np.isfinite(value)
@@ -121,7 +123,7 @@ class Panel:
         data = [value - 2 * std, value + 2 * std, value]
         if quantity.column in self._columns:
             data.append(rows[:, self._columns[quantity.column]] * scale)
-        return (rows[:, 0].tolist(), *map(_nullable, data))
+        return (rows[:, 0].copy(), *map(_nullable, data))
 
     def draw_health(self, title: str, summary: str, working: Sequence[str], faults: Sequence[str]) -> None:
         """Shows which sensors work, in green, and each fault as a red line."""
@@ -139,7 +141,7 @@ class Panel:
         values = row.get(name, {})
         angles = joint_texts(values)
         if HEIGHT in values:
-            first, lines = with_std(*values[HEIGHT], "m", 4), [_angles(values)]
+            first, lines = length_with_std(*values[HEIGHT]), [_angles(values)]
             caption = "height over the joint"
         elif angles:
             first, *lines = angles
@@ -164,25 +166,30 @@ class Panel:
 
 
 def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
-    parts = []
-    for quantity in (ROLL, PITCH, YAW):
-        if quantity in values:
-            parts.append(f"{quantity.name} {angle_with_std(*values[quantity])}")
-    return "   ".join(parts)
+    """Roll, pitch and yaw side by side; no line ends within one of them."""
+    parts = [f"{q.name} {angle_with_std(*values[q])}" for q in (ROLL, PITCH, YAW) if q in values]
+    return "   ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in parts)
 
 
 def with_gap_rows(rows: Floats) -> Floats:
-    """Rows (N, columns) by time, with a row of NaN inside each gap, which is longer than three usual intervals."""
+    """Rows (N, columns) by time, with a row of NaN inside each gap.
+
+    A gap is longer than three usual intervals and than GAP_S: live rows are the last ones of blocks of any length.
+    """
     if len(rows) < 3:
-        return rows.copy()
+        return rows
     step = np.diff(rows[:, 0])
-    at = np.flatnonzero(step > 3.0 * np.median(step))
+    at = np.flatnonzero(step > max(3.0 * float(np.median(step)), GAP_S))
+    if not len(at):
+        return rows
     between = np.full((len(at), rows.shape[1]), np.nan)
     between[:, 0] = 0.5 * (rows[at, 0] + rows[at + 1, 0])
     return np.insert(rows, at + 1, between, axis=0)
 
 
 def _nullable(values: Floats) -> Nullable:
+    if np.isfinite(values).all():
+        return values
     return [value if value == value else None for value in values.tolist()]
 
 

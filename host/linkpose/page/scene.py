@@ -5,13 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
 from linkpose.page import geometry
 from linkpose.presentation import Row, best_filter
-from linkpose.quantities import CHAIN_ROTATION, HEADING, HEIGHT, PITCH, QW, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import (
+    ANGLE,
+    BALL_ANGLES,
+    CHAIN_ROTATION,
+    HEADING,
+    HEIGHT,
+    HEIGHT1,
+    HEIGHT2,
+    PITCH,
+    QW,
+    ROLL,
+    YAW,
+    Quantity,
+    X,
+    Y,
+)
 from linkpose.rotations import product
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
@@ -26,14 +41,19 @@ Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)
 _ELLIPSES = 12  # along a path
-_PATH_INTERVAL = 10  # redraws of the scene between two of the path, which is larger
+_PATH_INTERVAL = 5  # redraws of the scene between two of the path, which is larger
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
-_FLOOR_M = 0.002  # of lines over the ground, so that the ground does not hide parts of them
+_ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
+_CONE_CHANGE = 0.02  # share of a cone's radius that is not worth a message: a pixel or two
+_FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does not hide parts of them
 
 
 class Scene(Protocol):
     """What the page draws in 3-D."""
+
+    charted: ClassVar[tuple[Quantity, ...]]  # that charts show, if a filter estimates them
+    shown_by: ClassVar[tuple[Quantity, ...]]  # the first of these with a value selects the best filter
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
         """Draws the newest row as the filter `name` estimates it.
@@ -52,6 +72,34 @@ class Surroundings:
 
     grid: GridMap | None = None
     beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m), perhaps z
+    places: Sequence[Sequence[float]] = ()  # x, y (m) that the camera shows too, such as the corners of a path
+
+    @property
+    def centre_m(self) -> Floats:
+        """Centre (2,) of all that there is; a robot starts at the origin and heads along x."""
+        corners = self._all_corners()
+        return (corners.min(axis=0) + corners.max(axis=0)) / 2 if len(corners) else np.array([1.0, 0.0])
+
+    @property
+    def size_m(self) -> float:
+        """The larger side of all that there is."""
+        corners = self._all_corners()
+        return max(float(np.ptp(corners, axis=0).max()), 1.0) if len(corners) else 4.0
+
+    def _all_corners(self) -> Floats:
+        found = [*(place[:2] for place in self.beacons.values()), *self.places]
+        if self.grid is not None:
+            found += _corners(self.grid).tolist()
+        return np.array(found, dtype=float).reshape(-1, 2)
+
+
+def _corners(grid: GridMap) -> Floats:
+    """The corners (4, 2) of a map."""
+    _, left, low, turn = grid.geometry.tolist()
+    (wide, high), cos, sin = grid.size_m, math.cos(turn), math.sin(turn)
+    flat = np.array([(0.0, 0.0), (wide, 0.0), (0.0, high), (wide, high)])
+    corners: Floats = np.array([left, low]) + flat @ np.array([[cos, sin], [-sin, cos]])
+    return corners
 
 
 class LinkScene:
@@ -60,6 +108,7 @@ class LinkScene:
     Without a known J2S only the attitude of the sensor is drawn, at the joint.
     """
 
+    charted, shown_by = (HEIGHT, ROLL, PITCH), (HEIGHT, ROLL)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, j2s_m: Floats | None) -> None:
@@ -77,8 +126,7 @@ class LinkScene:
         size = 0.07 * length
         self._sensor = scene.add_box("/link/sensor", _ORANGE, (size, 0.75 * size, 0.3 * size))
         self._axes = scene.add_frame("/link/axes", axes_length=2.5 * size, axes_radius=0.07 * size)
-        self._cone = _add_cone(scene, "/link/cone")
-        self._length_m = 0.0
+        self._cone = Cone(scene, "/link/cone")
         self._drawn_j2s: Floats | None = None
         self.set_j2s(j2s_m)
         server.initial_camera.position = (1.15 * length, -1.75 * length, 1.0 * length)
@@ -94,11 +142,10 @@ class LinkScene:
         if self._drawn_j2s is not None and np.linalg.norm(j2s_m - self._drawn_j2s) < 1e-3:
             return
         self._drawn_j2s = j2s_m
-        self._length_m = float(np.linalg.norm(j2s_m))
-        turn = geometry.turn_z_to(j2s_m)
+        turn, length = geometry.turn_z_to(j2s_m), float(np.linalg.norm(j2s_m))
         for part in self._parts:
-            part.position, part.wxyz, part.scale = 0.5 * j2s_m, turn, (1.0, 1.0, self._length_m)
-        self._cone.wxyz = turn
+            part.position, part.wxyz, part.scale = 0.5 * j2s_m, turn, (1.0, 1.0, length)
+        self._cone.point_along(j2s_m)
         self._sensor.position = self._axes.position = j2s_m
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
@@ -108,10 +155,7 @@ class LinkScene:
         self._link.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
             self._link.wxyz = geometry.attitude(roll, pitch, yaw)
-        radius = geometry.cone_radius(self._length_m, max(roll_std, pitch_std)) if is_known else 0.0
-        self._cone.visible = radius > 0.0
-        if radius > 0.0:
-            self._cone.scale = (radius, radius, self._length_m)
+        self._cone.draw(max(roll_std, pitch_std) if is_known else math.nan)
         roll, pitch = (reference.get(q, math.nan) for q in (ROLL, PITCH))
         self._reference.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
@@ -122,18 +166,28 @@ class LinkScene:
 class RobotScene:
     """A robot in the plane: ground, map, beacons, pose, path, ±2σ ellipses along it, and the reference's path."""
 
+    charted, shown_by = (X, Y, HEADING), (HEADING,)
+
     def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
-        self._scene = server.scene
-        _ground(self._scene, 20.0)
-        self._robot = self._scene.add_frame("/robot", axes_length=0.25, axes_radius=0.008, visible=False)
-        self._scene.add_box("/robot/body", _ORANGE, (0.24, 0.18, 0.06), position=(0.0, 0.0, 0.03))
-        self._scene.add_box("/robot/front", _BLACK, (0.03, 0.18, 0.062), position=(0.105, 0.0, 0.031))
-        self._draws = 0
-        centre, size = np.array([1.0, 0.0]), 4.0
-        if surroundings is not None:
-            centre, size = self._draw_surroundings(surroundings, centre, size)
-        server.initial_camera.position = (centre[0], centre[1] - 0.9 * size, size)
-        server.initial_camera.look_at = (centre[0], centre[1], 0.0)
+        self._scene, self._draws = server.scene, 0
+        around = surroundings or Surroundings()
+        (x, y), size = around.centre_m, around.size_m
+        self._floor_m = max(_FLOOR_M, 0.001 * size)
+        _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
+        self._draw_surroundings(around, size)
+        scale = max(1.0, size / _ROBOT_SHARE)  # a robot of 24 cm would be a dot on a floor of 100 m
+        self._robot = self._scene.add_frame(
+            "/robot", axes_length=0.25 * scale, axes_radius=0.008 * scale, visible=False
+        )  # fmt: skip
+        for name, colour, dimensions, at in (
+            ("body", _ORANGE, (0.24, 0.18, 0.06), (0.0, 0.0, 0.03)),
+            ("front", _BLACK, (0.03, 0.18, 0.062), (0.105, 0.0, 0.031)),
+        ):
+            self._scene.add_box(
+                f"/robot/{name}", colour, tuple(scale * np.array(dimensions)), position=scale * np.array(at)
+            )
+        server.initial_camera.position = (x, y - 0.5 * size, 0.75 * size)
+        server.initial_camera.look_at = (x, y, 0.0)
 
     @property
     def is_path_due(self) -> bool:
@@ -150,47 +204,36 @@ class RobotScene:
         if path is not None:
             self._draw_path(path)
 
-    def _draw_surroundings(self, around: Surroundings, centre: Floats, size: float) -> tuple[Floats, float]:
-        """Draws map and beacons. Returns the centre (2,) and the size (m) of what there is."""
+    def _draw_surroundings(self, around: Surroundings, size: float) -> None:
+        """Draws beacons, in proportion to the size (m) of the scene, and the map."""
         for name, place in around.beacons.items():
-            height = place[2] if len(place) > 2 else 0.0
-            self._scene.add_icosphere(f"/beacon/{name}", 0.15, _ORANGE, position=(place[0], place[1], height))
+            position = (place[0], place[1], place[2] if len(place) > 2 else 0.0)
+            self._scene.add_icosphere(f"/beacon/{name}", max(0.03, 0.012 * size), _ORANGE, position=position)
             self._scene.add_label(f"/beacon/{name}/label", name)
-        corners = [np.array(place[:2]) for place in around.beacons.values()]
-        if around.grid is not None:
-            _, left, low, turn = around.grid.geometry.tolist()
-            wide, high = around.grid.size_m
-            across = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-            middle = np.array([left, low]) + across @ np.array([wide, high]) / 2
-            # viser puts the first row of an image at its lowest y, as the map has it.
-            wxyz = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
-            image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
-            self._scene.add_image(
-                "/map",
-                np.repeat(image, 3, axis=2),
-                wide,
-                high,
-                wxyz=wxyz,
-                position=(middle[0], middle[1], _FLOOR_M / 2),
-            )
-            corners += [
-                np.array([left, low]) + across @ np.array(c) for c in ((0, 0), (wide, 0), (0, high), (wide, high))
-            ]
-        if not corners:
-            return centre, size
-        low_corner, high_corner = np.min(corners, axis=0), np.max(corners, axis=0)
-        return (low_corner + high_corner) / 2, max(float(np.max(high_corner - low_corner)), 1.0)
+        if around.grid is None:
+            return
+        turn = float(around.grid.geometry[3])
+        middle = np.mean(_corners(around.grid), axis=0)
+        image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
+        # viser puts the first row of an image at its lowest y, as the map has it.
+        self._scene.add_image(
+            "/map",
+            np.repeat(image, 3, axis=2),
+            *around.grid.size_m,
+            wxyz=(math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)),
+            position=(middle[0], middle[1], -self._floor_m),
+        )
 
     def _draw_path(self, path: Floats) -> None:
         for name, columns, colour, width in (("/path", [0, 1], _BLUE, 3.0), ("/reference", [6, 7], _BLACK, 1.5)):
-            points = np.column_stack([path[:, columns], np.full(len(path), _FLOOR_M)])
+            points = np.column_stack([path[:, columns], np.full(len(path), self._floor_m)])
             self._lines(name, geometry.polyline(points), colour, width)
         known = path[np.isfinite(path[:, [0, 1, 3, 4]]).all(axis=1)]
         if len(known):
             at = np.linspace(0, len(known) - 1, min(_ELLIPSES, len(known))).astype(int)
             self._lines(
                 "/ellipses",
-                np.concatenate([geometry.ellipse(known[i], 2 * _FLOOR_M) for i in at]),
+                np.concatenate([geometry.ellipse(known[i], 2 * self._floor_m) for i in at]),
                 _GREY,
                 1.5,
             )
@@ -209,6 +252,7 @@ class ChainScene:
     links. With a known J2S, the fixed joint stays in its place, otherwise the joint between the links does.
     """
 
+    charted, shown_by = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2), (QW,)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, rig: Rig) -> None:
@@ -233,8 +277,8 @@ class ChainScene:
             scene.add_frame(f"{name}/axes", axes_length=0.15 * size, axes_radius=0.005 * size, position=place)
         if j2s is not None:
             scene.add_icosphere("/joint/link1/fixed", 0.05 * size, _BLACK, position=end)
-        self._cone, self._reach_m = _add_cone(scene, "/joint/link2/cone"), float(np.linalg.norm(_BEYOND_SENSOR * r2))
-        self._cone.wxyz = geometry.turn_z_to(r2)
+        self._cone = Cone(scene, "/joint/link2/cone")
+        self._cone.point_along(_BEYOND_SENSOR * r2)
         server.initial_camera.position = (0.9 * size, -1.5 * size, 1.0 * size)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * size)
 
@@ -254,18 +298,30 @@ class ChainScene:
         self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
             self._links[1].wxyz = product(attitude, rotation / np.linalg.norm(rotation))
-        radius = geometry.cone_radius(self._reach_m, values.get(QW, nothing)[1]) if is_known else 0.0
-        self._cone.visible = radius > 0.0
-        if radius > 0.0:
-            self._cone.scale = (radius, radius, self._reach_m)
+        self._cone.draw(values.get(QW, nothing)[1] if is_known else math.nan)
 
 
-def _add_cone(scene: viser.SceneApi, name: str) -> viser.MeshHandle:
-    """A cone of ±2σ, hidden until it is scaled."""
-    vertices, faces = geometry.cone()
-    return scene.add_mesh_simple(
-        name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
-    )
+class Cone:
+    """A cone of ±2σ about an axis that starts at its parent's origin, hidden while σ is unknown."""
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        vertices, faces = geometry.cone()
+        self._mesh = scene.add_mesh_simple(
+            name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
+        )
+        self._length_m = self._radius_m = 0.0
+
+    def point_along(self, axis_m: Floats) -> None:
+        """Gives the cone an axis (3,)."""
+        self._mesh.wxyz, self._length_m = geometry.turn_z_to(axis_m), float(np.linalg.norm(axis_m))
+
+    def draw(self, std_deg: float) -> None:
+        """Opens the cone to ±2σ; NaN hides it."""
+        radius = geometry.cone_radius(self._length_m, std_deg)
+        self._mesh.visible = radius > 0.0
+        if abs(radius - self._radius_m) > _CONE_CHANGE * self._radius_m:
+            self._mesh.scale = (radius, radius, self._length_m)
+            self._radius_m = radius
 
 
 def scene_of(
@@ -281,9 +337,9 @@ def scene_of(
     return LinkScene(server, None if j2s is None else np.array(j2s))
 
 
-def _ground(scene: viser.SceneApi, size_m: float) -> None:
+def _ground(scene: viser.SceneApi, size_m: float, centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
     cell = 10.0 ** math.floor(math.log10(size_m / 8))
     scene.add_grid(
         "/ground", size_m, size_m, cell_size=cell, section_size=5 * cell, cell_color=(232, 235, 238),
-        section_color=(205, 210, 215), plane_color=(246, 247, 249), plane_opacity=1.0,
+        section_color=(205, 210, 215), plane_color=(246, 247, 249), plane_opacity=1.0, position=centre_m,
     )  # fmt: skip

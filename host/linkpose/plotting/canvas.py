@@ -53,9 +53,12 @@ def line_style(name: str, file: int = 0) -> dict[str, Any]:
     }
 
 
+_LONGEST_LABEL = 20  # characters beside a panel of the least height; the unit of a longer label is on a second line
+
+
 def finish(axes: Axes, label: str) -> None:
     """Label of the y axis, grid, and no frame above and right."""
-    axes.set_ylabel(label)
+    axes.set_ylabel(label.replace(" (", "\n(") if len(label) > _LONGEST_LABEL else label)
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0.0)

@@ -11,6 +11,7 @@ from linkpose import filters
 from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view
+from linkpose.presentation import same_digits
 from linkpose.quantities import unit_text
 from linkpose.sensors.measurements import Floats
 
@@ -131,7 +132,7 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
     for score in scores:
         for name, value in score.statistics().items():
             unit = unit_text(score.errors[name].unit)
-            figures = [f"{v:.3g}" for v in (value.rmse, value.mean, value.worst, value.p95)]
+            figures = same_digits(value.rmse, value.mean, value.worst, value.p95)
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import band, draw, shade
-from linkpose.plotting.sources import Sources, Track, pairs
+from linkpose.plotting.sources import Sources, Track, is_barometric, pairs
 from linkpose.quantities import YAW, Quantity, unit_text
 from linkpose.sensors.measurements import Floats
 
@@ -89,9 +89,9 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
         draw(axes, of.time_s, of.error, label=text, **line_style(track.name, track.file))
         drawn.append(of.error)
         if of.std is not None and not order:
-            stds.append(of.std)
+            stds.append(np.where(np.isfinite(of.error), of.std, np.nan))
             colour = str(line_style(track.name)["color"])
-            band(axes, of.time_s, np.zeros(len(of.time_s)), of.std, colour, f"±2σ {track.label}")
+            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"±2σ {track.label}")
         order.append(text)
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
@@ -153,7 +153,10 @@ def error_limit(errors: Sequence[Floats], stds: Sequence[Floats]) -> float:
 
 def note_hidden(sources: Sources) -> str:
     """What the plot leaves out, and how it is drawn; "" where nothing is left out."""
-    if not sources.hidden:
-        return ""
-    names = ", ".join(sources.hidden)
-    return f"not drawn, because air pressure noise hides the height: {names} (add --filter {sources.hidden[0]})"
+    barometric = [name for name in sources.hidden if is_barometric(name)]
+    others = [name for name in sources.hidden if name not in barometric]
+    reasons = (
+        (barometric, "not drawn, because air pressure noise hides the height"),
+        (others, "not drawn beside a path"),
+    )
+    return "; ".join(f"{why}: {', '.join(names)} (add --filter {names[0]})" for names, why in reasons if names)

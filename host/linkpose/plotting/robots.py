@@ -10,7 +10,7 @@ import numpy as np
 
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import shade_unknown, view_values
+from linkpose.plotting.panels import errors, shade_unknown, view_values
 from linkpose.plotting.sources import Sources, Track
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.rotations import rotation_vectors
@@ -59,11 +59,14 @@ def _with_path(sources: Sources) -> list[Track]:
 
 
 def time_panels(sources: Sources) -> list[TimePanel]:
-    """Speed, unwrapped heading and the mice left out, as far as there are any."""
+    """Error of the position, speed, unwrapped heading and the mice left out, as far as a filter estimates them."""
     found: list[TimePanel] = []
-    if any(track.has(VX) for track in sources.all):
+    shown = sources.tracks or sources.all
+    if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
+        found.append((1.8, lambda axes: _position_errors(axes, sources)))
+    if any(track.has(VX) for track in shown):
         found.append((1.8, lambda axes: _over_time(axes, sources, _speed, "speed (m/s)")))
-    if any(track.has(HEADING) for track in sources.all):
+    if any(track.has(HEADING) for track in shown):
         found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading, unwrapped (°)")))
     for track in sources.tracks:
         if track.has(EXCLUDED) and bool((track.values[EXCLUDED] > 0).any()):
@@ -155,6 +158,20 @@ def _mark(axes: Axes, track: Track, colour: str) -> None:
                     Ellipse((x[i], y[i]), 4 * sx, 4 * sy, facecolor=colour, edgecolor=colour, alpha=0.25, zorder=2)
                 )
         axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
+
+
+def _position_errors(axes: Axes, sources: Sources) -> None:
+    """Distances from the true position, and the best filter's 2σ of x and y together."""
+    errors(axes, sources, "position")
+    best = next((track for track in sources.tracks if X in track.std and Y in track.std), None)
+    if best is not None:
+        std = np.hypot(best.std[X], best.std[Y])
+        colour = str(line_style(best.name, best.file)["color"])
+        band(axes, best.time_s, np.zeros(len(std)), std, colour, f"2σ {best.label}")
+        known = std[np.isfinite(std)]
+        top = axes.get_ylim()[1]
+        axes.set_ylim(0.0, max(top, 2.2 * float(np.quantile(known, 0.9))) if len(known) else top)
+        legend_above(axes, 3)
 
 
 def _speed(track: Track) -> tuple[Floats, Floats | None] | None:

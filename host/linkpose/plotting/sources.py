@@ -16,7 +16,7 @@ from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
 from linkpose.presentation import counted
-from linkpose.quantities import Quantity, by_filter, split, std_column
+from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
@@ -67,7 +67,10 @@ def is_reference(table: Table) -> bool:
 
 
 def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
-    """Of estimates and references. Without `wanted`, the filters whose height comes from the air pressure are hidden.
+    """Of estimates and references.
+
+    Without `wanted`, the filters whose height comes from the air pressure are hidden, and beside a robot's path the
+    filters that estimate its tilt alone.
 
     Raises LinkposeError where a wanted filter is in no file.
     """
@@ -78,6 +81,8 @@ def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     if missing:
         raise LinkposeError(f"no file has the filter {', '.join(missing)}; there are {', '.join(dict.fromkeys(found))}")
     shown = _shown(list(dict.fromkeys(found)), wanted)
+    if not wanted and HEADING in {q for table in estimates for of in by_filter(table.columns).values() for q in of}:
+        shown = [name for name in shown if not all(_is_tilt_alone(table, name) for table in estimates)]
     tracks = [
         _track(table, name, columns, i, len(estimates) > 1)
         for i, table in enumerate(estimates)
@@ -96,8 +101,19 @@ def _shown(found: list[str], wanted: Sequence[str]) -> list[str]:
     """The wanted filters; without any, all but the barometric ones, unless there are no others."""
     if wanted:
         return list(wanted)
-    quiet = [name for name in found if not ((of := filters.capabilities(name)) and of.is_barometric)]
-    return quiet or found
+    return [name for name in found if not is_barometric(name)] or found
+
+
+def is_barometric(name: str) -> bool:
+    """Whether a filter's height comes from the air pressure."""
+    return bool((of := filters.capabilities(name)) and of.is_barometric)
+
+
+def _is_tilt_alone(table: Table, name: str) -> bool:
+    """Whether a filter has roll and pitch, no heading, and no value of the height, which needs J2S."""
+    of = by_filter(table.columns).get(name, {})
+    height = table.columns[of[HEIGHT]] if HEIGHT in of else np.empty(0)
+    return not of or (ROLL in of and HEADING not in of and not np.isfinite(height).any())
 
 
 def _rank(name: str) -> int:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import io
-import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -23,27 +21,6 @@ class Chunk(NamedTuple):
     first_line: int  # its number, from 1
     is_last: bool
     end: int  # bytes of the file up to here
-
-
-def read_bytes(path: Path) -> bytes:
-    """The file's bytes; raises CannotRead where it cannot be read."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise CannotRead(path, error.strerror) from error
-
-
-def open_binary(path: Path) -> BinaryIO:
-    """The file, opened at its start; what is no regular file, such as a pipe, is read into memory first.
-
-    Raises CannotRead.
-    """
-    try:
-        if path.exists() and not stat.S_ISREG(path.stat().st_mode):
-            return io.BytesIO(path.read_bytes())
-        return path.open("rb")
-    except OSError as error:
-        raise CannotRead(path, error.strerror) from error
 
 
 def read_chunks(path: Path, file: BinaryIO) -> Iterator[Chunk]:

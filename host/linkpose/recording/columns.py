@@ -63,13 +63,12 @@ def names(layout: Layout) -> list[str]:
 def text(block: Block, layout: Layout) -> str:
     """The block as lines of CSV. A missing value is an empty field."""
     part = block.measurements
-    mice = part.mice_counts.reshape(len(part), -1)
+    mice = part.mice_counts.reshape(len(part), 2 * layout.mouse_ports)
     head = [part.time_s, block.seq, part.accel_m_s2, part.gyro_rad_s, part.imu_temp_degC]
     imu2 = [part.accel2_m_s2, part.gyro2_rad_s, part.imu2_temp_degC] * layout.imu2
     mag = [part.mag_uT, part.mag_fresh] * layout.mag
-    table = np.column_stack(
-        [*head, part.pressure_Pa, part.baro_temp_degC, part.baro_fresh, *imu2, *mag, mice, part.flags],
-    )
+    parts = [*head, part.pressure_Pa, part.baro_temp_degC, part.baro_fresh, *imu2, *mag, mice, part.flags]
+    table = np.concatenate([each if each.ndim == 2 else each[:, None] for each in parts], axis=1)
     return ((_line(layout) * len(table)) % tuple(table.ravel().tolist())).replace("nan", "")
 
 

@@ -114,11 +114,13 @@ def create(path: Path, force: bool) -> int:
     try:
         if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
             flags = os.O_WRONLY
-        elif force and path.is_file():
-            path = path.resolve()  # a link stays a link
-            path.unlink()  # a program that still writes the old file notices, and does not write into the new one
+        elif force:
+            path = Path(os.path.realpath(path))  # a link stays a link, and may point to no file
+            path.unlink(missing_ok=True)  # who still writes the old file notices, and does not write into the new one
         return os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
     except FileExistsError:
+        if force:  # another program created it in between; the last one has the name
+            return create(path, force)
         raise FileExists(path) from None
     except OSError as error:
         raise CannotWrite(path, error.strerror) from error
@@ -135,6 +137,7 @@ def _standard_output() -> int:
 
 def write_all(fd: int, path: Path, data: bytes) -> None:
     """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
+    name = "the standard output" if path == STDOUT else path
     left = memoryview(data)
     written = 0
     try:
@@ -146,10 +149,10 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
         if written:
             _cut_back(fd, data[:written])
         if error.errno == errno.EPIPE:
-            raise FileError(path, f"the reader of {path} has gone; nothing more can be written to it") from error
+            raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
         raise FileError(
             path,
-            f"cannot write to {path} any more: {error.strerror}; what was written so far is whole, "
+            f"cannot write to {name} any more: {error.strerror}; what was written so far is whole, "
             "make room or name a file on another disk",
         ) from error
 

@@ -11,6 +11,7 @@ import csv
 import itertools
 import json
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import FileFormatError
+from linkpose.errors import FileFormatError, listed
 from linkpose.sensors.measurements import Floats
 
 _SEPARATORS = ("\t", ";", ",", " ")  # in order of preference: decimal commas occur beside the first two
@@ -257,7 +258,7 @@ def _match(path: Path, rows: list[list[str]], numbers: list[int], separator: str
     keep = [i for i, name in enumerate(names) if name or any(row[i].strip() for row in body)]
     if keep and keep[0] == 0 and width > 1 and (not names[0] or _INDEX_NAME.fullmatch(names[0])):
         del keep[0]
-    if keep != list(range(len(body[0]))):
+    if keep != list(range(width)) or any(len(row) > width for row in body):
         body = [[row[i] for i in keep] for row in body]
     names = [names[i] for i in keep]
     _check_names(path, names, numbers[0])
@@ -277,9 +278,9 @@ def _width_error(path: Path, line: int, found: int, expected: int) -> FileFormat
 
 
 def _check_names(path: Path, names: list[str], line: int) -> None:
-    twice = {name for name in names if names.count(name) > 1 and name}
+    twice = {name for name, times in Counter(names).items() if times > 1 and name}
     if twice:
-        raise FileFormatError(path, f"{path}, line {line}: column {', '.join(sorted(twice))} stands twice", line)
+        raise FileFormatError(path, f"{path}, line {line}: column {listed(sorted(twice))} stands twice", line)
     if not names or "" in names or all(_is_number(name) for name in names):
         shown = ",".join(names)[:_LONGEST_EXCERPT]
         raise FileFormatError(path, f"{path}, line {line}: expected the names of the columns, found {shown!r}", line)

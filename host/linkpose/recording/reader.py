@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import FileFormatError
+from linkpose.inputs import open_binary
 from linkpose.recording import columns
 from linkpose.recording.ahead import ahead
-from linkpose.recording.chunks import open_binary
 from linkpose.recording.survey import Survey
 from linkpose.recording.table import TableFile, require
 from linkpose.recording.textfile import Part
@@ -37,6 +37,7 @@ from linkpose.sensors.conversion import (
 from linkpose.sensors.devices import MAX_MICE, impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
+from linkpose.sensors.timeline import OFF_TICKS, WINDOW_TICKS
 from linkpose.wire.frames import OtherProtocol
 from linkpose.wire.messages import PROTOCOL_MAJOR, DeviceFamily, Hello, SampleFlags
 
@@ -268,7 +269,6 @@ class _TableSource:
         previous: dict[str, float] = {}
         for part in self._file.parts(progress):
             time_s = part.columns["time_s"]
-            _check_finite(self._path, part)
             yield self._measurements(part, previous)
             previous = {name: float(column[-1]) for name, column in part.columns.items()}
             first_s, last_s = (time_s[0] if not self._rows else first_s), time_s[-1]
@@ -409,17 +409,6 @@ def _usual_step(time_s: Floats) -> float:
     return float(np.median(intervals[intervals > 0])) if np.any(intervals > 0) else 0.01
 
 
-def _check_finite(path: Path, part: Part) -> None:
-    """Raises FileFormatError when a time is not finite."""
-    time_s = part.columns["time_s"]
-    wrong = np.flatnonzero(~np.isfinite(time_s))
-    if len(wrong):
-        line = part.first_line + int(wrong[0])
-        raise FileFormatError(
-            path, f"{path}, line {line}: time_s is {time_s[wrong[0]]}; it must be a number of seconds", line
-        )
-
-
 # ---- raw captures ----
 
 
@@ -434,7 +423,7 @@ class _CaptureSource:
         self._file = open_binary(path)
         self._size = max(1, self._file.seek(0, 2))
         self._restarts: list[int] = []  # samples before each
-        self._mouse_ports = self._samples = self._corrupt = self._lost = self._gaps = 0
+        self._mouse_ports = self._samples = self._corrupt = self._lost = self._gaps = self._jumps = 0
         self.settings = self._find_settings()
         self.rate_hz = self.stated_rate_hz = float(self.settings.sample_rate_hz)
         self.metadata: dict[str, Any] = {
@@ -455,7 +444,7 @@ class _CaptureSource:
                 time_s, gap_before = clock.place(capture.samples)
                 flags = (capture.samples["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
                 yield converter.convert(_raw_samples(capture, self._mouse_ports), time_s, flags)
-        self._lost, self._gaps = clock.lost, clock.gaps
+        self._lost, self._gaps, self._jumps = clock.lost, clock.gaps, clock.jumps
 
     def remarks(self) -> list[str]:
         """On the capture, after a pass over all blocks."""
@@ -464,6 +453,10 @@ class _CaptureSource:
             found.append(f"{self._path}: {self._corrupt} corrupt frames left out")
         if self._gaps:
             found.append(f"{self._path}: {self._lost} samples lost in {self._gaps} gaps")
+        if self._jumps:
+            found.append(
+                f"{self._path}: the board's clock jumped {self._jumps} times; its count of ticks gives the times there"
+            )
         return found
 
     def _parts(self, progress: Progress | None) -> Iterator[Capture]:
@@ -529,7 +522,7 @@ class _CaptureClock:
         self._period_us = round(1e6 / rate_hz)
         self._placed = self._elapsed_us = 0
         self._last: tuple[int, int] | None = None  # t_us and seq
-        self.gaps = self.lost = 0
+        self.gaps = self.lost = self.jumps = 0
 
     def place(self, raw: NDArray[np.void]) -> tuple[Floats, NDArray[np.int64]]:
         """Times (N,) of the next samples, s, and the flag of those after a gap."""
@@ -539,6 +532,9 @@ class _CaptureClock:
         ticks = np.diff(seq, prepend=before[1]) % _SEQ_WRAP
         inside = (self._restarts >= self._placed) & (self._restarts < self._placed + len(raw))
         restarts = self._restarts[inside] - self._placed
+        jumped = self._jumps(step_us, ticks)
+        step_us[jumped] = ticks[jumped] * self._period_us
+        self.jumps += int(np.count_nonzero(jumped))
         step_us[restarts], ticks[restarts] = self._period_us, 1
         elapsed_us = self._elapsed_us + np.cumsum(step_us)
         marked = ticks > 1
@@ -548,6 +544,16 @@ class _CaptureClock:
         self._placed, self._elapsed_us = self._placed + len(raw), int(elapsed_us[-1])
         self._last = int(t_us[-1]), int(seq[-1])
         return np.round(elapsed_us * 1e-6, TIME_DECIMALS), np.where(marked, GAP_BEFORE, 0)
+
+    def _jumps(self, step_us: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which steps of the board's clock contradict its count of ticks, as `sensors.timeline.Stamps` finds live."""
+        off_us = (step_us - ticks * self._period_us + _T_WRAP // 2) % _T_WRAP - _T_WRAP // 2
+        wrap_us = _SEQ_WRAP * self._period_us
+        off_us -= np.maximum(0, np.rint(off_us / wrap_us)).astype(np.int64) * wrap_us
+        jumps = (ticks > 0) & (ticks <= WINDOW_TICKS) & (np.abs(off_us) > OFF_TICKS * self._period_us)
+        if self._last is None:
+            jumps[0] = False
+        return np.asarray(jumps)
 
 
 def _raw_samples(capture: Capture, ports: int) -> RawSamples:

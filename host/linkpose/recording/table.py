@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import FileFormatError
-from linkpose.recording.chunks import read_bytes
+from linkpose.errors import FileFormatError, listed
+from linkpose.inputs import read_bytes
 from linkpose.recording.csvfile import metadata_path
 from linkpose.recording.parquet import ParquetTable, is_parquet
 from linkpose.recording.textfile import Part, TextTable, metadata_of
@@ -57,6 +57,7 @@ class Table:
 
 
 Progress = Callable[[float], None]
+_LARGEST_TIME_S = 9e15  # beyond it, stamps a second apart are one number; even microseconds since 1970 are below it
 _LARGEST = 1e15  # of a value in any column; squares of larger ones exceed the range of numbers in later steps
 
 
@@ -145,7 +146,7 @@ def require(path: Path, found: Collection[str], *names: str) -> None:
     """Raises FileFormatError unless all of `names` are among the columns found."""
     missing = [name for name in names if name not in found]
     if missing:
-        raise FileFormatError(path, f"{path} has no column {', '.join(missing)}; it has {', '.join(found)}")
+        raise FileFormatError(path, f"{path} has no column {', '.join(missing)}; it has {listed(found)}")
 
 
 def _check_sizes(path: Path, part: Part) -> None:
@@ -167,14 +168,17 @@ def _check_sizes(path: Path, part: Part) -> None:
 
 
 def check_times(path: Path, time_s: Floats, first_line: int, before_s: float = -np.inf) -> None:
-    """Raises FileFormatError at the first stamp that is missing or earlier than the one before it.
+    """Raises FileFormatError at the first stamp that is missing, impossible or earlier than the one before it.
 
     `before_s` is the stamp before the first.
     """
-    bad = np.flatnonzero(~(np.diff(time_s, prepend=before_s) >= 0))
+    with np.errstate(invalid="ignore", over="ignore"):  # of stamps that are infinite or not far from it
+        bad = np.flatnonzero(~(np.diff(time_s, prepend=before_s) >= 0) | (np.abs(time_s) > _LARGEST_TIME_S))
     if len(bad):
         row = int(bad[0])
-        what = "is missing" if np.isnan(time_s[row]) else f"runs backwards ({time_s[row]:.6f} s)"
-        raise FileFormatError(
-            path, f"{path}, line {first_line + row}: time_s {what}; remove the rows before or after it"
-        )
+        what = f"runs backwards ({time_s[row]:.6f} s); remove the rows before or after it"
+        if np.isnan(time_s[row]):
+            what = "is missing; remove the rows before or after it"
+        elif abs(time_s[row]) > _LARGEST_TIME_S:
+            what = f"is {time_s[row]:g}; it must be a number of seconds"
+        raise FileFormatError(path, f"{path}, line {first_line + row}: time_s {what}", first_line + row)

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from linkpose.errors import FileFormatError
-from linkpose.recording.chunks import Chunk, open_binary, read_chunks
+from linkpose.inputs import open_binary
+from linkpose.recording.chunks import Chunk, read_chunks
 from linkpose.recording.delimited import Cells, DecimalMark, has_rows, last_comment, split_cells, text_lines
 from linkpose.recording.numbers import parse_rows
 from linkpose.sensors.measurements import Floats

@@ -27,6 +27,10 @@ _MMHG = (600.0, 800.0)  # at sea level; as hPa, an altitude of 2 to 4 km
 _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
 _MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
+# From this correlation of gravity's rotation with the gyro's on, their scales are compared. From this factor between
+# them on, the gyro's scale is reported: a wrong range is off by 2 or more, and a fast swing is off by less.
+_AGREES = 0.9
+_SCALE_OFF = 1.7
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
 _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
@@ -106,12 +110,21 @@ def _turning(measurements: Measurements) -> str:
     known = np.isfinite(change).all(axis=1) & np.isfinite(expected).all(axis=1)
     both = float(np.sum(change[known] * expected[known]))
     size_change, size_expected = (float(np.sum(values[known] ** 2)) for values in (change, expected))
-    if size_expected == 0 or both < 0.5 * np.sqrt(size_change * size_expected):
+    if not np.any(gyro[np.isfinite(gyro)]):
+        return "gyro_* is 0 in all rows: the gyro gives no reading, or its columns are of another quantity"
+    if not size_change or not size_expected:
         return ""
-    ratio = both / size_expected / (np.pi / 180)
-    if not 2 / 3 < ratio < 1.5:
-        return ""
-    return f"gyro_* turns gravity {180 / np.pi:.0f} times too far: is it in °/s? multiply it by {np.pi / 180:.7f}"
+    agreement, factor = both / np.sqrt(size_change * size_expected), both / size_expected
+    if agreement >= 0.5 and 2 / 3 < factor / (np.pi / 180) < 1.5:
+        return f"gyro_* turns gravity {180 / np.pi:.0f} times too far: is it in °/s? multiply it by {np.pi / 180:.7f}"
+    if agreement <= -_AGREES:
+        return "gyro_* turns gravity backwards: its sign is reversed against accel_*"
+    if agreement >= _AGREES and not 1 / _SCALE_OFF < factor < _SCALE_OFF:
+        return (
+            f"gyro_* turns gravity by {1 / factor:.2g} of its rotation: check the range (gyro_range_deg_s) and the "
+            f"unit, or multiply it by {factor:.2g}"
+        )
+    return ""
 
 
 def _averaged(measurements: Measurements, size: int) -> tuple[Floats, Floats]:

@@ -7,6 +7,7 @@ height, where the pressure crosses a multiple of 256 Pa: less than the noise of 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class Calibration(NamedTuple):
     md: int
 
     @staticmethod
+    @lru_cache(maxsize=4)  # a live stream has the same words at each reading
     def of(words: tuple[int, ...]) -> Calibration:
         """From HELLO's `baro_words`: unsigned, in the order of the EEPROM."""
         signed = [word - 0x10000 if word & 0x8000 and at not in (3, 4, 5) else word for at, word in enumerate(words)]

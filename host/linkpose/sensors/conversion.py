@@ -43,6 +43,7 @@ _BARO = slice(COUNT_FIELDS.index("baro_ut"), COUNT_FIELDS.index("baro_count") + 
 _IMU_STEPS = 10.0 ** np.array(
     [mpu6050.ACCEL_DECIMALS] * 3 + [mpu6050.TEMPERATURE_DECIMALS] + [mpu6050.GYRO_DECIMALS] * 3, dtype=np.float64
 )
+_BARO_STEPS = 10.0 ** np.array([PRESSURE_DECIMALS, TEMPERATURE_DECIMALS], dtype=np.float64)
 _MAG_STEPS = 10.0**magnetometer.MAG_DECIMALS
 _MOUSE_BITS = np.array(MOUSE_VALID, dtype=np.int64)
 _PORTS = np.arange(MAX_MICE)
@@ -183,10 +184,9 @@ class Converter:
     def _convert_imu(self, number: int, counts: Integers, invalid: NDArray[np.bool_]) -> Floats:
         """Accelerations, temperature and rates (N, 7) of inertial sensor 0 or 1."""
         scale, offset = self._imu_scales[number]
-        imu = np.rint((counts * scale + offset) * _IMU_STEPS) / _IMU_STEPS
-        if invalid.any():
-            imu[invalid] = np.nan
-        return np.asarray(imu)
+        imu: Floats = np.rint((counts * scale + offset) * _IMU_STEPS) / _IMU_STEPS
+        np.copyto(imu, np.nan, where=invalid[:, None])
+        return imu
 
     def _convert_mag(self, counts: Integers, flags: Integers) -> dict[str, Any]:
         """Field (N, 3), µT, each reading repeated until the next, and where a new reading arrived (N,)."""
@@ -205,21 +205,18 @@ class Converter:
             return np.full((size, 2), np.nan), np.zeros(size, np.bool_)
         valid = flags & BARO_VALID != 0
         fresh, self._baro_count = _new_readings(valid, counts[:, 2], self._baro_count)
-        latest = np.cumsum(fresh)
-        readings = np.concatenate([self._baro, self._compensate(counts[fresh])]) if latest[-1] else self._baro
-        baro = readings.take(latest, axis=0)
-        if not valid.all():
-            baro[~valid] = np.nan
+        readings = np.concatenate((self._baro, self._compensate(counts[fresh, :2])))
+        baro = readings.take(fresh.cumsum(), axis=0)
+        np.copyto(baro, np.nan, where=~valid[:, None])
         self._baro = baro[-1:].copy()
         return baro, fresh & np.isfinite(baro[:, 0])
 
     def _compensate(self, counts: Integers) -> Floats:
         """Pressure (Pa) and temperature (degC) of readings (N, 2); NaN for an impossible one."""
-        temperature, pressure = self.settings.barometer.compensate(counts[:, 0], counts[:, 1])
-        decimals = 10.0**PRESSURE_DECIMALS
         baro = np.empty((len(counts), 2))
-        baro[:, 0], baro[:, 1] = np.rint(pressure * decimals) / decimals, temperature.round(TEMPERATURE_DECIMALS)
-        return baro
+        if len(counts):
+            baro[:, 1], baro[:, 0] = self.settings.barometer.compensate(counts[:, 0], counts[:, 1])
+        return np.rint(baro * _BARO_STEPS, out=baro) / _BARO_STEPS
 
     def _convert_mice(self, raw: RawSamples, flags: Integers) -> Floats:
         """Counts (N, ports, 2); NaN where a port has no mouse or its reading is invalid."""

@@ -19,6 +19,8 @@ from linkpose.wire.messages import (
     SampleFlags,
 )
 
+LEGAL_RATES_HZ = tuple(rate for rate in range(50, 501) if 2_000_000 % rate == 0)  # a tick is a whole number of 0.5 µs
+
 
 class Sensors(IntFlag):
     """Sensors that a board, a recording or a filter has or needs."""
@@ -189,7 +191,8 @@ def impossible(hello: Hello) -> str | None:
 
 def _impossible(hello: Hello) -> Iterator[str]:
     allowed = {
-        "sample_rate_hz": range(50, 501),
+        "streaming": (0, 1),
+        "sample_rate_hz": LEGAL_RATES_HZ,
         "accel_range_g": (2, 4, 8, 16),
         "gyro_range_deg_s": (250, 500, 1000, 2000),
         "dlpf": range(7),
@@ -201,7 +204,11 @@ def _impossible(hello: Hello) -> Iterator[str]:
         value = getattr(hello, name)
         if value not in values:
             yield f"{name} = {value}"
+    if (mice := (hello.sections >> 4) & 7) > MAX_MICE:
+        yield f"{mice} mice"
     for at, device in enumerate(hello.devices):
+        if device.kind not in list(DeviceKind):
+            yield f"kind {device.kind} for device {at}"
         if device.state not in list(DeviceState):
             yield f"state {device.state} for device {at}"
         if device.family not in list(DeviceFamily):

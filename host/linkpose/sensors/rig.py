@@ -15,7 +15,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from linkpose.errors import CannotRead, CannotWrite, FileFormatError
+from linkpose.errors import CannotWrite, FileFormatError
+from linkpose.inputs import read_bytes
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -28,6 +29,7 @@ _POSITIVE = (
 _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger ones overflow in the filters' squares
 
 CHAIN_JOINTS = ("ball", "hinge")
+FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
@@ -50,7 +52,13 @@ class Joint:
     @property
     def largest_std_m(self) -> float:
         """Standard deviation along the axis that is known least (m)."""
-        return max(self.j2s_std_m) if isinstance(self.j2s_std_m, tuple) else self.j2s_std_m
+        return max(self.std_of_axes_m)
+
+    @property
+    def std_of_axes_m(self) -> Vector:
+        """Standard deviation along each axis (m)."""
+        std = self.j2s_std_m
+        return std if isinstance(std, tuple) else (std, std, std)
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
@@ -224,9 +232,7 @@ class Rig:
     def load(path: str | PathLike[str]) -> Rig:
         """Reads a rig file. Raises CannotRead, or FileFormatError naming the file, the key and the cure."""
         try:
-            tables = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise CannotRead(path, error.strerror, "the rig file") from error
+            tables = tomllib.loads(read_bytes(Path(path), "the rig file").decode())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
             raise FileFormatError(path, f"{path} is not a rig file: {str(error)[:200]}") from error
         return Rig.from_dict(tables, str(path))
@@ -275,7 +281,7 @@ def _refuse_unknown(table: Mapping[str, Any], known: list[str], origin: str, whe
         if key not in known:
             near = difflib.get_close_matches(key, known, 1, 0.4)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-            raise FileFormatError(origin, f"{origin}: unknown key {where}{key}; {hint}")
+            raise FileFormatError(origin, f"{origin}: unknown key {where}{str(key)[:60]}; {hint}")
 
 
 def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:

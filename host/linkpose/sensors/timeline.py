@@ -10,6 +10,11 @@ from linkpose.sensors.conversion import GAP_BEFORE, Placed
 from linkpose.wire.messages import Sample
 
 _SEQ_WRAP = 1 << 16
+_T_WRAP = 1 << 32
+# How far the board's clock may be off its own count of ticks, in ticks, over at most WINDOW_TICKS: 5 %. The timer that
+# counts the ticks also stamps the samples, so that they agree; twice of it notices a slow clock half as early.
+OFF_TICKS = 5
+WINDOW_TICKS = 100
 
 
 class Clock(Protocol):
@@ -53,6 +58,55 @@ class Gap:
         }
 
 
+class Stamps:
+    """Compares the board's clock with its own count of ticks, and replaces it by the ticks where it cannot be right."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_us = period_s * 1e6
+        self.shift_us = 0  # what must be added to the board's clock since it jumped
+        self.is_trusted = True  # False: the clock stands still or runs at a wrong rate, and the ticks give the time
+        self.fault = ""  # what the last sample has shown, such as "jumped by 0.50 s"; "" if nothing new
+        self.restart()
+
+    def restart(self) -> None:
+        """The next sample starts a new count."""
+        self._last: tuple[int, int] | None = None  # seq and t_us of the last sample
+        self._ticks = self._off_us = 0.0  # since the window began
+
+    def corrected(self, seq: int, t_us: int) -> int:
+        """The sample's stamp (µs, modulo 2³²), or what it should have been."""
+        last, self._last, self.fault = self._last, (seq, t_us), ""
+        ticks = (seq - last[0]) % _SEQ_WRAP if last else 0
+        if last is None or not 0 < ticks <= WINDOW_TICKS:
+            self._ticks = self._off_us = 0.0
+            return (t_us + self.shift_us) % _T_WRAP
+        off_us = off_ticks(t_us - last[1], ticks, self._period_us)
+        if not self.is_trusted:
+            self.shift_us -= round(off_us)
+        elif abs(off_us) > OFF_TICKS * self._period_us:
+            self.shift_us -= round(off_us)
+            self.fault = f"jumped by {off_us * 1e-6:.2f} s"
+        else:
+            self._watch_rate(ticks, off_us)
+        return (t_us + self.shift_us) % _T_WRAP
+
+    def _watch_rate(self, ticks: int, off_us: float) -> None:
+        self._ticks, self._off_us = self._ticks + ticks, self._off_us + off_us
+        if abs(self._off_us) > OFF_TICKS * self._period_us:
+            rate = 1 + off_us / (ticks * self._period_us)
+            self.is_trusted = False
+            self.fault = "stands still" if abs(rate) < OFF_TICKS / WINDOW_TICKS else f"runs at {rate:.2f} of its rate"
+        if self._ticks >= WINDOW_TICKS:
+            self._ticks = self._off_us = 0.0
+
+
+def off_ticks(step_us: int, ticks: int, period_us: float) -> float:
+    """By how much (µs) a step of the board's clock differs from these ticks, or from 65536 more of them, and so on."""
+    off_us = (step_us - ticks * period_us + _T_WRAP / 2) % _T_WRAP - _T_WRAP / 2
+    wrap_us = _SEQ_WRAP * period_us
+    return float(off_us - max(0, round(off_us / wrap_us)) * wrap_us)
+
+
 class Timeline:
     """Places the samples of one recording one after another, over wraps, losses and restarts of the board."""
 
@@ -65,6 +119,7 @@ class Timeline:
         self._wire_seq = 0  # the last sample's seq as it came
         self._cause = "link"
         self._restarted = False
+        self.stamps = Stamps(self._period_s)
         self.is_over = False  # the end is reached
         self.missing_at_end = 0  # samples between the last one and the end, a part of `lost`
         self.end_gap_s = 0.0
@@ -102,6 +157,7 @@ class Timeline:
     def interrupted(self, cause: str) -> None:
         """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters start anew."""
         self._cause, self._restarted = cause, True
+        self.stamps.restart()
 
     def place(self, sample: Sample, clock: Clock, arrived_s: float) -> Placed | None:
         """Place of a sample that arrived at `arrived_s` (s, the host's clock).
@@ -110,7 +166,8 @@ class Timeline:
         """
         if self.is_over:
             return None
-        host_s = clock.host_time(clock.unwrap(sample.t_us, arrived_s))
+        t_us = self.stamps.corrected(sample.seq, sample.t_us)
+        host_s = clock.host_time(clock.unwrap(t_us, arrived_s))
         last = self._last
         if last is None:
             self.start_s = host_s

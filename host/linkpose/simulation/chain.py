@@ -1,7 +1,8 @@
-"""Two links with a sensor on each: a leg that hangs from a fixed joint, with a hinge or a ball joint at the knee.
+"""Two links with a sensor on each: a leg that hangs from a first joint, with a hinge or a ball joint at the knee.
 
-Link 1 moves about its fixed joint as the link of `simulation.link` does. Link 2 turns relative to it under the same
-envelope: at rest at the start and at the end. Rotations R take vectors of sensor 2's axes into sensor 1's.
+Link 1 moves about its first joint as the link of `simulation.link` does. The first joint is fixed, or free: carried to
+and fro as a hip is. Link 2 turns relative to link 1. All move under one envelope: at rest at the start and at the end.
+Rotations R take vectors of sensor 2's axes into sensor 1's.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from linkpose.errors import LinkposeError
 from linkpose.quantities import BALL_ANGLES
 from linkpose.rotations import of_matrices, swing_twist
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
-from linkpose.sensors.rig import CHAIN_JOINTS, Chain, Imu, Joint, Rig, Vector, to_quaternion, to_vector
+from linkpose.sensors.rig import CHAIN_JOINTS, FIRST_JOINTS, Chain, Imu, Joint, Rig, Vector, to_quaternion, to_vector
 from linkpose.simulation.link import LinkRun
+from linkpose.simulation.mag import axes
 from linkpose.simulation.motion import HandMotion, Kinematics
 
 Floats = NDArray[np.float64]
@@ -31,9 +33,13 @@ _AXIS1 = np.array([0.05, 1.0, 0.10])  # of the hinge, in sensor 1's axes: to the
 _LONG_AXIS = np.array([0.0, 0.0, 1.0])  # of link 1, in sensor 1's axes
 _STRAP = ((2, 0.45), (0, 0.2))  # how sensor 2 is turned on its link: about z, then about x (rad)
 _SWING1_RAD, _SWING2_RAD = 0.35, 0.4  # rms of the angles of link 1, and of link 2 relative to it: a brisk walk
-_RELATIVE_MOTION = 10  # stream of random numbers, apart from those of the link
+# A free first joint: rms of its path (m) along x and y of n (0.8 of it along z), and tempo; 1 m/s² rms along each, as
+# at the hip of a person who walks.
+_CARRIED_M, _CARRIED_TEMPO = 0.05, 1.5
+_RELATIVE_MOTION, _CARRIED_MOTION = 10, 11  # streams of random numbers, apart from those of the link
 _RIG_STD_M, _RIG_STD_DEG = 0.002, 0.5  # that a rig file states of the mounting
 
+_OVER_FIXED_JOINT = ("height_m", "x_m", "y_m")
 _BALL_COLUMNS = tuple(quantity.column for quantity in BALL_ANGLES)
 
 
@@ -61,15 +67,23 @@ class ChainRun(LinkRun):
         gyro_range_deg_s: int = 1000,
         oversampling: int = 1,
         noise_of: Rig | None = None,
+        first_joint: str = "fixed",
     ) -> None:
-        """`joint` is "ball" or "hinge"; the other arguments are those of `LinkRun`. Raises LinkposeError as it does."""
+        """`joint` is "ball" or "hinge", `first_joint` "fixed" or "free"; the other arguments are those of `LinkRun`.
+
+        Raises LinkposeError as it does.
+        """
         if joint not in CHAIN_JOINTS:
             raise LinkposeError(f"there is no joint {joint!r}: take {' or '.join(CHAIN_JOINTS)}")
+        if first_joint not in FIRST_JOINTS:
+            raise LinkposeError(f"there is no first joint {first_joint!r}: take {' or '.join(FIRST_JOINTS)}")
         super().__init__(
             1, seed, duration_s, rate_hz, errors, J2S_M, accel_range_g=accel_range_g, gyro_range_deg_s=gyro_range_deg_s,
             oversampling=oversampling, imu2=True, noise_of=noise_of, swing_rad=_SWING1_RAD,
         )  # fmt: skip
-        self.joint = joint
+        self.joint, self.first_joint = joint, first_joint
+        self._carried = HandMotion(np.random.default_rng([seed, _CARRIED_MOTION]), _CARRIED_TEMPO, duration_s)
+        self._carried.amplitude_rad = _CARRIED_M * (first_joint == "free")  # its angles serve as metres
         self._turned = HandMotion(np.random.default_rng([seed, _RELATIVE_MOTION]), 1.0, duration_s)
         self._turned.amplitude_rad = _SWING2_RAD
         self._first_angles = self._turned.angles(np.zeros(1))[0]
@@ -81,12 +95,16 @@ class ChainRun(LinkRun):
 
     @property
     def description(self) -> str:
-        return f"sim://chain?joint={self.joint}&seed={self.seed}&errors={self.errors}"
+        return f"sim://chain?joint={self.joint}&first_joint={self.first_joint}&seed={self.seed}&errors={self.errors}"
 
     @property
     def rig(self) -> Rig:
-        """What is known without a calibration of the chain: the fixed joint, and which joint the chain has."""
-        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=self._stated)
+        """What is known without a calibration of the chain: a fixed first joint, and which joint the chain has."""
+        return Rig(self._fixed_joint, Imu(delay_s=0.0), chain=self._stated)
+
+    @property
+    def _fixed_joint(self) -> Joint:
+        return Joint(self.j2s_m) if self.first_joint == "fixed" else Joint()
 
     @property
     def _stated(self) -> Chain:
@@ -106,7 +124,7 @@ class ChainRun(LinkRun):
         if self.joint == "hinge":
             chain = replace(chain, axis1=to_vector(axis1), axis1_std_deg=_RIG_STD_DEG)
             chain = replace(chain, axis2=to_vector(self._mount.T @ axis1), axis2_std_deg=_RIG_STD_DEG)
-        return Rig(Joint(self.j2s_m), Imu(delay_s=0.0), chain=chain)
+        return Rig(self._fixed_joint, Imu(delay_s=0.0), chain=chain)
 
     def relative(self, time_s: Floats) -> Relative:
         """Link 2 relative to link 1 at any instants (N,), s.
@@ -134,14 +152,24 @@ class ChainRun(LinkRun):
         turned = (_back(relative.rotation, vectors) for vectors in (first.tilt, rate, derivative))
         return Kinematics(np.full(len(time_s), np.nan), *turned)
 
+    def _felt(self, time_s: Floats, at_m: Floats) -> tuple[Floats, Floats]:
+        force, rate = super()._felt(time_s, at_m)
+        return force + self._carried_accel(time_s), rate
+
+    def _carried_accel(self, time_s: Floats) -> Floats:
+        """Acceleration of the first joint (N, 3), m/s², in sensor 1's axes. The barometer does not follow its path."""
+        accel = self._carried.angles(time_s)[2]
+        north, east, up = axes(self._motion.at(time_s))
+        return np.asarray(accel[0][:, None] * north + accel[1][:, None] * east + accel[2][:, None] * up)
+
     def _second(self, time_s: Floats) -> tuple[Floats, Floats]:
-        knee = self._motion.at(time_s).acceleration(self._d - self._r1)
+        knee = self._motion.at(time_s).acceleration(self._d - self._r1) + self._carried_accel(time_s)
         link = self.second_link(time_s)
         accel = _back(self.relative(time_s).rotation, knee) + link.acceleration(self._r2)
         return STANDARD_GRAVITY * link.tilt + accel, link.rate_rad_s
 
     def truth_columns(self, time_s: Floats) -> Mapping[str, Floats]:
-        """Sensor 1 as a link's; R as a quaternion, the angle of a hinge, and the heights of both sensors."""
+        """R as a quaternion, the joint's angles; sensor 1 as a link's, and with a fixed first joint both heights."""
         link, relative = self.at(time_s), self.relative(time_s)
         columns = dict(super().truth_columns(time_s))
         columns |= dict(zip(("qw", "qx", "qy", "qz"), of_matrices(relative.rotation).T, strict=True))
@@ -149,6 +177,8 @@ class ChainRun(LinkRun):
             columns |= dict(zip(_BALL_COLUMNS, np.degrees(self._ball_angles(relative)).T, strict=True))
         else:
             columns["angle_deg"] = (np.degrees(relative.angle_rad) + 180.0) % 360.0 - 180.0
+        if self.first_joint == "free":
+            return {name: column for name, column in columns.items() if name not in _OVER_FIXED_JOINT}
         below = link.tilt @ (self._d - self._r1) + self.second_link(time_s).tilt @ self._r2
         return columns | {"height1_m": link.height_m, "height2_m": below}
 

@@ -1,7 +1,7 @@
 """`sim://...`: simulated boards as pyserial ports, for any code that opens a port.
 
     sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&mag_disturbance=desk&drift_ppm=0&speed=1
-    sim://chain?joint=hinge&seed=0&errors=calibrated&drift_ppm=0&speed=1
+    sim://chain?joint=hinge&first_joint=fixed&seed=0&errors=calibrated&drift_ppm=0&speed=1
     sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8&drift_ppm=0&speed=1
 
 `speed` is how much faster than real time the board lives; 0 is as fast as it is read. `drift_ppm` is how much its clock
@@ -10,6 +10,7 @@ runs fast.
 
 from __future__ import annotations
 
+import difflib
 import math
 import threading
 import time
@@ -38,7 +39,7 @@ class Serial(serial.SerialBase):
         try:
             make_run, options = _parse(self.portstr or "")
         except LinkposeError as error:
-            raise serial.SerialException(f"{self.portstr}: {error}") from error
+            raise serial.SerialException(str(error)) from error
         self._speed, self._drift = options["speed"], 1 + 1e-6 * options["drift_ppm"]
         self._board = SimulatedBoard(make_run)
         self.rig = self._board.rig
@@ -131,7 +132,9 @@ def _parse(url: str) -> tuple[Callable[[Configure], Run], dict[str, float]]:
     if speed < 0 or abs(drift) > 10_000:
         raise LinkposeError("speed must be 0 or more, and drift_ppm within 10000")
     if parts.netloc not in _RIGS:
-        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; type {', '.join(map(_address, _RIGS))}")
+        near = difflib.get_close_matches(parts.netloc, _RIGS, 1)
+        names = f"did you mean {_address(near[0])}?" if near else f"type {', '.join(map(_address, _RIGS))}"
+        raise LinkposeError(f"there is no simulated board {parts.netloc!r}; {names}")
     rig, known = _RIGS[parts.netloc]
     make_run = rig(options)
     if options:
@@ -176,7 +179,8 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
 def _chain(options: dict[str, str]) -> Callable[[Configure], Run]:
     from linkpose.simulation.chain import ChainRun
 
-    joint, seed = options.pop("joint", "hinge"), int(_number(options, "seed", 0))
+    joint, first_joint = options.pop("joint", "hinge"), options.pop("first_joint", "fixed")
+    seed = int(_number(options, "seed", 0))
     errors = options.pop("errors", "calibrated")
 
     def make_run(settings: Configure) -> ChainRun:
@@ -189,6 +193,7 @@ def _chain(options: dict[str, str]) -> Callable[[Configure], Run]:
             accel_range_g=settings.accel_range_g,
             gyro_range_deg_s=settings.gyro_range_deg_s,
             oversampling=settings.baro_oversampling,
+            first_joint=first_joint,
         )
 
     return make_run
@@ -220,7 +225,7 @@ def _mice(options: dict[str, str]) -> Callable[[Configure], Run]:
 # Simulated board -> what makes it from its options, and their names.
 _RIGS: dict[str, tuple[Callable[[dict[str, str]], Callable[[Configure], Run]], str]] = {
     "link": (_link, "test, seed, errors, j2s, imu2, mag, mag_disturbance"),
-    "chain": (_chain, "joint, seed, errors"),
+    "chain": (_chain, "joint, first_joint, seed, errors"),
     "mice": (_mice, "seed, mice, path, errors, fault"),
 }
 

@@ -251,6 +251,7 @@ class StreamDecoder:
 
     def __init__(self, from_board: bool = True) -> None:
         self.corrupt = Corrupt()
+        self.misfit: tuple[int, int] | None = None  # type and body length of the last sound frame that is no message
         self._unpack = _UNPACK[from_board]
         self._unpack_sample: dict[int, Unpack] = _UNPACK_SAMPLE if from_board else {}
         self._types = {layout.type_id for layout in LAYOUTS if (layout.type_id < 0x80) == from_board}
@@ -297,14 +298,17 @@ class StreamDecoder:
         """Any message that is not a sound SAMPLE; None, counted, if it is not a message."""
         length = len(payload) - 3
         message = None
+        is_sound = length >= 0 and crc_hqx(payload[:-2], _CRC_START) == payload[-2] | payload[-1] << 8
         if length < 0 or length > _LONGEST_BODY:
             self.corrupt.length += 1
-        elif crc_hqx(payload[:-2], _CRC_START) != payload[-2] | payload[-1] << 8:
+        elif not is_sound:
             self.corrupt.crc += 1
         elif (unpack := self._unpack.get(payload[0] << 8 | length)) is None:
             self._refuse(payload)
         elif (message := unpack(payload)) is None:
             self.corrupt.length += 1
+        if is_sound and message is None:
+            self.misfit = payload[0], length
         return message
 
     def _refuse(self, payload: bytes) -> None:

@@ -121,6 +121,7 @@ class ChainFilter:
                 setattr(state, name, getattr(other, name))
             if learned.knows_heading:
                 state.axis, state.has_axis = other.axis, other.has_axis
+            state.level = max(other.level, 1.0)
             if backwards:
                 state.gyro_bias = -other.gyro_bias
             for first in set(range(0, self.size, 3)) - not_constant:

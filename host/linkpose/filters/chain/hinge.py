@@ -14,6 +14,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
+from linkpose.filters.chain.level import floor_level, follow_innovation
 from linkpose.filters.chain.rotation import between, rotate, rotate_back, square, to_matrix
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, Record
 from linkpose.filters.chain.update import clear_row, expected_square, update
@@ -106,7 +107,7 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
     """Apply the constraint, `h` (s) after the last time. Returns its log likelihood, at most 0."""
     rotate(s.rotation[0], s.axis[0], s.a)
     rotate(s.rotation[1], s.axis[1], s.b)
-    variance = q.play_correlation * max(s.play_square, q.least_play_rad**2)
+    variance = q.play_correlation * max(s.play_square, floor_level(s, q) * q.least_play_rad**2)
     uncertain = _horizontal_variance(s, size, hinge)
     across = s.b[0] ** 2 + s.b[1] ** 2
     heading_share = min(max(across / (_CLEAR_AXIS * uncertain) - 1, 0.0), 1.0)
@@ -128,6 +129,7 @@ def update_axis(s: Record, size: int, hinge: int, h: float, q: Record) -> float:
         value = s.a[row] - s.b[row]
         found += value * value
         fit, share = update(s, size, -value, variance, q.huber)
+        follow_innovation(s, 1, row, value, share + variance, h, q)
         likelihood += min(fit + density, 0.0)
         expected += share
     s.play_square += min(h / q.play_s, 1.0) * (max(found - expected, 0.0) / 2 - s.play_square)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 from linkpose.compiling import inner
+from linkpose.filters.chain.level import floor_level, follow_innovation
 from linkpose.filters.chain.rotation import cross, rotate, square
 from linkpose.filters.chain.state import BG, OF_SENSOR, Floats, R, Record, V
 from linkpose.filters.chain.update import clear_row, update
@@ -73,7 +74,7 @@ def update_joint(s: Record, size: int, first: int, gyro: Floats, h: float, q: Re
 
     `first` is the first row: 2, the vertical one, while the relative heading is unknown.
     """
-    own = q.velocity_floor_m_s**2
+    own = floor_level(s, q) * q.velocity_floor_m_s**2
     reach = 0.0
     for k in range(2):
         own += _side_variance(s, k, gyro, s.lever[k], OF_SENSOR * k + R, noise)
@@ -89,6 +90,7 @@ def update_joint(s: Record, size: int, first: int, gyro: Floats, h: float, q: Re
         fit, share = update(s, size, -value, variance, q.huber)
         likelihood += fit
         expected += share
+        follow_innovation(s, 0, row, value, share + variance, h, q)
     if first == 0:
         _follow_residual(s, found, expected, own, variance, reach, h, q)
     return likelihood
@@ -107,7 +109,8 @@ def _follow_residual(
     excess = min(max(found - expected - 3 * own, 0.0) / 3, 9 * variance)
     s.excess_square += keep * (excess - s.excess_square)
     s.reach_square += keep * (reach - s.reach_square)
-    s.residual_share = max(s.excess_square / max(s.reach_square, 1e-9), q.least_residual**2)
+    share = s.excess_square / max(s.reach_square, 1e-9)
+    s.residual_share = max(share, floor_level(s, q) * q.least_residual**2)
 
 
 @inner

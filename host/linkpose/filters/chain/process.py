@@ -18,13 +18,14 @@ from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.angles import report_angles, set_frame
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
+from linkpose.filters.chain.level import begin_level, follow_level
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
 from linkpose.filters.chain.stops import clear_stops, stop_variance, update_stop
 from linkpose.filters.chain.update import add_linearization_errors, apply_correction, clear_row, expected_square
-from linkpose.filters.frozen import is_frozen
+from linkpose.filters.frozen import MEMORY, is_frozen
 from linkpose.wire.messages import SampleFlags
 
 _NEEDED = int(SampleFlags.IMU_VALID | SampleFlags.IMU2_VALID)
@@ -35,8 +36,8 @@ _CLIPPED = int(
     | SampleFlags.GYRO2_SATURATED
 )
 # Readings of a sensor at rest may repeat to the last bit (low-pass filter, little noise): below this rate of all axes
-# they do not show a frozen sensor.
-_RESTING_RAD_S = 0.05
+# they do not show a frozen sensor, unless they repeat for _LONGEST_REPEAT_S.
+_RESTING_RAD_S, _LONGEST_REPEAT_S = 0.05, 2.0
 _LARGEST = 1e4  # m/s² or rad/s: beyond what any sensor reads
 _UNKNOWN_HEADING = math.pi / math.sqrt(3.0)  # σ of a heading that is uniform all around (rad)
 
@@ -85,6 +86,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             for j in range(3):
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
         s.moved_heading = 0.0
+        begin_level(s, q)
         for k in range(2):
             for j in range(3):
                 s.moved_axis[k, j] = 0.0
@@ -96,6 +98,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             _begin_start(s, bank.length)
     if bank.hinge < 0 and not bank.begun:
         set_frame(bank, states[0].rotation[0, 2])
+    bank.rests = int(not bank.begun)
     bank.begun, bank.spread, bank.best = 1, 0, 0
     if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
         _spread(bank, states, 0.0, gyro, q)
@@ -235,6 +238,7 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
         s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
     if bank.spread:
         add_linearization_errors(s, hinge, h, q)
+    follow_level(s, h, q)
     s.log_likelihood += q.tempering * likelihood
     p, total = s.covariance, 0.0
     for i in range(3):
@@ -302,7 +306,9 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         if base >= 0:
-            out.height[k], out.height_std[k] = _height(best, k, size, base)
+            height, std = _height(best, k, size, base)
+            if std < q.unknown_m:
+                out.height[k], out.height_std[k] = height, std
     for k in range(2):
         for i in range(3):
             out.tilt[k, i] = best.rotation[k, 2, i]
@@ -407,7 +413,8 @@ def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, cali
         bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
         is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
-    return is_possible and not (frozen and turns)
+    frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
+    return is_possible and not frozen
 
 
 @inner
@@ -415,6 +422,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
     """One sample, `h` (s) after the last."""
     for k in range(2):
         follow_rest(bank, states[bank.best], k, gyro, accel, h, q)
+        if bank.still_s[k] == 0.0:
+            bank.rests = 0
     bank.since_update += h
     due = bank.since_update >= q.period_s
     for i in range(states.shape[0]):
@@ -425,6 +434,8 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
             s.span += h
             if due:
                 _update(s, bank, gyro, bank.since_update, q, noise)
+                if bank.rests and min(bank.still_s[0], bank.still_s[1]) > q.rest_s:
+                    _begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
     if due:
         bank.since_update = 0.0
         _select(bank, states, q)

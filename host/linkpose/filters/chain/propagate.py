@@ -61,9 +61,10 @@ def integrate(
         s.swing[k, i] = s.swing[k, i] * (1 - min(h / q.swing_s, 1.0)) + own * h
     guess = h * h / 12 if h > LONGEST_STEP_S else 0.0
     rate_square = bx * bx + by * by + bz * bz
-    s.rotation_variance[k] += h * (h * noise[0] + q.gyro_misfit**2 * rate_square * _GYRO_MISFIT_S)
+    gyro_misfit, accel_misfit = s.level * q.gyro_misfit**2, s.level * q.accel_misfit**2
+    s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * rate_square * _GYRO_MISFIT_S)
     s.rotation_variance[k] += (h * guess * _JERK_RAD_S3) ** 2
-    s.velocity_variance[k] += h * (h * noise[1] * s.widening + q.accel_misfit**2 * s.accel_square[k] * _ACCEL_MISFIT_S)
+    s.velocity_variance[k] += h * (h * noise[1] * s.widening + accel_misfit * s.accel_square[k] * _ACCEL_MISFIT_S)
     s.velocity_variance[k] += (h * guess * _JERK_M_S3) ** 2
     turning = (by * fz - bz * fy) ** 2 + (bz * fx - bx * fz) ** 2 + (bx * fy - by * fx) ** 2
     s.force_rate_square[k] += min(h / q.accel_scale_s, 1.0) * (turning - s.force_rate_square[k])
@@ -136,7 +137,7 @@ def propagate_covariance(s: Record, size: int, q: Record) -> None:
         _transpose(p, size)
     for k in range(2):
         o, turned, impulse = OF_SENSOR * k, s.turned[k], s.impulse[k]
-        walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + q.accel_scale**2 * s.force_rate_square[k]) * span
+        walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + s.level * q.accel_scale**2 * s.force_rate_square[k]) * span
         for i in range(3):
             p[o + i, o + i] += s.rotation_variance[k]
             p[o + V + i, o + V + i] += s.velocity_variance[k]

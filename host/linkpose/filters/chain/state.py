@@ -2,9 +2,9 @@
 
 Frame n has Z upwards; its heading is arbitrary. Of each sensor k the filter estimates the rotation R_k from the
 sensor's axes into n, the velocity v_k in n, the biases of gyro and accelerometer, and r_k, the vector from the joint
-centre to the sensor in the sensor's axes. S_k are the R_k at the first sample, from which joint angles count. A hinge
-adds its axis j_k in either sensor's axes. A fixed first joint adds r_0, the vector from that joint to sensor 1. Errors
-of rotations are in n: R = exp([δθ×]) R̂.
+centre to the sensor in the sensor's axes. S_k are the R_k at the first sample, or at the end of a rest that begins
+there; joint angles count from them. A hinge adds its axis j_k in either sensor's axes. A fixed first joint adds r_0,
+the vector from that joint to sensor 1. Errors of rotations are in n: R = exp([δθ×]) R̂.
 """
 
 from __future__ import annotations
@@ -61,6 +61,25 @@ class ChainParameters(NamedTuple):
     # Acceleration noise grows up to `most_widening` times where innovations exceed their σ, by e in 1/widening_rate s.
     widening_rate: float = 1.0
     most_widening: float = 100.0
+    # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1
+    # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second,
+    # so the level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated
+    # leg (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8
+    # times their error; at 0.01 throughout, σ of data-sheet sensors is a fifth of it.
+    moving_mean_s: float = 0.5
+    # That square, where σ is right: 0.1 to 0.3 for all of these. Doubled, σ of the hinge [D] 3-4 is 25 % smaller than
+    # its error.
+    level_square: float = 0.25
+    level_s: float = 10.0  # over which the square is averaged (s). At 4 s, short bad stretches of [D] set the level.
+    # Rate (1/s) at which the level grows e-fold for each multiple of `level_square` beyond the first, and falls below;
+    # doubled, calibrated sensors have their σ 5 s earlier, and the ball joint of [D] loses a quarter of its accuracy.
+    level_rate: float = 0.25
+    level_most_ratio: float = 8.0
+    least_level: float = 0.01  # scale error of 0.2 %: twelve-position calibration
+    # Reached by a hinge's axis only: errors of the accelerometer turn with the link, and the axis shows them.
+    most_level: float = 10.0
+    least_floor_level: float = 0.06  # the same for floors of the residual and of the play: (2.5 mm/s)², not 10 mm/s
+    level_std_rad: float = 0.1  # σ of the rotation above which the level does not fall
     # Play of a hinge (rad): σ before it has been measured, and the least; time over which it is measured (s).
     first_play_rad: float = 0.01
     least_play_rad: float = 0.003
@@ -111,6 +130,7 @@ class ChainParameters(NamedTuple):
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
+    unknown_m: float = 0.1  # ditto, of a height: an unknown r_k alone makes it 0.3 m
     # Prior standard deviations.
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
@@ -159,6 +179,9 @@ STATE = np.dtype(
         ("innovation_ratio", "f8"),  # mean square innovation over its expectation
         ("widening", "f8"),
         ("play_square", "f8"),
+        ("level", "f8"),  # of the model's errors
+        ("moving_mean", "f8", (2, 3)),  # of innovations over σ: of the joint, of a hinge's axis,
+        ("moving_square", "f8", 2),  # and the mean of its square, 1 for white noise
         ("moved_heading", "f8"),  # corrections within the last second: of the relative heading (rad)
         ("moved_axis", "f8", (2, 3)),  # and of either axis
         ("relative_spread", "f8", (3, 3)),  # ∫ ω_rel ω_relᵀ dt
@@ -208,6 +231,7 @@ BANK = np.dtype(
         ("mean_gyro", "f8", (2, 3)),
         ("mean_accel", "f8", (2, 3)),
         ("still_s", "f8", 2),
+        ("rests", "i8"),  # whether both sensors have been at rest since the first sample
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
         ("new_accel", "f8", (2, 3)),
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`

@@ -33,7 +33,7 @@ def follow_speed(s: Record, turn: Vec, force: Vec, h: float, q: Record) -> None:
     trust its error the more. The acceleration's mean square is measured beside it. A rest changes nothing: the next
     motion is assumed to be as fast as the last.
     """
-    swing = vec.turn_back(turn, vec.load(s.swing))
+    swing = vec.turn_back(vec.turn_of(turn), vec.load(s.swing))
     accel = vec.axpy(-GRAVITY, vec.load(s.tilt), force)
     swing = vec.axpy(h, accel, vec.scale(1.0 - min(h / q.swing_time_s, 1.0), swing))
     vec.store(s.swing, swing)

@@ -2,24 +2,45 @@
 
 from __future__ import annotations
 
+import math
+
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY
 from linkpose.filters._vector import Vec
 from linkpose.filters.inertial.propagate import specific_force
-from linkpose.filters.inertial.state import BA, BG, MA, SIZE, Floats, Record, V, Z
+from linkpose.filters.inertial.state import BA, BG, MA, PSI, SIZE, Floats, Record, V, Z
 from linkpose.filters.inertial.update import SMALL_RAD2
 
 _NEARLY_VERTICAL = 0.01  # square of the horizontal part of an axis that is too short to give a heading
 
 
 @inner
+def _pointer(tilt: Vec) -> Vec:
+    """The sensor's x axis; its z axis where x is nearly vertical."""
+    return (0.0, 0.0, 1.0) if 1.0 - tilt[0] * tilt[0] < _NEARLY_VERTICAL else (1.0, 0.0, 0.0)
+
+
+@inner
 def heading_axis(tilt: Vec) -> Vec:
-    """X: the sensor's x axis seen from above; its z axis where x is nearly vertical."""
-    axis = (1.0, 0.0, 0.0)
-    if 1.0 - tilt[0] * tilt[0] < _NEARLY_VERTICAL:
-        axis = (0.0, 0.0, 1.0)
+    """X: the sensor's pointer seen from above."""
+    axis = _pointer(tilt)
     return vec.unit(vec.axpy(-vec.dot(axis, tilt), tilt, axis))
+
+
+@inner
+def relate_heading(s: Record) -> None:
+    """Covariance of ψ with the other errors where X is `heading_axis` of an uncertain tilt.
+
+    Seen from above, the pointer a turns with Z: ψ = (a·Z) / √(1 − (a·Z)²) YᵀδZ, with Y = Z × X. A later correction of
+    the tilt then corrects the heading since the start.
+    """
+    p, tilt = s.covariance, vec.load(s.tilt)
+    west, along = vec.cross(tilt, vec.load(s.north)), vec.dot(_pointer(tilt), tilt)
+    west = vec.scale(along / math.sqrt(max(1.0 - along * along, _NEARLY_VERTICAL)), west)
+    for j in range(PSI):
+        p[PSI, j] = p[j, PSI] = west[0] * p[Z, j] + west[1] * p[Z + 1, j] + west[2] * p[Z + 2, j]
+    p[PSI, PSI] += west[0] * p[PSI, Z] + west[1] * p[PSI, Z + 1] + west[2] * p[PSI, Z + 2]
 
 
 @inner

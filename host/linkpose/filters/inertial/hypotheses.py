@@ -46,14 +46,15 @@ def mix(first: Record, second: Record, out: Floats) -> None:
 
     A variance includes how far the filters differ. Where one filter has no position, the other's counts alone.
 
-    The prior odds choose between the filters before the motion shows what the sensors are; σ must not. So far as the
-    accelerometer's bias is still unknown to the second filter, σ is therefore that of even odds.
+    The prior odds choose between the filters before the motion shows what the sensors are; σ must not. As long as the
+    accelerometer's bias is unknown to the second filter, σ is therefore that of even odds.
     """
     for i in range(len(first)):
         a, b = first[i], second[i]
         odds = _log_odds(a.distance, b.distance)
         probability = 1.0 / (1.0 + math.exp(-odds))
-        weight = 1.0 / (1.0 + math.exp(-max(odds - _LOG_ODDS * b.unknown, min(odds, 0.0))))
+        unresolved = min(b.unknown * b.unknown, 1.0)
+        weight = min(probability, 1.0 - 0.5 * unresolved)
         unknown_a, unknown_b = math.isnan(a.value[HEIGHT]), math.isnan(b.value[HEIGHT])
         share = 1.0 if unknown_b and not unknown_a else 0.0 if unknown_a and not unknown_b else probability
         position_weight = weight if share == probability else share

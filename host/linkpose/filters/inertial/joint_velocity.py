@@ -1,7 +1,9 @@
 """The joint's constraint on the velocity as a measurement: 0 = v − ω × d + n_G × d + e.
 
 The joint centre is fixed, so the angular rate gives the sensor's velocity. e is what the constraint leaves over (play,
-bending, a joint that moves): its mean square is measured as a share of (‖ω‖ ‖d‖)² over the last seconds.
+bending, a joint that moves). Its mean square is measured on each axis, as a share of (‖ω‖ ‖d‖)² over the last seconds.
+It follows the motion and has its correlation time T, so that updates at intervals h count as white noise of the
+variance e² · 2T / h (`free_velocity` has the source); the least share, a sampling error, is white.
 
 The same noise is in the reading s_G and in the innovation. A reading that may be noise alone would therefore be
 "explained" by M_g, or by a shorter d (errors in variables). So M_g is updated by the components of the reading that
@@ -16,7 +18,7 @@ from __future__ import annotations
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import ImuCalibration
-from linkpose.filters._vector import Vec
+from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.inertial.propagate import angular_rate
 from linkpose.filters.inertial.state import BG, MG, SIZE, D, Floats, Record, V
 from linkpose.filters.inertial.update import project, sub_covariance, update_vector
@@ -29,6 +31,7 @@ _GATE = 25.0
 # Share of the strongest direction's mean square rotation that another direction must exceed to update J2S along it:
 # (5 %)², twice what cross-axis sensitivity and misalignment of an uncalibrated sensor (2 %) leak into it.
 _LEAK = 0.0025
+FIRST_REACH_M2_S2 = 0.5  # mean square speed that the assumed share of the constraint's residual counts for
 _SPREAD_S = 5.0  # over which ω ωᵀ is averaged (s): some swings of a hand
 
 
@@ -113,23 +116,45 @@ def update_joint_velocity(
     expected = vec.add(expected, 1.0, vec.cross_product_covariance(vec.minus(rate, excited), lever))
     moved = vec.minus(before, vec.load(s.gyro_bias)) if jumped else rate  # a spike must not excuse itself
     reach = vec.dot(moved, moved) * vec.dot(d, d)
-    share = min(max(s.residual_square / s.reach_square, q.least_residual**2), 1.0)
-    whole = vec.plus_diagonal(expected, share * reach)
-    inverse = vec.inverse(whole)
-    distance = vec.quadratic(inverse, innovation)
-    _follow_residual(s, innovation, vec.trace(expected), share, reach, min(h / q.residual_time_s, 1.0))
+    excess = vec.scale(reach, _shares(s, 0.0, q))
+    whole = vec.add_diagonal(expected, excess)
+    distance = vec.quadratic(vec.inverse(whole), innovation)
+    _follow_residual(s, innovation, expected, excess, reach, h, q)
+    if jumped and not distance <= _GATE:
+        return False
+    lasting = max(2.0 * q.residual_correlation_s / h, 1.0) - 1.0
+    x, y, z = measured_shares(s, q)
+    least = q.least_residual**2
+    inverse = vec.inverse(vec.add_diagonal(whole, vec.scale(lasting * reach, (x - least, y - least, z - least))))
     if not distance <= _GATE:
-        if jumped:
-            return False
         inverse = vec.scaled(_GATE / distance, inverse)  # the state may be wrong: a cautious update
     update_vector(s, innovation, inverse)
     return True
 
 
 @inner
-def _follow_residual(s: Record, innovation: Vec, expected: float, share: float, reach: float, keep: float) -> None:
-    """Measure the share of (‖ω‖ ‖d‖)² that the constraint leaves over."""
-    square = min(vec.dot(innovation, innovation), _GATE * (expected + 3.0 * share * reach))
-    s.residual_square += keep * ((square - expected) / 3.0 - s.residual_square)
+def measured_shares(s: Record, q: Record) -> Vec:
+    """Share of (‖ω‖ ‖d‖)² that the constraint leaves over on each axis, without what is assumed at the start."""
+    return _shares(s, s.assumed * FIRST_REACH_M2_S2 * q.first_residual**2, q)
+
+
+@inner
+def _shares(s: Record, less: float, q: Record) -> Vec:
+    """The same, less a mean square (m²/s²) that does not count."""
+    least, r = q.least_residual**2, s.residual_square
+    return (
+        min(max((r[0] - less) / s.reach_square, least), 1.0),
+        min(max((r[1] - less) / s.reach_square, least), 1.0),
+        min(max((r[2] - less) / s.reach_square, least), 1.0),
+    )
+
+
+@inner
+def _follow_residual(s: Record, innovation: Vec, expected: Sym, excess: Vec, reach: float, h: float, q: Record) -> None:
+    """Measure the square that the constraint leaves over on each axis, and ‖ω‖² ‖d‖²."""
+    known, keep = (expected[0], expected[3], expected[5]), min(h / q.residual_time_s, 1.0)
+    for k in range(3):
+        square = min(innovation[k] * innovation[k], _GATE * (known[k] + excess[k]))
+        s.residual_square[k] += keep * (square - known[k] - s.residual_square[k])
     s.reach_square += keep * (reach - s.reach_square)
     s.assumed *= 1.0 - keep

@@ -16,6 +16,7 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import (
     GRAVITY,
     LONGEST_BLIND_S,
+    LONGEST_HOLD_S,
     ImuCalibration,
     ImuSamples,
     blind_for,
@@ -28,8 +29,8 @@ from linkpose.filters._imu import (
 from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
 from linkpose.filters.inertial.free_velocity import correlation_time, follow_speed, update_free_velocity
-from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis
-from linkpose.filters.inertial.joint_velocity import update_joint_velocity
+from linkpose.filters.inertial.gravity import align_to_gravity, heading_axis, relate_heading
+from linkpose.filters.inertial.joint_velocity import FIRST_REACH_M2_S2, measured_shares, update_joint_velocity
 from linkpose.filters.inertial.noise import follow_noise, start_noise, with_noise
 from linkpose.filters.inertial.propagate import (
     add_noise,
@@ -42,6 +43,7 @@ from linkpose.filters.inertial.propagate import (
     specific_force,
     velocity_variance,
 )
+from linkpose.filters.inertial.report import report
 from linkpose.filters.inertial.rest import (
     align_at_rest,
     follow_rest,
@@ -53,18 +55,12 @@ from linkpose.filters.inertial.rest import (
 from linkpose.filters.inertial.state import (
     BA,
     BG,
-    HEIGHT,
     MG,
-    PITCH,
     PSI,
-    ROLL,
     SIZE,
-    YAW,
     D,
     Record,
     V,
-    X,
-    Y,
     Z,
 )
 from linkpose.filters.inertial.unobservable import restore_unobservable
@@ -72,9 +68,6 @@ from linkpose.filters.inertial.update import sub_covariance
 
 # Least interval between two updates (s). A faster pace gains nothing: what the models leave over is correlated.
 _UPDATE_INTERVAL_S = 0.035
-# Identical readings for less than this are one reading of a slower sensor, held by the logger (s).
-LONGEST_HOLD_S = 0.1
-_NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
 # From one sample to the next: a spike, or at least no smooth motion. A rate is compared with its linear extrapolation:
 # at 1200 °/s it changes by more between sound samples.
 _JUMP_RAD_S, _JUMP_M_S2 = 1.0, 10.0
@@ -87,13 +80,11 @@ _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
-_FIRST_REACH_M2_S2 = 0.5  # mean square speed that the assumed share of the constraint's residual counts for
 _LOST, _LOST_M2_S2 = 0.5, 0.01
+_ANY_HEADING_RAD2 = math.pi**2  # variance of a heading that is not known
 # σ of what was learned grows by this factor then: after two or three losses in a row it is that of the start.
 _WIDEN = 3.0
 _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
-_LEAST_LEVEL = 1e-4  # square of the horizontal part of an axis below which the angles that it gives are undefined
-_UNKNOWN_HEIGHT_M = 0.1  # σ of the height through J2S alone, above which the height is not known
 
 
 @compiled
@@ -123,7 +114,7 @@ def process(
         else:
             good = False
         s.rejected += 0 if good else 1
-        _report(s, time_s, imu, out[i])
+        report(s, time_s, imu, out[i])
 
 
 @inner
@@ -143,24 +134,33 @@ def _take_sample(s: Record, time_s: float, force: Vec, rate: Vec) -> None:
 
 @inner
 def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> None:
-    """Mean and covariance from one sample and the priors."""
+    """Mean and covariance from one sample and the priors; at a restart, heading and its variance stay."""
+    heading_variance = s.covariance[PSI, PSI]
+    if not 0.0 <= heading_variance <= _ANY_HEADING_RAD2:  # NaN too, after impossible readings
+        heading_variance = _ANY_HEADING_RAD2
+    s.unmoved = s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0
     for i in range(SIZE):
         s.nominal[i] = s.start_mean[i]
         for j in range(SIZE):
             s.covariance[i, j] = s.start_covariance[i, j]
     s.distance = _distance(s)
     s.rate_noise = s.force_noise = 0.0
-    if s.north[0] == 0.0 and s.north[1] == 0.0 and s.north[2] == 0.0:
+    s.covariance[PSI, PSI] = heading_variance
+    if s.unmoved:
         vec.store(s.tilt, vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0))
         vec.store(s.north, heading_axis(vec.load(s.tilt)))
     _forget_motion(s, q)
     _align(s, force, rate, imu, q)
+    if s.unmoved:
+        relate_heading(s)
 
 
 @inner
 def _forget_motion(s: Record, q: Record) -> None:
     """What was measured of the motion is measured again: the constraint's residual, the excited directions, a rest."""
-    s.residual_square, s.reach_square, s.assumed = _FIRST_REACH_M2_S2 * q.first_residual**2, _FIRST_REACH_M2_S2, 1.0
+    s.reach_square, s.assumed = FIRST_REACH_M2_S2, 1.0
+    for i in range(3):
+        s.residual_square[i] = FIRST_REACH_M2_S2 * q.first_residual**2
     s.rest_s = 0.0
     for i in range(3):
         for j in range(3):
@@ -329,6 +329,12 @@ def _update(
 
 
 @inner
+def _mean_residual_square(s: Record) -> float:
+    """Mean over the axes (m²/s²)."""
+    return float(s.residual_square[0] + s.residual_square[1] + s.residual_square[2]) / 3.0
+
+
+@inner
 def _bias_walk(s: Record, q: Record) -> float:
     """Random walk of the gyro bias ((rad/s)/√s); more where the joint's constraint leaves over more than its floor.
 
@@ -338,8 +344,8 @@ def _bias_walk(s: Record, q: Record) -> float:
     """
     if not q.has_joint:
         return float(q.gyro_bias_walk_rad_s)
-    measured = s.residual_square - s.assumed * _FIRST_REACH_M2_S2 * q.first_residual**2
-    share = math.sqrt(max(measured / s.reach_square, q.least_residual**2)) / q.least_residual
+    x, y, z = measured_shares(s, q)
+    share = math.sqrt((x + y + z) / 3.0) / q.least_residual
     return float(min(q.gyro_bias_walk_rad_s * share**3, q.most_bias_walk_rad_s))
 
 
@@ -386,7 +392,7 @@ def _restart_if_lost(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: R
         and math.isfinite(s.nominal[V] + s.nominal[V + 1] + s.nominal[V + 2] + s.tilt[0])
         and math.isfinite(vec.trace(sub_covariance(s.covariance, V)) + vec.trace(sub_covariance(s.covariance, D)))
     )
-    lost = q.has_joint > 0.0 and s.residual_square > _LOST * max(s.reach_square, _LOST_M2_S2)
+    lost = q.has_joint > 0.0 and _mean_residual_square(s) > _LOST * max(s.reach_square, _LOST_M2_S2)
     if possible and not lost:
         return
     s.restarts += 1
@@ -414,85 +420,3 @@ def _widen_parameters(s: Record) -> None:
 @inner
 def _same(a: Vec, b: Vec) -> bool:
     return bool(a[0] == b[0] and a[1] == b[1] and a[2] == b[2])
-
-
-@inner
-def _report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
-    """The estimate at the time of the stamp: the readings' delay, and a step that waits, are extrapolated."""
-    bias, waited = vec.load(s.gyro_bias), 0.0
-    ahead = vec.scale(imu.delay, vec.minus(vec.load(s.newest_rate), bias))
-    if s.time < time_s < math.inf:  # while the step waits
-        waited = time_s - s.turned_at
-        ahead = vec.axpy(1.0, vec.load(s.angle), ahead)
-        ahead = vec.axpy(waited, vec.load(s.newest_rate), ahead)
-        ahead = vec.axpy(s.time - time_s, bias, ahead)
-    if s.blind_s == 0.0:
-        ahead = vec.axpy(0.5 * min(waited + imu.delay, LONGEST_HOLD_S) ** 2, vec.load(s.rate_slope), ahead)
-    ahead = corrected(s.nominal, MG, ahead)
-    tilt, north = vec.turn_back(ahead, vec.load(s.tilt)), vec.turn_back(ahead, vec.load(s.north))
-    west, d = vec.cross(tilt, north), vec.load(s.j2s)
-    _report_values(tilt, north, west, d, row)
-    _report_stds(s, vec.scale(-1.0, vec.axpy(1.0, vec.load(s.turned), ahead)), tilt, north, west, d, row)
-    row.distance = s.distance
-    row.unknown = vec.trace(sub_covariance(s.covariance, BA)) / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])
-    unknown = 0
-    if math.isnan(s.time) or max(s.blind_s, s.no_force_s) > _NO_SENSOR_S:
-        vec.store(row.tilt, (math.nan, math.nan, math.nan))
-        unknown = YAW + 1
-    elif vec.quadratic(sub_covariance(s.covariance, D), tilt) > _UNKNOWN_HEIGHT_M**2:
-        unknown = Y + 1
-    for i in range(unknown):
-        row.value[i] = row.std[i] = math.nan
-
-
-@inner
-def _report_values(tilt: Vec, north: Vec, west: Vec, d: Vec, row: Record) -> None:
-    """Position of the sensor and the angles of its attitude R_z(yaw) R_y(pitch) R_x(roll)."""
-    vec.store(row.tilt, tilt)
-    row.value[HEIGHT], row.value[X], row.value[Y] = vec.dot(tilt, d), vec.dot(north, d), vec.dot(west, d)
-    row.value[ROLL] = math.atan2(tilt[1], tilt[2])
-    row.value[PITCH] = math.atan2(-tilt[0], math.sqrt(tilt[1] * tilt[1] + tilt[2] * tilt[2]))
-    row.value[YAW] = math.atan2(west[0], north[0])
-
-
-@inner
-def _report_stds(s: Record, back: Vec, tilt: Vec, north: Vec, west: Vec, d: Vec, row: Record) -> None:
-    """σ of each reported value; `back` is the rotation to the attitude at which the covariance was propagated (rad).
-
-    The attitude error is the rotation θ = ψ Z − Z × δZ, which turns X by X × θ and Y by Y × θ. The gradient of
-    yaw = atan2(Y_x, X_x) with respect to θ follows from these; that of Xᵀd is d × X, that of Yᵀd is d × Y.
-    """
-    none = (0.0, 0.0, 0.0)
-    row.std[HEIGHT] = _std(s, vec.turn_back(back, d), 0.0, tilt)  # δ(Zᵀd) = dᵀδZ + Zᵀδd
-    slope = vec.cross(d, north)
-    row.std[X] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), north)
-    slope = vec.cross(d, west)
-    row.std[Y] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), west)
-    level = max(tilt[1] * tilt[1] + tilt[2] * tilt[2], _LEAST_LEVEL)
-    slope = (0.0, tilt[2] / level, -tilt[1] / level)
-    row.std[ROLL] = _std(s, vec.turn_back(back, slope), 0.0, none)
-    level = math.sqrt(level)
-    slope = (-level, tilt[0] * tilt[1] / level, tilt[0] * tilt[2] / level)
-    row.std[PITCH] = _std(s, vec.turn_back(back, slope), 0.0, none)
-    level = max(north[0] * north[0] + west[0] * west[0], _LEAST_LEVEL)
-    slope = (0.0, west[0] * north[2] - north[0] * west[2], north[0] * west[1] - west[0] * north[1])
-    slope = vec.scale(1.0 / level, slope)
-    row.std[YAW] = _std(s, vec.turn_back(back, vec.cross(tilt, slope)), vec.dot(slope, tilt), none)
-
-
-@inner
-def _std(s: Record, across: Vec, along: float, towards: Vec) -> float:
-    """σ of a value with the gradients `across` (of Z), `along` (of ψ) and `towards` (of J2S)."""
-    g, p, variance = s.gradient, s.covariance, 0.0
-    for i in range(3):
-        g[i], g[3 + i] = across[i], towards[i]
-    g[6] = along
-    for i in range(7):
-        if g[i] == 0.0:  # an angle does not depend on J2S
-            continue
-        row = i if i < 3 else i + D - 3  # J2S and ψ are neighbours
-        part = 0.5 * g[i] * p[row, row]
-        for j in range(i):
-            part += g[j] * p[row, j if j < 3 else j + D - 3]
-        variance += 2.0 * g[i] * part
-    return math.sqrt(max(variance, 0.0))

@@ -11,8 +11,9 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
-from linkpose.filters._vector import Vec
+from linkpose.filters._vector import Turn, Vec
 from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, Floats, Record, V, Z
+from linkpose.filters.inertial.update import multiply_row
 
 # Acceleration that a step without a force may hold (m/s², 1σ): a blow. The velocity is then unknown after a few
 # samples, which is the intention. Doubling it changes nothing visible.
@@ -52,8 +53,8 @@ def angular_rate(s: Record, reading: Vec) -> Vec:
 
 
 @inner
-def rotate_attitude(s: Record, turn: Vec) -> None:
-    """Z and X after the sensor has turned by `turn` (rad), orthonormal again."""
+def rotate_attitude(s: Record, turn: Turn) -> None:
+    """Z and X after a turn of the sensor, orthonormal again."""
     tilt = vec.unit(vec.turn_back(turn, vec.load(s.tilt)))
     north = vec.turn_back(turn, vec.load(s.north))
     vec.store(s.tilt, tilt)
@@ -61,13 +62,13 @@ def rotate_attitude(s: Record, turn: Vec) -> None:
 
 
 @inner
-def integrate(s: Record, turn: Vec, begin: Vec, end: Vec, bend: Vec, h: float) -> None:
-    """Attitude and velocity after a step `h` that turns the sensor by `turn`, with f `begin` and `end` at its ends.
+def integrate(s: Record, rotation: Vec, begin: Vec, end: Vec, bend: Vec, h: float) -> None:
+    """Attitude and velocity after a step `h` that turns the sensor by `rotation`, with f `begin` and `end` at its ends.
 
     `bend` is the second difference of f. Summed over many steps its share is the Euler-Maclaurin correction of the
     trapezoid, the first difference at either end.
     """
-    g = -GRAVITY
+    g, turn = -GRAVITY, vec.turn_of(rotation)
     v = vec.axpy(0.5 * h, vec.axpy(g, vec.load(s.tilt), begin), vec.load(s.velocity))
     v = vec.turn_back(turn, v)
     rotate_attitude(s, turn)
@@ -100,7 +101,7 @@ def fill_transition(s: Record, rate: Vec, force: Vec) -> None:
     for i in range(7):
         for j in range(SIZE):
             f[i, j] = 0.0
-    turn = vec.load(s.turned)
+    turn = vec.turn_of(vec.load(s.turned))
     for k in range(3):
         column = vec.turn_back(turn, (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0))
         for c in range(3):
@@ -128,22 +129,29 @@ def apply_transition(s: Record) -> None:
     """P ← F P Fᵀ; only the rows and columns of Z, v and ψ change."""
     p, f, w = s.covariance, s.transition, s.work
     for i in range(7):
-        for j in range(SIZE):
-            w[i, j] = 0.0
-        for k in range(SIZE):
-            share = f[i, k]
-            if share != 0.0:
-                for j in range(SIZE):
-                    w[i, j] += share * p[k, j]
-    for i in range(7):
+        multiply_row(f[i], p, w[i])
+    for i in range(6, -1, -1):
         row = i if i < 6 else PSI
         for j in range(6, PSI):
             p[row, j] = p[j, row] = w[i, j]
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(SIZE):
-                total += w[i, k] * f[j, k]
-            p[row, j if j < 6 else PSI] = p[j if j < 6 else PSI, row] = total
+        z, v, heading = _times_transposed(w, f[i])
+        for j in range(3):
+            p[row, Z + j] = p[Z + j, row] = z[j]
+            p[row, V + j] = p[V + j, row] = v[j]
+        p[row, PSI] = p[PSI, row] = heading
+
+
+@inner
+def _times_transposed(w: Floats, f: Floats) -> tuple[Vec, Vec, float]:
+    """w fᵀ for seven rows w and one row f: its parts of Z, v and ψ."""
+    z, v, heading = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+    for k in range(SIZE):
+        share = f[k]
+        if share != 0.0:
+            z = vec.axpy(share, (w[0, k], w[1, k], w[2, k]), z)
+            v = vec.axpy(share, (w[3, k], w[4, k], w[5, k]), v)
+            heading += share * w[6, k]
+    return z, v, heading
 
 
 @inner

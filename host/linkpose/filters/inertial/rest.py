@@ -6,7 +6,7 @@ from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._vector import Vec
-from linkpose.filters.inertial.gravity import align_to_gravity
+from linkpose.filters.inertial.gravity import align_to_gravity, relate_heading
 from linkpose.filters.inertial.propagate import specific_force
 from linkpose.filters.inertial.state import BA, BG, MA, PSI, SIZE, Record, Z
 from linkpose.filters.inertial.update import constrain_attitude, project, sub_covariance, update_scalar, update_vector
@@ -39,7 +39,7 @@ def follow_rest(s: Record, north: Vec, force: Vec, rate: Vec, h: float, imu: Imu
     steady = vec.dot(change, change) < width * imu.accel_variance
     steady = steady and vec.dot(drift, drift) < width * (imu.gyro_variance + _MOST_SWAY_RAD_S**2) * still * still
     if still > 0.0 and not steady:
-        s.rest_s = 0.0
+        s.rest_s, s.unmoved = 0.0, False
         return
     if still == 0.0:
         vec.store(s.rest_north, north)
@@ -98,11 +98,13 @@ def align_at_rest(s: Record, h: float, imu: ImuCalibration) -> None:
     for i in range(3):
         s.nominal[BG + i] = s.rest_rate_sum[i] / rest_s
         p[BG + i, BG + i] = variance
-    p[PSI, PSI] = s.rest_heading_variance + _SWAY_RAD**2
+    p[PSI, PSI] = _SWAY_RAD**2 + (0.0 if s.unmoved else s.rest_heading_variance)
     vec.store(s.north, vec.load(s.rest_north))
     force = vec.scale(1.0 / rest_s, vec.load(s.rest_force_sum))
     accel = imu.accel_variance * h / rest_s + (_SWAY_M_S / rest_s) ** 2
     align_to_gravity(s, force, accel, (0.0, 0.0, 0.0), _REST_SPEED_M2_S2)
+    if s.unmoved:
+        relate_heading(s)
 
 
 @inner

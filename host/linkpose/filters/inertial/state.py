@@ -84,13 +84,14 @@ _FIELDS = np.dtype(
         ("rate_noise", "f8"),  # rad²/s²
         # Memory of the measurement models.
         ("rest_s", "f8"),  # how long the sensor has been at rest (s)
+        ("unmoved", "b1"),  # at rest since the first sample
         ("rest_north", *_VECTOR),  # X when it began
         ("rest_heading_variance", "f8"),  # rad²
         ("rest_force", *_VECTOR),  # first force of the rest (m/s²)
         ("rest_force_sum", *_VECTOR),  # ∫ force over the rest (m/s)
         ("rest_rate_sum", *_VECTOR),  # ∫ rate over the rest (rad)
         ("steady_force", *_VECTOR),  # force without its noise (m/s²)
-        ("residual_square", "f8"),  # mean square of the joint constraint's excess residual (m²/s²)
+        ("residual_square", *_VECTOR),  # mean square of the joint constraint's excess residual (m²/s²)
         ("reach_square", "f8"),  # mean of ‖ω‖² ‖d‖² (m²/s²)
         ("assumed", "f8"),  # share of these two means that is assumed rather than measured
         ("spread", "f8", (3, 3)),  # mean of ω ωᵀ (rad²/s²)
@@ -100,6 +101,9 @@ _FIELDS = np.dtype(
         ("mean_force", *_VECTOR),  # over the last tenth of a second (m/s²)
         ("mean_rate", *_VECTOR),  # rad/s
         ("unsteadiness", "f8"),  # mean square change of rate and tilt (rad²/s²)
+        # Reported until the covariance changes.
+        ("position_std", *_VECTOR),  # σ of height, x and y (m)
+        ("turn_covariance", "f8", (6,)),  # of the attitude error θ in n, xx xy xz yy yz zz (rad²)
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
@@ -141,7 +145,7 @@ ESTIMATE = np.dtype(
         ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
         ("distance", "f8"),  # `distance` of the state
-        ("unknown", "f8"),  # share of the accelerometer's bias variance that the motion has not resolved
+        ("unknown", "f8"),  # share of the accelerometer's bias variance across Z that the motion has not resolved
     ],
     align=True,
 )

@@ -15,17 +15,27 @@ _NONE_RAD2 = 1e-6  # with no more than this along it
 
 
 @inner
+def multiply_row(factors: Floats, p: Floats, out: Floats) -> None:
+    """out ← factors P: a row of 34, mostly zeros, times the covariance, by three of its rows at a time."""
+    for j in range(SIZE):
+        out[j] = 0.0
+    for k in range(0, PSI, 3):
+        a, b, c = factors[k], factors[k + 1], factors[k + 2]
+        if a != 0.0 or b != 0.0 or c != 0.0:
+            for j in range(SIZE):
+                out[j] = out[j] + a * p[k, j] + b * p[k + 1, j] + c * p[k + 2, j]
+    a = factors[PSI]
+    if a != 0.0:
+        for j in range(SIZE):
+            out[j] += a * p[PSI, j]
+
+
+@inner
 def project(s: Record) -> Sym:
     """H P into `work` (three rows), and H P Hᵀ, with H in `jacobian`."""
     h, p, w = s.jacobian, s.covariance, s.work
     for i in range(3):
-        for j in range(SIZE):
-            w[i, j] = 0.0
-        for k in range(SIZE):
-            share = h[i, k]
-            if share != 0.0:
-                for j in range(SIZE):
-                    w[i, j] += share * p[k, j]
+        multiply_row(h[i], p, w[i])
     xx = xy = xz = yy = yz = zz = 0.0
     for k in range(SIZE):
         xx += w[0, k] * h[0, k]

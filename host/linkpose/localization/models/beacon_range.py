@@ -1,7 +1,7 @@
-"""Ranges to beacons at known places: h = (1 + s) ‖p − b‖ + β, with the sensor's scale error s and bias β where the
-state has them.
+"""Ranges to beacons at known places: h = (1 + s) ‖p − b‖ + β + β_b, with the sensor's scale error s, its bias β and
+the drifting error β_b of this beacon where the state has them.
 
-A row of parameters is (beacon x, y, z m, index of the state's z, of s, of β); -1 where the state has none.
+A row of parameters is (beacon x, y, z m, index of the state's z, of s, of β, of β_b); -1 where the state has none.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ def predict(state: Floats, parameters: Floats, out: Floats) -> None:
             out[i] *= 1.0 + state[scale]
         if bias >= 0:
             out[i] += state[bias]
+        if parameters[i, 6] >= 0.0:
+            out[i] += state[int(parameters[i, 6])]
 
 
 @compiled
@@ -44,3 +46,5 @@ def jacobian(state: Floats, parameters: Floats, out: Floats) -> None:
             out[i, scale] = distance
         if bias >= 0:
             out[i, bias] = 1.0
+        if parameters[i, 6] >= 0.0:
+            out[i, int(parameters[i, 6])] = 1.0
