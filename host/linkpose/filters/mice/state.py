@@ -52,7 +52,6 @@ MOUSE = np.dtype(
         # Motion.
         ("moved", "c16"),  # over the last step (m)
         ("window", "c16"),  # over the window of the fault tests: an exponentially forgetting sum (m)
-        ("apart", "c16"),  # sum of its velocities beyond the fit of all mice (m/s), forgetting
         ("silent_s", "f8"),  # time without a count (s)
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)

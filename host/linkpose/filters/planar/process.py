@@ -40,13 +40,6 @@ _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
 # spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
 _SPOILT_Z = 2.0
-# Mice against gyro: the bias has jumped where the mice turn by another rate over some seconds, by this many standard
-# deviations and at least by so much (rad/s), beyond a difference of scale (1σ). Doubling the deviations misses 1 °/s on
-# a straight of two seconds. Mice that differ by more than this velocity (m/s) are no judges of the gyro. A turn of
-# which the mice show a share between these two is a slip.
-_BIAS_M_S = 0.002
-_BIAS_Z, _BIAS_RAD_S, _BIAS_SCALE, _BIAS_MEMORY_S, _BIAS_LEAST_S = 5.0, 0.001, 0.03, 3.0, 0.5
-_SLIP_LEAST, _SLIP_MOST = 0.1, 0.92
 _REPAIR_SHARE = 0.3  # of the turn by which a wrong gyro's heading is corrected: σ of the correction
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
@@ -171,48 +164,12 @@ def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, floa
 
 @inner
 def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
-    """Widen the bias where all mice turn by another rate than the gyro, and repair the heading after a dead gyro."""
+    """Repair the heading after a dead gyro, by the mice."""
     if state.at_rest or m.missed > 0.0 or not m.step > 0.0 or m.disagree_s > 0.0:
         return
     if not _turn_of_mice(m, mice):
         return
     _watch_dead_gyro(state, m)
-    if not math.isfinite(m.mean_rate):
-        return
-    keep, turn = math.exp(-m.step / _BIAS_MEMORY_S), m.mean_rate - state.at.bias
-    off = m.fit_turn - turn
-    state.compared = keep * state.compared + 1.0
-    state.compared_turn = keep * state.compared_turn + turn
-    state.compared_square = keep * state.compared_square + turn * turn
-    state.compared_off = keep * state.compared_off + off
-    state.compared_product = keep * state.compared_product + turn * off
-    is_agreed = _common_errors(state, m, mice)[0] < _BIAS_SCALE * _BIAS_SCALE
-    for i in range(m.count):
-        mouse = mice[i]
-        apart = mouse.sum - m.fit - scaled(m.fit_turn, mouse.arm)
-        mouse.apart = scaled(keep, mouse.apart) + apart
-        is_agreed = is_agreed and square(mouse.apart) < (_BIAS_M_S * state.compared) ** 2
-    if is_agreed:
-        _find_jump(state, m)
-
-
-@inner
-def _find_jump(state: Record, m: Record) -> None:
-    """Fit ω_mice − ω_gyro = e ω_gyro − c, with e a small difference of scale: c is the error of the bias."""
-    count, turn, off = state.compared, state.compared_turn, state.compared_off
-    shown = abs(turn + off) * math.copysign(1.0, turn * (turn + off))
-    if count * m.step < _BIAS_LEAST_S or _SLIP_LEAST * abs(turn) < shown < _SLIP_MOST * abs(turn):
-        return
-    squares = state.compared_square + m.fit_turn_variance / _BIAS_SCALE**2
-    scatter = 1.0 / (count * squares - turn * turn)
-    jump = scatter * (squares * off - turn * state.compared_product)
-    spread = m.fit_turn_variance * scatter * squares + state.covariance[BIAS, BIAS]
-    if abs(jump) > _BIAS_Z * math.sqrt(spread) + _BIAS_RAD_S:
-        _turn_heading(state, jump * count * m.step)
-        state.covariance[BIAS, BIAS] += (2.0 * jump) ** 2
-        state.compared = state.compared_turn = state.compared_square = 0.0
-        state.compared_off = state.compared_product = 0.0
-        state.jumps += 1
 
 
 @inner

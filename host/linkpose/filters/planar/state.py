@@ -68,12 +68,6 @@ _FIELDS = [
     ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
     ("jumps", "i8"),  # how often the gyro's bias has jumped or the gyro died
     ("floors", "i8"),  # how often the floor has changed
-    # Gyro against mice: sums over the readings of the last seconds, of 1, ω, ω², d, ω d, with d = ω_mice − ω.
-    ("compared", "f8"),
-    ("compared_turn", "f8"),
-    ("compared_square", "f8"),
-    ("compared_off", "f8"),
-    ("compared_product", "f8"),
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
     ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
