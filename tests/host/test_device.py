@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import threading
@@ -96,6 +97,7 @@ def test_absent_busy_and_impossible_ports(refused, tmp_path):
     assert "there is no port /dev/ttyNONE" in refused("info", "--port", "/dev/ttyNONE")
     (tmp_path / "file").write_text("no port")
     assert "is not a serial port" in refused("info", "--port", tmp_path / "file")
+    assert "is not a serial port" in refused("info", "--port", os.devnull)  # which another program has open, too
     assert "nonsense://x is not a port" in refused("info", "--port", "nonsense://x")
     assert "no simulated board 'nothing'" in refused("info", "--port", "sim://nothing")
     assert "no option tset" in refused("info", "--port", "sim://link?tset=1")

@@ -139,6 +139,49 @@ def test_the_filter_beats_the_baseline(case, share):
     assert np.linalg.norm(ours) < 1.01 * share * np.linalg.norm(theirs)
 
 
+def with_swapped_axes(block: Measurements) -> Measurements:
+    counts = block.mice_counts.copy()
+    counts[:, 1] = counts[:, 1, ::-1]
+    return replace(block, mice_counts=counts)
+
+
+def with_reversed_axis(block: Measurements) -> Measurements:
+    counts = block.mice_counts.copy()
+    counts[:, 1, 0] *= -1.0
+    return replace(block, mice_counts=counts)
+
+
+def with_a_dead_gyro(block: Measurements) -> Measurements:
+    """From 20 s on, the gyro reads 0 without a flag."""
+    return replace(block, gyro_rad_s=np.where(block.time_s[:, np.newaxis] > 20.0, 0.0, block.gyro_rad_s))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "most_m"), [(with_swapped_axes, 0.05), (with_reversed_axis, 0.05), (with_a_dead_gyro, 0.7)]
+)
+def test_a_part_that_contradicts_the_others_is_left_out(spoil, most_m):
+    """The ten-line baseline, which trusts all mice and the gyro, is 10 m off behind the dead gyro."""
+    run = drive(64)
+    block = spoil(run.measurements)
+    out = filters.create("planar-ekf", run.rig).process(block)
+    assert pose_error(out[:, :3], run.pose).position_m < most_m
+    off = np.hypot(*(out[:, :2] - run.pose[:, :2]).T)
+    assert np.mean(off < 3.0 * np.hypot(out[:, 6], out[:, 7])) > 0.9
+
+
+def test_lifts_of_all_mice_are_no_other_floor():
+    """One second in five: before, the filter took the lost way for another scale, and was 6 m off."""
+    lifts = tuple(
+        Fault("lift", mouse, start, start + 1.0) for start in np.arange(10.0, 58.0, 5.0) for mouse in (1, 2, 3)
+    )
+    run = drive(64, faults=lifts)
+    filter_ = filters.create("planar-ekf", run.rig)
+    out = filter_.process(run.measurements)
+    assert pose_error(out[:, :3], run.pose).position_m < 1.5 * pose_error(baseline(run), run.pose).position_m
+    off = np.hypot(*(out[:, :2] - run.pose[:, :2]).T)
+    assert np.mean(off < 3.0 * np.hypot(out[:, 6], out[:, 7])) > 0.9
+
+
 @BOTH
 def test_another_floor_does_not_turn_the_robot_and_is_found(name):
     run = CASES["all mice + 5 %"](50)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +24,8 @@ from linkpose.errors import (
     SeveralBoardsFound,
 )
 from linkpose.wire.messages import BAUD
+
+_MEMORY_DEVICES = 1  # Linux's major device number of null, zero, full, random
 
 
 class Chip(NamedTuple):
@@ -196,6 +200,8 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
     """
     options: dict[str, Any] = {"baudrate": baud, "timeout": READ_TIMEOUT_S, "write_timeout": WRITE_TIMEOUT_S}
     if "://" not in name:
+        if _is_no_terminal(name):
+            raise NotASerialPort(name)
         user = holder(name)
         if user:
             raise PortBusy(name, user)
@@ -206,6 +212,16 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
     except (serial.SerialException, OSError, ValueError) as error:
         raise _why_not(name, error) from error
     return port
+
+
+def _is_no_terminal(name: str) -> bool:
+    """Whether the name belongs to a file, a folder, or one of Linux's memory devices such as /dev/null."""
+    try:
+        status = os.stat(name)
+    except OSError:  # no such file, or a name such as COM3
+        return False
+    is_memory = sys.platform == "linux" and os.major(status.st_rdev) == _MEMORY_DEVICES
+    return not stat.S_ISCHR(status.st_mode) or is_memory
 
 
 def _why_not(name: str, error: Exception) -> PortError:
