@@ -217,7 +217,7 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
 def _is_no_terminal(name: str) -> bool:
     """Whether the name belongs to a file, a folder, or one of Linux's memory devices such as /dev/null."""
     try:
-        status = os.stat(name)
+        status = Path(name).stat()
     except OSError:  # no such file, or a name such as COM3
         return False
     is_memory = sys.platform == "linux" and os.major(status.st_rdev) == _MEMORY_DEVICES
