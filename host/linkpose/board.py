@@ -34,7 +34,7 @@ def open_session(port: str | None, notify: Callable[[str], None], capture: Binar
 
 
 class Board:
-    """A board that is connected. Use it as a context manager, or call `close`.
+    """A connection to a board, or to a simulated one. Use it as a context manager, or call `close`.
 
     Example:
         with linkpose.open("sim://link") as board:
@@ -58,9 +58,10 @@ class Board:
 
         Args:
             port: device, pyserial URL or `sim://link`, `sim://chain`, `sim://mice`; None: the only UNO connected.
-            settings: fields of CONFIGURE to change, such as {"sample_rate_hz": 200, "accel_range_g": 16}.
+            settings: board settings to change, such as {"sample_rate_hz": 200, "accel_range_g": 16}; the message
+                CONFIGURE in protocol/README.md lists them.
             rig: sensor placement and calibration, or the path of a rig.toml; a simulated board has its own.
-            joint: replaces the joint of the rig.
+            joint: J2S with its standard deviation (m), as `linkpose.sensors.rig.Joint`; replaces the rig's.
             record: also write a recording (CSV) to this path.
             raw: also write every received byte to this path.
             force: replace existing files.
@@ -68,7 +69,7 @@ class Board:
                 By default the lines go to the logger "linkpose".
 
         Raises:
-            LinkposeError: its kinds PortError, NoBoardFound, SeveralBoardsFound, NoFirmware, WrongFirmware, BoardError
+            LinkposeError, as one of PortError, NoBoardFound, SeveralBoardsFound, NoFirmware, WrongFirmware, BoardError
                 (the board refuses a setting), FileExists, CannotWrite.
         """
         from linkpose.recorder import Recorder, raw_capture

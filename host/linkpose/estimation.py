@@ -417,10 +417,11 @@ def estimate(
         j2s_m: J2S, the vector from the joint centre to the sensor in the sensor's axes (m); "auto" estimates it from
             the motion. None: the rig's.
         j2s_std_m: standard deviation of `j2s_m`, each axis (m). Default: 0.1 mm.
-        joint: the joint between the two links of a chain. None: the rig's.
-        rig: sensor placement and calibration, or the path of a rig.toml. None: the recording's own.
+        joint: the joint between the two links of a chain, "ball" or "hinge". Default: the rig's.
+        rig: sensor placement and calibration, or the path of a rig.toml. Default: the recording's; for `Measurements`,
+            an empty rig.
         smooth: use a smoother, which also uses later measurements, for each filter that has one.
-        mag: let the magnetometer hold the yaw of each filter that estimates one. The rig must hold its calibration.
+        mag: correct the yaw with the magnetometer. The rig must contain the magnetometer's calibration.
 
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:

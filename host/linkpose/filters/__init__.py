@@ -101,13 +101,13 @@ class FindsJ2s(Protocol):
 
 
 def create(name: str, rig: Rig, sensors: Sensors = ALL_SENSORS, mice: int = MAX_MICE) -> Filter:
-    """Creates a filter, whose `process` takes measurements block by block.
+    """Creates a filter. Its `process(block)` returns a row for each sample, with a column for each name in `columns`.
 
     Args:
         name: such as "joint-inertial"; underscores are accepted.
-        rig: sensor placement and calibration. J2S is in the sensor's axes (m), mice are in the robot's frame (m).
-        sensors: the sensors that the measurements come from.
-        mice: the highest port of a mouse, counted from 1.
+        rig: sensor placement and calibration; J2S in the sensor's axes (m), positions of mice in the robot's frame (m).
+        sensors: the sensors that supply the measurements. Default: all.
+        mice: number of mouse ports in use, 3 if the last mouse is at port 3. Default: all ports.
 
     Raises:
         UnknownFilter: there is no filter of this name.

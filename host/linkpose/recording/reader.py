@@ -90,10 +90,10 @@ def _imu_delay_s(metadata: dict[str, Any]) -> float | None:
 
 
 def load_recording(path: str | PathLike[str]) -> Recording:
-    """Reads a recording as a whole: a CSV or Parquet file, or a raw capture (`.bin`).
+    """Reads a recording as a whole: CSV, Parquet, or a raw capture (`.bin`, the bytes that the board sent).
 
     The result holds `measurements` (SI units, in the sensors' axes), the `rig` of the recording, and `remarks` on what
-    is wrong with the data. Raises FileError, which names the file, the line and the reason, for anything else.
+    is wrong with the data. Raises FileError, whose message names file, line and reason, for any other file.
     """
     file = RecordingFile(Path(path))
     measurements = file.load()

@@ -81,16 +81,18 @@ class Measurements:
         gyro2_rad_s: ArrayLike | None = None,
         mag_uT: ArrayLike | None = None,
     ) -> Measurements:
-        """Measurements of one's own inertial sensor, or of two, with or without a magnetometer.
+        """Makes measurements from the arrays of your own inertial sensor, or of two, with or without a magnetometer.
+
+        A sample with NaN in its acceleration or rate counts as missing. The result has no pressure and no mice.
 
         Args:
             time_s: (N,) time of each sample (s), not decreasing.
             accel_m_s2: (N, 3) specific force in the sensor's axes (m/s²): +9.81 along the upward axis at rest.
-            gyro_rad_s: (N, 3) angular rate in the same axes (rad/s). A sample with NaN counts as missing.
+            gyro_rad_s: (N, 3) angular rate in the same axes (rad/s).
             accel2_m_s2: (N, 3) specific force of a second sensor in its own axes (m/s²); requires gyro2_rad_s.
             gyro2_rad_s: (N, 3) angular rate of the second sensor (rad/s); requires accel2_m_s2.
-            mag_uT: (N, 3) magnetic field in the first sensor's axes (µT). A row that differs from the one before it is
-                a new reading.
+            mag_uT: (N, 3) magnetic field in the first sensor's axes (µT). Repeat the last row where there is no new
+                reading.
 
         Raises:
             InvalidValue: an array has another shape, only one of accel2_m_s2 and gyro2_rad_s is given, or a time is
