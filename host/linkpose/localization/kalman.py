@@ -66,6 +66,11 @@ class Measurement:
     block: int = 1
     angles: tuple[bool, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a table of another width: the compiled models do not check their indices."""
+        if self.parameters.shape[1] != models.COLUMNS[self.model]:
+            raise ValueError(f"model {self.model} takes {models.COLUMNS[self.model]} parameters a row")
+
 
 @dataclass(slots=True)
 class KalmanFilter:

@@ -24,6 +24,7 @@ from linkpose.localization.models import (
 UNICYCLE, HOLONOMIC, SUBMERSIBLE = unicycle.ID, holonomic.ID, submersible.ID
 CONSTANT_VELOCITY = constant_velocity.ID
 BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
+COLUMNS = {model.ID: model.COLUMNS for model in (beams, beacon_range, landmark, direct)}  # of a model's parameters
 
 
 @compiled

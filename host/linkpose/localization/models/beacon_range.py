@@ -12,6 +12,7 @@ from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 1
+COLUMNS = 7  # of parameters
 
 
 @compiled

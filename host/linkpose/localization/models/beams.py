@@ -14,6 +14,7 @@ from linkpose.localization.grid import GridMap, cast_ray
 from linkpose.localization.linalg import Floats
 
 ID = 0
+COLUMNS = 5  # of parameters
 # Of the difference quotients; in x and y it is one cell, since less would see only a stair's face.
 TURN_STEP = math.radians(0.5)
 # Where the slopes ahead and behind differ by more than this (m/m, m/rad), the beam crosses an edge between them, such

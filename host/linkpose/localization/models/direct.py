@@ -10,6 +10,7 @@ from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats
 
 ID = 3
+COLUMNS = 2  # of parameters
 
 
 @compiled

@@ -12,6 +12,7 @@ from linkpose.compiling import compiled
 from linkpose.localization.linalg import Floats, wrap_angle
 
 ID = 2
+COLUMNS = 4  # of parameters
 
 
 @compiled
