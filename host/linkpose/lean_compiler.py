@@ -20,7 +20,6 @@ import operator
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from llvmlite.binding import Linkage
 from numba.core import base, ir, lowering, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
@@ -110,9 +109,6 @@ _PASSES = (
 )
 # LLVM's level. Level 3 unrolls the loops over 34 states: twice the time to compile, and no faster.
 _OPTIMISATION = 2
-# Functions of a module up to which each moves into its only caller: `joint` runs in two thirds of the time, since its
-# state stays in registers. In the larger inertial core that gains nothing, and takes a third more time to optimise.
-_SMALL = 56
 _SCALARS = (types.Float, types.Integer, types.Boolean)
 
 _functions: Any = types.Function  # the class of numba's built-in functions, such as operators
@@ -158,11 +154,6 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
         module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
-        """Optimise it as a whole. In a small module, a part that has a single caller moves into that caller."""
-        parts = [each for each in self._final_module.functions if each.linkage == Linkage.linkonce_odr]
-        if len(parts) <= _SMALL:
-            for part in parts:
-                part.linkage = Linkage.internal  # nothing else calls it
         manager, builder = self._codegen._module_pass_manager(opt=_OPTIMISATION)
         manager.run(self._final_module, builder)
 
