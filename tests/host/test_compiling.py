@@ -246,3 +246,13 @@ def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
     nowhere = dict.fromkeys(places, tmp_path / "file" / "below")
     code = "import linkpose.compiling as c\nc._the_folder = lambda: None\n" + PREPARE
     assert "in each run" in run(code, HOST, NUMBA_DISABLE_JIT=1, **nowhere)
+
+
+def test_filters_that_share_parts_compile_in_one_process(tmp_path):
+    """Parts of one that were local to its module once took the place of another's of the same name, and it crashed."""
+    code = (
+        "from linkpose import filters; from linkpose.experiments.planar import drive; run = drive(1, 8.0); "
+        "print(*(f'{filters.create(name, run.rig).process(run.measurements)[-1, 0]:.2f}' "
+        "for name in ('mice', 'planar-ekf')))"
+    )
+    assert run(code, HOST, NUMBA_CACHE_DIR=tmp_path) == "0.45 1.55"
