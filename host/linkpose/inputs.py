@@ -80,6 +80,7 @@ def _read_pipe(descriptor: int, path: Path, what: str) -> bytes:
                 raise CannotRead(path, "it is a pipe, and no program writes into it", what)
             time.sleep(_POLL_S)
             waited_s += _POLL_S
+            continue
         parts.append(part)
         size += len(part)
         if size > MOST_BYTES:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from linkpose import plotting
 from linkpose.experiments import indoor, underwater
-from linkpose.experiments.paths import Path, rms_within, worst_sections
+from linkpose.experiments.paths import ComparedPath, rms_within, worst_sections
 from linkpose.experiments.variants import Variant, remark, sign_test, verdict
 from linkpose.localization.grid import GridMap
 from linkpose.localization.tables import PathScore
@@ -62,14 +62,14 @@ def test_too_few_seeds_are_named() -> None:
     assert "at least 6 seeds" in str(remark(5))
 
 
-def path(name: str, label: str, errors_m: list[float]) -> Path:
+def path(name: str, label: str, errors_m: list[float]) -> ComparedPath:
     """A path along y = 5 m, 1 m a sample, that is off to the left by these errors."""
     n = len(errors_m)
     truth = np.column_stack([np.arange(n) + 1.0, np.full(n, 5.0), np.full(n, -3.0)])
     error = np.array(errors_m)
     position = truth + np.column_stack([np.zeros(n), error, np.zeros(n)])
     at = np.arange(n, dtype=float)
-    return Path(
+    return ComparedPath(
         name, label, at, at, position, truth, error, np.full(n, 0.02), np.radians(error), np.full(n, 0.01), at[3:4]
     )  # fmt: skip
 
@@ -84,7 +84,7 @@ EKF = path("ekf", "EKF", ERRORS)
 def floor():  # type: ignore[no-untyped-def]
     grid = GridMap(np.eye(20, 100, dtype=np.uint8), np.array([0.5, 0.0, 0.0, 0.0]))
     paths = {"3.2": FIXED, "3.3": ADAPTIVE, "3.5": EKF, "3.6": ADAPTIVE}
-    return plotting.indoor_figures(indoor.Drive(grid, FIXED.truth_m[:, :2], FIXED.truth_m[:, :2] + 1.0, paths))
+    return plotting.indoor_figures(indoor.DrawnDrive(grid, FIXED.truth_m[:, :2], FIXED.truth_m[:, :2] + 1.0, paths))
 
 
 @pytest.fixture(scope="module")
@@ -224,7 +224,7 @@ def test_reproduce_draws_one_picture_per_figure(reproduced) -> None:  # type: ig
     assert all(file.read_bytes().startswith(b"\x89PNG") for file in folder.iterdir())
 
 
-def test_pictures_lie_beside_a_named_file_and_are_kept(tmp_path: FilePath, refused) -> None:  # type: ignore[no-untyped-def]
+def test_pictures_lie_beside_a_named_file_and_are_kept(tmp_path: Path, refused) -> None:  # type: ignore[no-untyped-def]
     files = plotting.picture_files(tmp_path / "u.svg", "variants", ["figure-3.7"], force=False)
     assert files == {"variants": tmp_path / "u.svg", "figure-3.7": tmp_path / "u-figure-3.7.svg"}
     (tmp_path / "u-figure-3.7.svg").touch()

@@ -121,3 +121,13 @@ def test_gravity_and_the_number_of_mouse_ports_stand_in_one_place() -> None:
         for match in constant.finditer(path.read_text(encoding="utf-8"))
     )
     assert found == [("sensors/devices.py", "MAX_MICE = "), ("sensors/mpu6050.py", "9.80665")]
+
+
+def test_no_two_classes_share_a_name() -> None:
+    names = [
+        node.name
+        for path in PACKAGE.rglob("*.py")
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert sorted(names) == sorted(set(names))

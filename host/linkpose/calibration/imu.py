@@ -30,7 +30,7 @@ _PIECE_S = 2.0  # of a rest: long compared with the slowest low-pass filter (5 H
 
 
 @dataclass(frozen=True, slots=True)
-class ImuErrors:
+class FoundImuErrors:
     """Sensor errors and noise. Vectors are by axis; None where the recordings do not show a value."""
 
     rests: int
@@ -51,7 +51,7 @@ class ImuErrors:
         return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
 
-def calibrate_imu(recordings: Sequence[Recording]) -> ImuErrors:
+def calibrate_imu(recordings: Sequence[Recording]) -> FoundImuErrors:
     """The calibration from all rests in the recordings. Raises LinkposeError without a rest, or for a poor fit."""
     rests = [r.measurements[part] for r in recordings for part in find_rests(r.measurements)]
     if not rests:
@@ -66,7 +66,7 @@ def calibrate_imu(recordings: Sequence[Recording]) -> ImuErrors:
     offset = scale = residual = offset_std = None
     if len(attitudes) >= FEWEST_ATTITUDES:
         offset, scale, residual, offset_std = fit_sphere(attitudes)
-    return ImuErrors(
+    return FoundImuErrors(
         len(rests),
         len(attitudes),
         np.asarray(bias),
@@ -81,7 +81,7 @@ def calibrate_imu(recordings: Sequence[Recording]) -> ImuErrors:
     )
 
 
-def with_calibration(rig: Rig, found: ImuErrors) -> Rig:
+def with_calibration(rig: Rig, found: FoundImuErrors) -> Rig:
     """The rig with the calibration; everything else as it was."""
     imu = replace(
         rig.imu,

@@ -12,7 +12,7 @@ from linkpose.cli import options
 from linkpose.presentation import counted
 
 if TYPE_CHECKING:
-    from linkpose.calibration.imu import ImuErrors
+    from linkpose.calibration.imu import FoundImuErrors
 
 
 @click.command("imu")
@@ -44,7 +44,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
 
 
-def _show(found: ImuErrors) -> None:
+def _show(found: FoundImuErrors) -> None:
     from linkpose.calibration.imu import FEWEST_ATTITUDES
 
     x, y, z = found.gyro_bias_rad_s

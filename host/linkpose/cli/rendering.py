@@ -14,7 +14,7 @@ import click
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from linkpose.experiments.variants import Verdict
+    from linkpose.experiments.variants import ClaimVerdict
 
 
 def progress(label: str, quiet: bool = False) -> Callable[[Iterable[Any]], Iterable[Any]]:
@@ -46,7 +46,7 @@ def _text(name: str, value: object) -> str:
 
 
 def show_experiment(
-    tables: Sequence[Sequence[dict[str, object]]], verdicts: Sequence[Verdict], seeds: int, json_lines: bool
+    tables: Sequence[Sequence[dict[str, object]]], verdicts: Sequence[ClaimVerdict], seeds: int, json_lines: bool
 ) -> None:
     """An experiment's tables and verdicts: as JSON lines, or as text."""
     if json_lines:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 from linkpose.evaluation.markers import is_c3d, is_trc, read_c3d, read_trc
@@ -27,7 +26,7 @@ def read_for_picture(path: Path, up: str | None = None, progress: Progress | Non
 
 def read_take(path: Path, up: str | None) -> Table | None:
     """The take (C3D, TRC, Motive's CSV) in a file; None for any other file."""
-    with contextlib.closing(open_binary(path)) as file:
+    with open_binary(path) as file:
         start = file.read(64)
     if is_c3d(start):
         return read_c3d(path, up)

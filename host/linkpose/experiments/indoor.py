@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from linkpose.experiments.paths import Path, path_of
-from linkpose.experiments.variants import Progress, Variant, Verdict, verdict
+from linkpose.experiments.paths import ComparedPath, path_of
+from linkpose.experiments.variants import ClaimVerdict, Progress, Variant, verdict
 from linkpose.localization.carmen import as_log
 from linkpose.localization.events import Log, Scan
 from linkpose.localization.grid import GridMap
@@ -84,7 +84,7 @@ def _settings(variant: Variant, log: Log, errors: IndoorErrors, run: IndoorRun) 
     )
 
 
-def claims(compared: Sequence[Variant]) -> list[Verdict]:
+def claims(compared: Sequence[Variant]) -> list[ClaimVerdict]:
     """The thesis's claims by table, and comparisons that it does not make."""
     found = []
     for name in FILTERS:
@@ -104,7 +104,7 @@ def claims(compared: Sequence[Variant]) -> list[Verdict]:
     return [*found, *_further_claims(compared)]
 
 
-def _further_claims(compared: Sequence[Variant]) -> list[Verdict]:
+def _further_claims(compared: Sequence[Variant]) -> list[ClaimVerdict]:
     adaptive, affine = (_find(compared, "ukf", noise, 0.0) for noise in ("adaptive", "affine"))
     scaled = _find(compared, "ukf", "affine", 0.0, transform="scaled")
     return [
@@ -135,13 +135,13 @@ def label(variant: Variant) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class DrawnDrive:
     """One simulated drive on its map, and the estimated paths by the number of their figure."""
 
     grid: GridMap
     truth_m: Floats  # (N, 2)
     odometry_m: Floats  # (N, 2) dead reckoning from the true start
-    paths: dict[str, Path]
+    paths: dict[str, ComparedPath]
 
 
 # Figure -> filter, R, and the correlation in R and Q. Figures 3.5 and 3.6 show the thesis's method as a whole.
@@ -153,7 +153,7 @@ FIGURES: dict[str, tuple[FilterName, NoiseModel, float]] = {
 }
 
 
-def drive(seed: int) -> Drive:
+def drive(seed: int) -> DrawnDrive:
     """The runs behind Figures 3.1 to 3.6: one drive with obstacles that the map lacks."""
     grid, errors = office_map(), IndoorErrors(outlier_fraction=UNMAPPED[-1])
     run = simulate_indoor(seed, errors, DURATION_S, grid)
@@ -164,4 +164,4 @@ def drive(seed: int) -> Drive:
         words = f"{name.upper()}, {noise} R" + (f", R and Q off-diagonal (ρ = {rho:g})" if rho else "")
         paths[figure] = path_of(name, words, track, run.truth, np.unwrap(run.pose[:, 2]))
     odometry = np.array([reading.odometry[:2] for reading in run.readings])
-    return Drive(grid, run.pose[:, :2], odometry, paths)
+    return DrawnDrive(grid, run.pose[:, :2], odometry, paths)

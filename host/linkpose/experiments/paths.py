@@ -15,7 +15,7 @@ from linkpose.sensors.measurements import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class ComparedPath:
     """An estimated path and its errors at the N instants of the estimate; x, y and with a depth z, D = 2 or 3."""
 
     filter: str
@@ -37,14 +37,14 @@ class Path:
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class WaySection:
     """A part of the way, from one distance along it to another (m)."""
 
     start_m: float
     end_m: float
 
 
-def path_of(name: str, label: str, track: Track, truth: Truth, heading_rad: Floats) -> Path:
+def path_of(name: str, label: str, track: Track, truth: Truth, heading_rad: Floats) -> ComparedPath:
     """A track of a filter beside its truth, whose headings (N,) are unwrapped. Instants before the pose is known are
     left out.
     """
@@ -56,7 +56,7 @@ def path_of(name: str, label: str, track: Track, truth: Truth, heading_rad: Floa
     std = track.std[known]
     heading = track.names.index("heading_rad")
     turned = track.state[known][:, heading] - np.interp(time, truth.time_s, heading_rad)
-    return Path(
+    return ComparedPath(
         name,
         label,
         time,
@@ -71,7 +71,7 @@ def path_of(name: str, label: str, track: Track, truth: Truth, heading_rad: Floa
     )
 
 
-def worst_sections(path: Path, count: int, length_m: float) -> list[Section]:
+def worst_sections(path: ComparedPath, count: int, length_m: float) -> list[WaySection]:
     """The stretches of `length_m` around the largest errors that do not overlap, in the order of the way."""
     left, found = path.error_m.copy(), []
     for _ in range(count):
@@ -79,18 +79,18 @@ def worst_sections(path: Path, count: int, length_m: float) -> list[Section]:
         if left[worst] == -math.inf:
             break
         middle = float(path.way_m[worst])
-        found.append(Section(max(middle - length_m / 2, 0.0), min(middle + length_m / 2, float(path.way_m[-1]))))
+        found.append(WaySection(max(middle - length_m / 2, 0.0), min(middle + length_m / 2, float(path.way_m[-1]))))
         left[np.abs(path.way_m - middle) < length_m] = -math.inf
     return sorted(found, key=lambda section: section.start_m)
 
 
-def rms_within(path: Path, section: Section) -> float:
+def rms_within(path: ComparedPath, section: WaySection) -> float:
     """Root mean square of the position error (m) within a section."""
     inside = (path.way_m >= section.start_m) & (path.way_m <= section.end_m)
     return float(np.sqrt(np.mean(path.error_m[inside] ** 2)))
 
 
-def large(paths: Sequence[Path]) -> tuple[float, float]:
+def large(paths: Sequence[ComparedPath]) -> tuple[float, float]:
     """The error of position (m) and of heading (rad) that 99 % of the errors on each path do not exceed."""
     return (
         max(float(np.quantile(path.error_m, 0.99)) for path in paths),

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
-from linkpose.experiments.paths import Path, path_of
-from linkpose.experiments.variants import Progress, Variant, Verdict, verdict
+from linkpose.experiments.paths import ComparedPath, path_of
+from linkpose.experiments.variants import ClaimVerdict, Progress, Variant, verdict
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import localize
@@ -165,7 +165,7 @@ def check_simulator(seeds: int) -> list[dict[str, object]]:
     ]
 
 
-def claims(cases: Sequence[Case]) -> list[Verdict]:
+def claims(cases: Sequence[Case]) -> list[ClaimVerdict]:
     """What the thesis expects, by the table that would show it."""
     late, at_once = TIMINGS
     ukf = _find(cases, late, True, OUTLIERS, "ukf")
@@ -216,8 +216,8 @@ class Dive:
     time_s: Floats
     command_m: Floats
     truth_m: Floats
-    sets: list[Path]
-    paths: dict[str, Path]
+    sets: list[ComparedPath]
+    paths: dict[str, ComparedPath]
 
 
 # Figure 3.8: what the ranges carry beside Gaussian noise.
@@ -239,7 +239,7 @@ def dive(seed: int) -> Dive:
     return Dive(motion.time_s, command.pose[:, :3], motion.pose[:, :3], sets, paths)
 
 
-def _estimated(seed: int, name: FilterName, words: str, correlated: bool, outliers: int) -> Path:
+def _estimated(seed: int, name: FilterName, words: str, correlated: bool, outliers: int) -> ComparedPath:
     errors = Case(TIMINGS[0], correlated, outliers).errors()
     run = simulate_underwater(seed, errors, DURATION_S)
     track = localize(run.log, name, _settings(errors, Variant(name, "fixed", 0.0, GATE)), None, BEACONS)

@@ -49,7 +49,7 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ClaimVerdict:
     """Whether `after` has the smaller position error than `before`, seed by seed, by a two-sided exact sign test.
 
     `table` is the number of the thesis's table that makes the comparison; empty where none does.
@@ -89,11 +89,11 @@ class Verdict:
         return asdict(self) | {"p": self.p, "result": self.result}
 
 
-def verdict(claim: str, before: Variant, after: Variant, table: str = "") -> Verdict:
+def verdict(claim: str, before: Variant, after: Variant, table: str = "") -> ClaimVerdict:
     """Compares two variants that ran on the same seeds."""
     pairs = [(old.position_rmse_m, new.position_rmse_m) for old, new in zip(before.scores, after.scores, strict=True)]
     wins, losses = sum(new < old for old, new in pairs), sum(new > old for old, new in pairs)
-    return Verdict(claim, table, before.position_rmse_m(), after.position_rmse_m(), wins, losses, len(pairs))
+    return ClaimVerdict(claim, table, before.position_rmse_m(), after.position_rmse_m(), wins, losses, len(pairs))
 
 
 def sign_test(wins: int, losses: int) -> float:

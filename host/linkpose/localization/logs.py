@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 
 from linkpose.inputs import open_binary
@@ -16,6 +15,6 @@ def read_log(path: Path) -> LogFile:
 
     Raises LinkposeError with file, line and cure for what cannot be read.
     """
-    with contextlib.closing(open_binary(path, "the log")) as file:
+    with open_binary(path, "the log") as file:
         lines = text_lines(to_utf8(file.read()))  # the last one ends without a line end
     return read_carmen(path, lines) if is_carmen(lines) else read_events(path, lines)

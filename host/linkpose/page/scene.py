@@ -108,7 +108,8 @@ class LinkScene:
     Without a known J2S only the attitude of the sensor is drawn, at the joint.
     """
 
-    charted, shown_by = (HEIGHT, ROLL, PITCH), (HEIGHT, ROLL)
+    charted: ClassVar[tuple[Quantity, ...]] = (HEIGHT, ROLL, PITCH)
+    shown_by: ClassVar[tuple[Quantity, ...]] = (HEIGHT, ROLL)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, j2s_m: Floats | None) -> None:
@@ -166,7 +167,8 @@ class LinkScene:
 class RobotScene:
     """A robot in the plane: ground, map, beacons, pose, path, ±2σ ellipses along it, and the reference's path."""
 
-    charted, shown_by = (X, Y, HEADING), (HEADING,)
+    charted: ClassVar[tuple[Quantity, ...]] = (X, Y, HEADING)
+    shown_by: ClassVar[tuple[Quantity, ...]] = (HEADING,)
 
     def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
         self._scene, self._draws = server.scene, 0
@@ -252,7 +254,8 @@ class ChainScene:
     links. With a known J2S, the fixed joint stays in its place, otherwise the joint between the links does.
     """
 
-    charted, shown_by = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2), (QW,)
+    charted: ClassVar[tuple[Quantity, ...]] = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2)
+    shown_by: ClassVar[tuple[Quantity, ...]] = (QW,)
     is_path_due = False
 
     def __init__(self, server: viser.ViserServer, rig: Rig) -> None:
@@ -326,7 +329,7 @@ class Cone:
 
 def scene_of(
     server: viser.ViserServer, filters: Iterable[Mapping[Quantity, str]], rig: Rig, surroundings: Surroundings | None
-) -> LinkScene | RobotScene | ChainScene:
+) -> Scene:
     """The scene for the quantities that the filters estimate."""
     estimated = {quantity for of in filters for quantity in of}
     if QW in estimated:

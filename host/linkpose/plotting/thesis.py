@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from linkpose.experiments.indoor import Drive
-    from linkpose.experiments.paths import Path, Section
+    from linkpose.experiments.indoor import DrawnDrive
+    from linkpose.experiments.paths import ComparedPath, WaySection
     from linkpose.experiments.underwater import Dive
     from linkpose.localization.grid import GridMap
     from linkpose.localization.tables import Beacons
@@ -33,7 +33,7 @@ _HEADROOM = 1.5  # of an axis over the error that 99 % do not exceed
 _UNDER_TRUTH = {"linewidth": 2.6}  # of an estimated path, which the dashed truth covers
 
 
-def indoor_figures(drive: Drive) -> dict[str, Figure]:
+def indoor_figures(drive: DrawnDrive) -> dict[str, Figure]:
     """Figures 3.1 to 3.6 by number: map and path, four estimates with their errors, and where errors are large."""
     from linkpose.experiments.paths import large
 
@@ -60,7 +60,7 @@ def _titled(figure: Figure, number: str, words: str) -> None:
     figure.suptitle(f"Figure {number}  {words}", fontsize=10, x=0.01, ha="left")
 
 
-def _summary(path: Path) -> str:
+def _summary(path: ComparedPath) -> str:
     return f"position error {100 * path.rms_m:.1f} cm rms, {100 * path.error_m.max():.0f} cm at most"
 
 
@@ -82,7 +82,7 @@ def _from_above(axes: Axes) -> None:
     axes.margins(0.05)
 
 
-def _map_and_path(drive: Drive) -> Figure:
+def _map_and_path(drive: DrawnDrive) -> Figure:
     """Figure 3.1."""
     figure = new_figure(10.0, 5.2)
     _titled(figure, "3.1", "Map and path of the robot (simulated)")
@@ -96,7 +96,7 @@ def _map_and_path(drive: Drive) -> Figure:
     return figure
 
 
-def _estimate(number: str, path: Path, grid: GridMap, largest: tuple[float, float]) -> Figure:
+def _estimate(number: str, path: ComparedPath, grid: GridMap, largest: tuple[float, float]) -> Figure:
     """Figures 3.2, 3.3, 3.5, 3.6: the path on the map over its errors along the way."""
     figure = new_figure(10.0, 8.6)
     _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
@@ -112,7 +112,7 @@ def _estimate(number: str, path: Path, grid: GridMap, largest: tuple[float, floa
     return figure
 
 
-def _errors(position: Axes, heading: Axes, path: Path, along: Floats, largest: tuple[float, float]) -> None:
+def _errors(position: Axes, heading: Axes, path: ComparedPath, along: Floats, largest: tuple[float, float]) -> None:
     """Errors of position and heading with 2σ, along the way or over time."""
     style = line_style(path.filter) | {"linewidth": 0.9}
     _position_error(position, path, along, largest)
@@ -126,7 +126,7 @@ def _errors(position: Axes, heading: Axes, path: Path, along: Floats, largest: t
     legend_above(position)
 
 
-def _position_error(axes: Axes, path: Path, along: Floats, largest: tuple[float, float]) -> None:
+def _position_error(axes: Axes, path: ComparedPath, along: Floats, largest: tuple[float, float]) -> None:
     style = line_style(path.filter) | {"linewidth": 0.9}
     axes.fill_between(along, 0.0, 200 * path.std_m, label="2σ", color=style["color"], alpha=BAND_ALPHA, linewidth=0)
     axes.plot(along, 100 * path.error_m, label=path.filter, **style)
@@ -134,7 +134,7 @@ def _position_error(axes: Axes, path: Path, along: Floats, largest: tuple[float,
     finish(axes, "position error (cm)")
 
 
-def _large_errors(drive: Drive) -> Figure:
+def _large_errors(drive: DrawnDrive) -> Figure:
     """Figure 3.4: where the errors with a fixed R are largest, with the adaptive R beside it."""
     from linkpose.experiments.paths import worst_sections
 
@@ -161,12 +161,12 @@ def _large_errors(drive: Drive) -> Figure:
     return figure
 
 
-def _middle(path: Path, section: Section) -> Floats:
+def _middle(path: ComparedPath, section: WaySection) -> Floats:
     at = int(np.searchsorted(path.way_m, 0.5 * (section.start_m + section.end_m)))
     return path.truth_m[min(at, len(path.way_m) - 1), :2]
 
 
-def _detail(axes: Axes, number: int, section: Section, paths: Sequence[Path]) -> None:
+def _detail(axes: Axes, number: int, section: WaySection, paths: Sequence[ComparedPath]) -> None:
     """The errors along a section, with both R."""
     from linkpose.experiments.paths import rms_within
 
@@ -211,7 +211,7 @@ def _draw_beacons(axes: Axes, beacons: Beacons) -> None:
         axes.annotate(name, place[:2], xytext=(5, 3), textcoords="offset points", fontsize=8)
 
 
-def _sets_of_measurements(paths: Sequence[Path], beacons: Beacons, largest: tuple[float, float]) -> Figure:
+def _sets_of_measurements(paths: Sequence[ComparedPath], beacons: Beacons, largest: tuple[float, float]) -> Figure:
     """Figure 3.8: the path from the complete set, and the errors with each set."""
     figure = new_figure(10.0, 6.6)
     _titled(figure, "3.8", f"{paths[0].filter.upper()} on sets of simulated measurements, all with Gaussian noise")
@@ -228,7 +228,7 @@ def _sets_of_measurements(paths: Sequence[Path], beacons: Beacons, largest: tupl
     return figure
 
 
-def _from_above_among_beacons(axes: Axes, path: Path, beacons: Beacons) -> None:
+def _from_above_among_beacons(axes: Axes, path: ComparedPath, beacons: Beacons) -> None:
     _plot(axes, path.position_m, label=path.filter, **line_style(path.filter) | _UNDER_TRUTH)
     _plot(axes, path.truth_m, label="truth", **TRUTH)
     _start(axes, path.truth_m[0])
@@ -237,7 +237,7 @@ def _from_above_among_beacons(axes: Axes, path: Path, beacons: Beacons) -> None:
     legend_above(axes, 4)
 
 
-def _dive_estimate(number: str, path: Path, beacons: Beacons, largest: tuple[float, float]) -> Figure:
+def _dive_estimate(number: str, path: ComparedPath, beacons: Beacons, largest: tuple[float, float]) -> Figure:
     """Figures 3.9 and 3.10: the path from above, the depth, and the errors over time."""
     figure = new_figure(10.0, 6.6)
     _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
