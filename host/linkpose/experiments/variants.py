@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.tables import PathScore
+from linkpose.presentation import counted
 
 # Receives the runs of an experiment and yields them again: the place for a progress bar.
 Progress: TypeAlias = Callable[[Iterable[Any]], Iterable[Any]]
@@ -107,4 +108,5 @@ def remark(seeds: int) -> str | None:
     """Why no verdict can be reached with so few seeds; None where one can."""
     if sign_test(seeds, 0) < SIGNIFICANCE:
         return None
-    return f"A sign test needs at least {FEWEST_SEEDS} seeds for p < {SIGNIFICANCE:g}; {seeds} give no verdict."
+    few = counted(seeds, "seed")
+    return f"A sign test needs at least {FEWEST_SEEDS} seeds for p < {SIGNIFICANCE:g}; {few} cannot give a verdict."
