@@ -91,7 +91,9 @@ class ChainParameters(NamedTuple):
     # Play is correlated: one update counts as 1/10 of an independent one at 25 Hz. [D]; at 1, the heading follows a
     # play of 3°.
     play_correlation: float = 10.0
-    axis_std_rad: float = 0.3  # of the first estimate of the axis, from the direction of the relative rate
+    # Of the first estimate of the axis, from the direction of the relative rate. At 0.3, σ of simulated hinges is too
+    # small for a second or two after it.
+    axis_std_rad: float = 0.5
     axis_rotation: float = 0.1  # ∫‖ω_rel‖² dt that the first estimate needs (rad²/s)
     axis_share: float = 0.8  # of ∫ω_rel ω_relᵀ in its largest eigenvalue, ditto
     axis_memory_s: float = 10.0
