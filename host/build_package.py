@@ -117,7 +117,7 @@ def _compile(library: Path, folder: Path) -> None:
     with tempfile.TemporaryDirectory() as cache:
         environment = {
             **os.environ,
-            "PYTHONPATH": os.pathsep.join([str(library.resolve()), *filter(None, sys.path)]),
+            "PYTHONPATH": os.pathsep.join(filter(None, [str(library.resolve()), os.environ.get("PYTHONPATH")])),
             "PYTHONDONTWRITEBYTECODE": "1",  # these files would enter the wheel
             "PYTHONHASHSEED": "0",  # the same bytes from each build
             "NUMBA_CACHE_DIR": cache,
