@@ -285,7 +285,7 @@ def check_the_alignment_to_gravity(rng):
 
 def check_the_level_of_the_sensor_errors(rng):
     """Errors drawn as their prior says have a level of 1 in the mean, whatever share of them the motion resolves."""
-    states, s = random_state(rng)
+    _, s = random_state(rng)
     prior, share = s.prior[BA:D], rng.uniform(0.3, 1.0, D - BA)
     s.covariance[range(BA, D), range(BA, D)] = (1 - share) * prior
     levels, row = [], empty_row()
