@@ -91,7 +91,7 @@ def _level(estimate: Record, least: float) -> float:
     As long as the motion has resolved none of them, it is 1.
     """
     level = (_LEVEL_PRIOR + 2.0 * estimate.distance) / (_LEVEL_PRIOR + estimate.resolved)
-    return min(max(level, least), _MOST_LEVEL)
+    return float(min(max(level, least), _MOST_LEVEL))
 
 
 @inner
