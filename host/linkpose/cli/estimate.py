@@ -196,6 +196,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     _report_field(estimator, console)
+    _report_remarks(estimator, console)
     if request.output:
         console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
         options.show_next(console.is_quiet, f"plot {request.output}")
@@ -337,6 +338,7 @@ class _LiveRun:
         _report_j2s(self._estimator, self._console)
         _report_mice(self._estimator, self._console)
         _report_field(self._estimator, self._console)
+        _report_remarks(self._estimator, self._console)
 
     def _mark(self, time_s: float) -> None:
         self._marks.append(time_s)
@@ -393,6 +395,12 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
     if estimator.magnetic_field:
         outcome["mag"] = estimator.magnetic_field.as_dict()
     return outcome
+
+
+def _report_remarks(estimator: Estimator, console: Console) -> None:
+    """What the filters found wrong with the measurements."""
+    for remark in estimator.remarks:
+        console.report(remark)
 
 
 def _report_field(estimator: Estimator, console: Console) -> None:
