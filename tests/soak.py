@@ -256,7 +256,7 @@ def suspended(folder: Path, rng: random.Random) -> None:
             process.send_signal(signal.SIGSTOP)
             time.sleep(10)
             process.send_signal(signal.SIGCONT)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(signal.SIGTERM)  # a background job ignores SIGINT
         _, err = process.communicate(timeout=30)
     table = read_table(out, "recording")
     closing = table.closing or {}
