@@ -63,7 +63,8 @@ def main() -> int:
 
 def _arguments(folder: Path) -> int:
     """All nasty inputs and outputs of hostile.py, each in a process of its own, as a user runs it."""
-    files, failures, slowest = valid_files(folder), 0, 0.0
+    (valid := folder / "valid").mkdir()
+    files, failures, slowest = valid_files(valid), 0, 0.0
     pairs = [(command, kind, make) for command in INPUTS.values() for kind, make in KINDS.items()]
     pairs += [(command, kind, make) for command in OUTPUTS.values() for kind, make in PLACES.items()]
     for number, (command, kind, make) in enumerate(pairs):

@@ -55,7 +55,7 @@ class CsvFile:
     ) -> None:
         """`plain` writes no comment lines, and the metadata beside the file, or nowhere for STDOUT."""
         self.path = self._asked = path
-        self._is_plain = plain
+        self._is_plain, self._fd = plain, -1
         self._start = ",".join(columns) + "\n" if plain else head(kind, metadata, columns)
         self._beside: dict[str, Any] | None = {"kind": kind, "metadata": metadata, "closing": None} if plain else None
         if path == STDOUT:
