@@ -14,6 +14,7 @@ from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
 from linkpose.localization.grid import GridMap
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import lines
 from linkpose.plotting.canvas import COLOURS
 from linkpose.recording.table import read_table
@@ -161,7 +162,7 @@ def test_a_map_and_beacons_lie_under_the_path(tmp_path):
     t = np.arange(50) / 100
     file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
     grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
-    scene = plotting.PathBackground(grid, {"A1": (3.0, 4.0, 9.0)})
+    scene = Surroundings(grid, {"A1": (3.0, 4.0, 9.0)})
     figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
     (path,) = figure.axes
     (image,) = path.images

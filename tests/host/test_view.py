@@ -16,8 +16,9 @@ import linkpose as lp
 from linkpose import quantities
 from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
-from linkpose.cli.view import Extremes, Screen, final_table
+from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
+from linkpose.extremes import Extremes
 from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
@@ -141,10 +142,15 @@ def test_filters_that_become_ready_late_give_the_same_estimates() -> None:
             ready |= {"tilt"}
         if at == 40:
             ready |= {"joint", "text"}
-        complete, newest = late.process(block[at : at + 5])
+        complete, newest, caught_up = late.process(block[at : at + 5])
         rows.append(complete)
         tilt, joint = newest[1 : 1 + 4], newest[5:]
         assert np.isnan(tilt).all() == (at < 20) and np.isnan(joint).all() == (at < 40)
+        # A filter that catches up gives all rows so far once more: the view's curve does not begin at this moment.
+        assert len(caught_up) == (at + 5 if at in (20, 40) else 0)
+        if at == 20:
+            assert np.array_equal(caught_up[:, 1:5], expected[:25, 1:5], equal_nan=True)
+            assert np.isnan(caught_up[:, 5:]).all()
     rows.append(late.finish())
     assert [len(part) for part in rows[:8]] == [0] * 8
     assert np.array_equal(np.concatenate(rows), expected, equal_nan=True)

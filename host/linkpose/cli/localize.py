@@ -240,7 +240,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "picture",
     type=options.FILE,
     metavar="PICTURE",
-    help="Draw the paths with 2σ ellipses over the map or the beacons, and the truth (.png, .pdf, .svg).",
+    help="Draw the paths with 2σ ellipses, map, beacons and truth (.png, .pdf, .svg), or play them (.html).",
 )
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
@@ -282,6 +282,7 @@ def command(
     from linkpose.localization.logs import read_log
     from linkpose.localization.maps import load_map
     from linkpose.localization.plausibility import check_units
+    from linkpose.localization.surroundings import Surroundings
     from linkpose.localization.tables import read_beacons, read_truth, score_track
 
     console = Console(quiet, verbose=False)
@@ -295,9 +296,10 @@ def command(
     beacons = read_beacons(beacons_path) if beacons_path else {}
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
+        from linkpose.page.animation import FORMATS
         from linkpose.plotting import check_output
 
-        check_output(picture, force)
+        check_output(picture, force, FORMATS)
     read = read_log(log)
     for remark in read.remarks:
         console.report(remark)
@@ -337,18 +339,15 @@ def command(
 
         write_tracks(output, tracks, log, force)
     if picture is not None:
-        from linkpose import plotting
+        from linkpose.page.animation import save_picture
 
-        scene = plotting.PathBackground(grid, beacons, tracks[names[0]].rejected_xy_m)
-        figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], scene)
-        plotting.save(figure, picture, force)
+        around = Surroundings(grid, beacons, tracks[names[0]].rejected_xy_m)
+        save_picture(picture, _tables(tracks, log, truth_path), [], around, force)
     for name, track in tracks.items():
         result = score_track(track, truth) if truth else None
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
     if has_page:
-        from linkpose.page.scene import Surroundings
-
         page.play(_tables(tracks, log, truth_path), [], Surroundings(grid, beacons), console)
 
 

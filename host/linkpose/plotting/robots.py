@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import errors, shade_unknown, view_values
@@ -29,23 +29,14 @@ _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the who
 TimePanel = tuple[float, Callable[["Axes"], None]]
 
 
-@dataclass(frozen=True, slots=True)
-class PathBackground:
-    """What lies under a robot's path, in its map's frame."""
-
-    grid: GridMap | None = None
-    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m); further axes are ignored
-    rejected_xy_m: Floats | None = None  # (N, 2) where measurements were rejected
-
-
-def path_panel(sources: Sources, scene: PathBackground | None) -> Callable[[Axes], None] | None:
+def path_panel(sources: Sources, scene: Surroundings | None) -> Callable[[Axes], None] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
     tracks = _with_path(sources)
     wide = is_wide(sources, scene)
-    return (lambda axes: _path(axes, tracks, scene or PathBackground(), wide)) if tracks else None
+    return (lambda axes: _path(axes, tracks, scene or Surroundings(), wide)) if tracks else None
 
 
-def is_wide(sources: Sources, scene: PathBackground | None) -> bool:
+def is_wide(sources: Sources, scene: Surroundings | None) -> bool:
     """Whether a path, without a map, extends so much further along x than along y that a square would be empty."""
     if scene is not None and scene.grid is not None:
         return False
@@ -74,7 +65,7 @@ def time_panels(sources: Sources) -> list[TimePanel]:
     return found
 
 
-def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: PathBackground, wide: bool) -> None:
+def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: bool) -> None:
     _draw_scene(axes, scene)
     for track in reversed(tracks):
         style = line_style(track.name, track.file) if track.name else TRUTH
@@ -91,7 +82,7 @@ def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: PathBackground, wide:
     legend_above(axes, 6 if wide else 3, [track.label for track in tracks])
 
 
-def _draw_scene(axes: Axes, scene: PathBackground) -> None:
+def _draw_scene(axes: Axes, scene: Surroundings) -> None:
     if scene.grid is not None:
         draw_map(axes, scene.grid)
     if scene.beacons:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import panels, readings, robots
 from linkpose.plotting.canvas import new_figure
 from linkpose.plotting.sources import Sources, gather, is_recording, title
@@ -62,7 +63,7 @@ class Section:
 
 
 def plot_tables(
-    tables: Sequence[Table], wanted: Sequence[str] = (), scene: robots.PathBackground | None = None
+    tables: Sequence[Table], wanted: Sequence[str] = (), scene: Surroundings | None = None
 ) -> tuple[Figure, list[str]]:
     """Recordings, estimates and references in one figure, and remarks on what it leaves out.
 
@@ -152,7 +153,7 @@ def _chain(sources: Sources) -> Section | None:
     return Section(found) if found else None
 
 
-def _robot(sources: Sources, scene: robots.PathBackground | None) -> Section | None:
+def _robot(sources: Sources, scene: Surroundings | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
     path = robots.path_panel(sources, scene)
     over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources)]
