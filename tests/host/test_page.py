@@ -266,7 +266,7 @@ def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Pa
     leave_without_error(browser)
     assert linkpose("plot", estimate, "-o", tmp_path / "e.gif").status == 2
     refused = linkpose("evaluate", estimate, estimate, "--plot", tmp_path / "e.html")
-    assert refused.status == 2 and "`linkpose plot ESTIMATE.csv -o FILE.html` plays" in refused.stderr
+    assert refused.status == 2 and "`linkpose plot ESTIMATE.csv -o FILE.html` plays" in refused.err
 
 
 def test_what_is_not_excited_yet_is_shown() -> None:
