@@ -14,6 +14,7 @@ from terminal import Terminal
 
 import linkpose as lp
 from linkpose import quantities
+from linkpose.cli.characters import replacement
 from linkpose.cli.curve import Canvas, curve, path_map
 from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.screen import Screen, final_table
@@ -85,6 +86,13 @@ def test_the_curve_covers_its_values() -> None:
     assert lines[0].strip().startswith("1.0") and lines[-1].strip().startswith("-1.0")
     assert all(any(char > "\u2800" for char in line.split("┤")[1]) for line in lines)
     assert curve([0.0], [math.nan], 20.0, 30, 3, 0.02) == [" " * 30] * 3
+
+
+def test_a_code_page_keeps_signs_columns_and_the_curve() -> None:
+    assert replacement("▸ joint  1.59 m ±0.4 mm  −3.2°") == "> joint  1.59 m +/-0.4 mm  -3.2 deg"
+    canvas = Canvas(8, 1)
+    canvas.line((0, 0), (15, 3))
+    assert replacement(canvas.lines()[0]) == "''----.." and replacement("\u2800\u28ff") == " :"
 
 
 def test_dots_are_where_they_should_be() -> None:

@@ -132,7 +132,7 @@ class Screen:
             sections += self._link_sections(link, width)
         if robot is not None:
             sections += self._robot_sections(robot, width)
-        sections += [(9, [(status, "yellow")] if status else []), (1, [(self._keys, "dim")] if self._keys else [])]
+        sections += [(9, [(status, "bold")] if status else []), (1, [(self._keys, "dim")] if self._keys else [])]
         return [section for section in sections if section[1]]
 
     def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
@@ -148,7 +148,7 @@ class Screen:
         path = self._paths.get(name, ())
         lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
         head = (_HEADLINE, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
-        return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
+        return [head, (6, [(line, "") for line in lines]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         """The joint's angles, both heights (narrow screens drop the last ones), and the curve of the first angle."""
@@ -238,7 +238,7 @@ def _add_point(curves: dict[str, Points], name: str, time_s: float, value: float
 def _curve_lines(points: Iterable[tuple[float, float]], width: int, least: float) -> list[tuple[str, str]]:
     """The curve of the last seconds; its axis covers at least `least`."""
     times, values = [time for time, _ in points], [value for _, value in points]
-    return [(line, "cyan") for line in curve(times, values, CURVE_S, width, CURVE_ROWS, least)]
+    return [(line, "") for line in curve(times, values, CURVE_S, width, CURVE_ROWS, least)]
 
 
 def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -> list[str]:
