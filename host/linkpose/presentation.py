@@ -184,6 +184,11 @@ def same_digits(first: float, *others: float) -> list[str]:
     return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
 
 
+def with_unit(number: str, unit: str) -> str:
+    """A number with its unit; the degree sign stands without a space: 0.4 cm, 0.4°."""
+    return number + ("" if unit == "°" else " ") + unit
+
+
 def counted(number: int, noun: str) -> str:
     """A number with its noun: 1 gap, 2 gaps."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -178,11 +178,13 @@ def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
     t = np.arange(300) / 100
     angle = 30 * np.sin(t)
     estimate = {"time_s": t, "chain_angle_deg": angle + 1, "chain_angle_std_deg": np.ones(300)}
+    estimate |= {f"chain_q{axis}": np.full(300, float(axis == "w")) for axis in "wxyz"} | {"tilt_height_m": t}
     truth = {"time_s": t, "chain_angle_deg": angle}
     paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", truth, "truth"))
-    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    figure, remarks = plotting.plot_tables([read_table(Path(path)) for path in paths])
     assert [axes.get_ylabel() for axes in figure.axes] == ["joint angle (°)", "angle error (°)"]
-    assert drawn(figure.axes[1])[0] == "chain 1 ° rms"
+    assert drawn(figure.axes[1])[0] == "chain 1° rms"
+    assert remarks == ["not drawn beside a chain: tilt (add --filter tilt)"]
 
 
 def test_a_ball_joint_has_a_panel_for_each_angle_with_its_truth(tmp_path):

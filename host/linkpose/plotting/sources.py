@@ -16,7 +16,7 @@ from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
 from linkpose.presentation import counted
-from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, by_filter, split, std_column
+from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
@@ -69,8 +69,8 @@ def is_reference(table: Table) -> bool:
 def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     """Of estimates and references.
 
-    Without `wanted`, the filters whose height comes from the air pressure are hidden, and beside a robot's path the
-    filters that estimate its tilt alone.
+    Without `wanted`, the filters whose height comes from the air pressure are hidden, beside a robot's path the filters
+    that estimate its tilt alone, and beside a chain the filters of one of its sensors.
 
     Raises LinkposeError where a wanted filter is in no file.
     """
@@ -81,8 +81,10 @@ def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     if missing:
         raise LinkposeError(f"no file has the filter {', '.join(missing)}; there are {', '.join(dict.fromkeys(found))}")
     shown = _shown(list(dict.fromkeys(found)), wanted)
-    if not wanted and HEADING in {q for table in estimates for of in by_filter(table.columns).values() for q in of}:
+    if not wanted and any(_has(table, HEADING) for table in estimates):
         shown = [name for name in shown if not all(_is_tilt_alone(table, name) for table in estimates)]
+    if not wanted and any(_has(table, QW) for table in estimates):
+        shown = [name for name in shown if any(_has(table, QW, name) for table in estimates)]
     tracks = [
         _track(table, name, columns, i, len(estimates) > 1)
         for i, table in enumerate(estimates)
@@ -107,6 +109,15 @@ def _shown(found: list[str], wanted: Sequence[str]) -> list[str]:
 def is_barometric(name: str) -> bool:
     """Whether a filter's height comes from the air pressure."""
     return bool((of := filters.capabilities(name)) and of.is_barometric)
+
+
+def _has(table: Table, quantity: Quantity, name: str | None = None) -> bool:
+    """Whether this filter, or any, has a value of a quantity somewhere."""
+    return any(
+        quantity in of and bool(np.isfinite(table.columns[of[quantity]]).any())
+        for each, of in by_filter(table.columns).items()
+        if name in (None, each)
+    )
 
 
 def _is_tilt_alone(table: Table, name: str) -> bool:

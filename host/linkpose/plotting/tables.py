@@ -73,7 +73,7 @@ def plot_tables(
     for table in tables:
         table.require("time_s")
     sources = gather([table for table in tables if not is_recording(table)], wanted)
-    sections = [section for section in (_robot(sources, scene), _link(sources), _chain(sources)) if section]
+    sections = [section for section in (_robot(sources, scene), _chain(sources), _link(sources)) if section]
     sections += [section for table in tables if is_recording(table) and (section := _readings(table))]
     if not sections:
         raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
@@ -111,6 +111,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
         axes.set_xlabel("time (s)")
+        part.align_ylabels()
 
 
 def _link(sources: Sources) -> Section | None:
@@ -125,6 +126,8 @@ def _link(sources: Sources) -> Section | None:
                 found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height")))
         elif _estimated(sources, HEIGHT):
+            if panels.differences_hide_best(sources, HEIGHT):
+                found.append(PlotPanel(1.3, lambda axes: panels.from_best(axes, sources, HEIGHT, best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
     for quantity in (ROLL, PITCH, YAW):
         if panels.has(sources, quantity):
