@@ -16,7 +16,7 @@ from linkpose.evaluation.scores import evaluate
 from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import lines
-from linkpose.plotting.canvas import COLOURS
+from linkpose.plotting.canvas import COLOURS, legend_above
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -141,7 +141,7 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x (m)", "y (m)", 1.0)
     assert drawn(path) == ["truth", "planar-ekf", "±2σ planar-ekf"]
     assert {(e.width, e.height) for e in path.patches if hasattr(e, "width")} == {(0.04, 0.08)}
-    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped\n(°)")
+    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading (°)")
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
     (bar,) = mice.collections[1].get_paths()  # of mouse 2
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
@@ -302,3 +302,24 @@ def test_reproduce_link_prints_every_method_on_every_test(linkpose, tmp_path):
 def test_reproduce_link_shows_the_papers_tables_beside(linkpose):
     shown = linkpose("reproduce", "link", "--seeds", 1).out
     assert "Table 1" in shown and "Table 2" in shown and "17.34" in shown and "joint A" in shown
+
+
+def test_a_legend_reads_row_by_row_and_single_values_are_dots(tmp_path):
+    axes = plotting.new_figure(4, 4).add_subplot()
+    for name in "abcdefg":
+        lines.draw(axes, np.arange(3.0), np.array([1.0, np.nan, 2.0]), label=name)
+    legend_above(axes, 3, list("abcdefg"))
+    shown = [text.get_text() for text in axes.get_legend().get_texts()]
+    columns = np.array_split(shown, 3)  # as matplotlib fills them
+    assert [column[row] for row in range(3) for column in columns if row < len(column)] == list("abcdefg")
+    assert axes.lines[1].get_xdata().tolist() == [0.0, 2.0] and axes.lines[1].get_marker() == "."
+
+
+def test_a_long_name_is_shortened_and_an_empty_estimate_refused(tmp_path):
+    t = np.arange(100) / 100
+    table = read_table(Path(write(tmp_path / f"{'n' * 150}.csv", {"time_s": t, "tilt_height_m": t})))
+    figure, _ = plotting.plot_tables([table])
+    assert "…" in figure.get_suptitle() and len(figure.get_suptitle()) < 120
+    empty = read_table(Path(write(tmp_path / "empty.csv", {"time_s": t, "tilt_height_m": np.nan * t})))
+    with pytest.raises(LinkposeError, match="its quantities are empty in all rows"):
+        plotting.plot_tables([empty])

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from linkpose import quantities
-from linkpose.cli.curve import curve, path_map
+from linkpose.cli.curve import curve, path_map, time_axis
 from linkpose.device.session import Health
 from linkpose.presentation import (
     Exclusions,
@@ -23,6 +23,7 @@ from linkpose.presentation import (
     joint_angle,
     joint_texts,
     length_with_std,
+    minus,
     pose_text,
     signed_angle,
     std_text,
@@ -140,7 +141,7 @@ class Screen:
         table = (5, self._height_table(name, width))
         return [
             (_HEADLINE, [(self._headline(name, width), "")]),
-            (6, _curve_lines(points, width, LEAST_HEIGHT_M)),
+            *_curve_sections(6, points, width, LEAST_HEIGHT_M),
             table,
         ]
 
@@ -159,8 +160,8 @@ class Screen:
                 parts.append(f"height {number} {length_with_std(*values[quantity])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()
-        lines = _curve_lines(self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
-        return [(_HEADLINE, [("   ".join(parts), "")]), (7, lines)]
+        curve_below = _curve_sections(7, self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
+        return [(_HEADLINE, [("   ".join(parts), "")]), *curve_below]
 
     def _head(self, health: Health, width: int) -> str:
         """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
@@ -235,10 +236,14 @@ def _add_point(curves: dict[str, Points], name: str, time_s: float, value: float
         points.append((time_s, value))
 
 
-def _curve_lines(points: Iterable[tuple[float, float]], width: int, least: float) -> list[tuple[str, str]]:
-    """The curve of the last seconds; its axis covers at least `least`."""
+def _curve_sections(
+    priority: int, points: Iterable[tuple[float, float]], width: int, least: float
+) -> list[tuple[int, list[tuple[str, str]]]]:
+    """The curve of the last seconds, whose axis covers at least `least`, and its time axis, which goes sooner."""
     times, values = [time for time, _ in points], [value for _, value in points]
-    return [(line, "") for line in curve(times, values, CURVE_S, width, CURVE_ROWS, least)]
+    lines = curve(times, values, CURVE_S, width, CURVE_ROWS, least)
+    axis = time_axis(CURVE_S, lines[0].find("┤"), width) if "┤" in lines[0] else ""
+    return [(priority, [(line, "") for line in lines]), (2, [(axis, "dim")] if axis else [])]
 
 
 def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -> list[str]:
@@ -258,5 +263,5 @@ def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -
 def _signed_length(metres: float) -> str:
     size = abs(metres)
     if size < 0.01:
-        return f"{1e3 * metres:+.1f} mm"
-    return f"{1e2 * metres:+.1f} cm" if size < 1 else f"{metres:+.2f} m"
+        return minus(f"{1e3 * metres:+.1f} mm")
+    return minus(f"{1e2 * metres:+.1f} cm" if size < 1 else f"{metres:+.2f} m")

@@ -11,8 +11,9 @@ from linkpose import filters
 from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, others_hide_best
+from linkpose.plotting.sources import shortened
 from linkpose.presentation import same_digits, with_unit
-from linkpose.quantities import unit_text
+from linkpose.quantities import unit_text, words
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
     figure = new_figure(11.0, 0.7 + _ROW_INCHES * len(rows) + table_inches)
     offset = found.scores[0].time_offset_s
     aligned = f"   ·   clocks aligned by {offset:+.4f} s" if offset else ""
-    figure.suptitle(f"{estimate} against {reference}{aligned}", fontsize=10, x=0.01, ha="left")
+    figure.suptitle(f"{shortened(estimate)} against {shortened(reference)}{aligned}", fontsize=10, x=0.01, ha="left")
     heights = [_ROW_INCHES] * len(rows) + [table_inches]
     grid = figure.add_gridspec(len(rows) + 1, 2, width_ratios=[2.6, 1], height_ratios=heights)
     first: Axes | None = None
@@ -97,14 +98,14 @@ def _errors(axes: Axes, scores: Sequence[Score], name: str) -> None:
         draw(axes, of.time_s, of.error, label=label, **line_style(score.filter))
         drawn.append(of.error)
         if of.std is not None and not stds:
-            stds.append(of.std)
+            stds.append(np.where(np.isfinite(of.error), of.std, np.nan))
             colour = str(line_style(score.filter)["color"])
-            band(axes, of.time_s, np.zeros(len(of.time_s)), of.std, colour, f"±2σ {score.filter}")
+            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"±2σ {score.filter}")
     first = next(score.errors[name] for score in scores if name in score.errors)
     shade(axes, first.time_s, ~np.isfinite(first.error))
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
-    finish(axes, f"{name} error ({unit})")
+    finish(axes, f"{words(name)} error ({unit})")
     legend_above(axes, 4, order)
 
 
@@ -150,7 +151,7 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
-            rows.append([score.filter, f"{name} ({unit})", *figures, *sigma, str(value.rows)])
+            rows.append([score.filter, f"{words(name)} ({unit})", *figures, *sigma, str(value.rows)])
             colours.append(str(line_style(score.filter)["color"]))
     head = ["filter", "quantity", "RMSE", "mean", "worst", "95 %", "NEES", "within ±2σ", "rows"]
     axes.axis("off")

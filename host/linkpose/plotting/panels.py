@@ -11,7 +11,7 @@ from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.sources import DrawnTrack, Sources, is_barometric, pairs
 from linkpose.presentation import with_unit
-from linkpose.quantities import QW, YAW, Quantity, unit_text
+from linkpose.quantities import QW, YAW, Quantity, unit_text, words
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
     shade_unknown(axes, sources.tracks)
-    finish(axes, f"{name} error ({unit})")
+    finish(axes, f"{words(name)} error ({unit})")
     legend_above(axes, best_first=order)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import errors, shade_unknown, view_values
+from linkpose.plotting.panels import errors, hides_best, shade_unknown, view_values
 from linkpose.plotting.sources import DrawnTrack, Sources
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.rotations import rotation_vectors
@@ -49,16 +49,19 @@ def _with_path(sources: Sources) -> list[DrawnTrack]:
     return [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
 
 
-def time_panels(sources: Sources) -> list[TimePanel]:
+def time_panels(sources: Sources, scene: Surroundings | None = None) -> list[TimePanel]:
     """Error of the position, speed, unwrapped heading and the mice left out, as far as a filter estimates them."""
     found: list[TimePanel] = []
     shown = sources.tracks or sources.all
     if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
-        found.append((1.8, lambda axes: _position_errors(axes, sources)))
+        columns = 6 if is_wide(sources, scene) else 3
+        if hides_best(sources, "position"):
+            found.append((1.4, lambda axes: _position_errors(axes, sources, columns, best_only=True)))
+        found.append((1.8, lambda axes: _position_errors(axes, sources, columns)))
     if any(track.has(VX) for track in shown):
         found.append((1.8, lambda axes: _over_time(axes, sources, _speed, "speed (m/s)")))
     if any(track.has(HEADING) for track in shown):
-        found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading, unwrapped (°)")))
+        found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading (°)")))
     for track in sources.tracks:
         if track.has(EXCLUDED) and bool((track.values[EXCLUDED] > 0).any()):
             found.append((0.9, _mice_panel(track)))
@@ -151,9 +154,9 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
         axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
 
 
-def _position_errors(axes: Axes, sources: Sources) -> None:
+def _position_errors(axes: Axes, sources: Sources, columns: int, best_only: bool = False) -> None:
     """Distances from the true position, and the best filter's 2σ of x and y together."""
-    errors(axes, sources, "position")
+    errors(axes, sources, "position", best_only)
     best = next((track for track in sources.tracks if X in track.std and Y in track.std), None)
     if best is not None:
         std = np.hypot(best.std[X], best.std[Y])
@@ -162,7 +165,7 @@ def _position_errors(axes: Axes, sources: Sources) -> None:
         known = std[np.isfinite(std)]
         top = axes.get_ylim()[1]
         axes.set_ylim(0.0, max(top, 2.2 * float(np.quantile(known, 0.9))) if len(known) else top)
-        legend_above(axes, 3)
+    legend_above(axes, columns)
 
 
 def _speed(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:

@@ -20,6 +20,7 @@ from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, by_filter, 
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
+_LONGEST_NAME = 61  # characters; the rest of the title takes as many
 _THINNED = "the picture shows the extremes of each part, and figures beside lines are of the rows shown"
 
 
@@ -186,7 +187,7 @@ def _describe(table: Table) -> str:
     time_s, whole = table.columns["time_s"], table.whole
     step = whole.interval_s if whole else interval(time_s)
     length = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    words = [table.path.name, _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
+    words = [shortened(table.path.name), _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
     holes = whole.gaps if whole else len(gaps(time_s))
     closing = table.closing or {}
     lost = closing.get("lost")
@@ -194,6 +195,14 @@ def _describe(table: Table) -> str:
         lost = whole.lost if whole else lost_samples(time_s)
     words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {counted(holes, 'gap')}")
     return "   ·   ".join(word for word in words if word)
+
+
+def shortened(name: str) -> str:
+    """A file's name, without its middle if it is so long that the title would not fit the figure."""
+    if len(name) <= _LONGEST_NAME:
+        return name
+    half = (_LONGEST_NAME - 1) // 2
+    return f"{name[:half]}…{name[-half:]}"
 
 
 def _length(seconds: float) -> str:

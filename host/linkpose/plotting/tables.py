@@ -25,6 +25,7 @@ from linkpose.quantities import (
     ROTATION,
     YAW,
     Quantity,
+    split,
 )
 from linkpose.recording.table import Table
 
@@ -76,6 +77,8 @@ def plot_tables(
     sections = [section for section in (_robot(sources, scene), _chain(sources), _link(sources)) if section]
     sections += [section for table in tables if is_recording(table) and (section := _readings(table))]
     if not sections:
+        if any(split(column) for column in tables[0].columns):
+            raise LinkposeError(f"{tables[0].path} holds nothing to draw: its quantities are empty in all rows")
         raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
     figure = new_figure(_WIDTH_INCHES, 0.8 + _INCHES * sum(section.height for section in sections))
     figure.suptitle(title(tables), fontsize=10, x=0.01, ha="left")
@@ -159,7 +162,7 @@ def _chain(sources: Sources) -> Section | None:
 def _robot(sources: Sources, scene: Surroundings | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
     path = robots.path_panel(sources, scene)
-    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources)]
+    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources, scene)]
     return Section(over_time, path, robots.is_wide(sources, scene)) if path or over_time else None
 
 
