@@ -101,8 +101,10 @@ def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
 def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["height over the joint\n(m)", "from best (cm)", "roll (°)"]
-    assert drawn(figure.axes[1])[0] == "joint-inertial (best)"
+    # The best filter's ±2σ has a panel of its own, where the others differ so much that it would look like a line.
+    assert labels == ["height over the joint\n(m)", "from best (cm)", "from best (cm)", "roll (°)"]
+    assert drawn(figure.axes[1]) == ["joint-inertial (best)", "±2σ joint-inertial"]
+    assert drawn(figure.axes[2])[:2] == ["joint-inertial (best)", "joint 0.639 cm rms from it"]
 
 
 def test_gaps_and_unknown_values_are_shaded(tmp_path):
@@ -236,7 +238,8 @@ def test_long_lines_keep_their_extremes_and_few_points(tmp_path):
 def test_an_evaluation_shows_errors_their_distribution_and_the_table(tmp_path):
     found = evaluate(*link_files(tmp_path))
     figure = plotting.evaluation(found, "e.csv", "t.csv")
-    errors, density, roll, table = figure.axes
+    best, _, errors, density, roll, table = figure.axes
+    assert drawn(best) == [drawn(errors)[0], "±2σ joint-inertial"] and "joint 0.7" in drawn(errors)[1]
     assert errors.get_ylim()[0] < 0.0
     assert errors.get_ylabel() == "height error (cm)" and roll.get_ylabel() == "roll error (°)"
     share = found.scores[0].statistics()["height"].within_2sigma
