@@ -328,6 +328,17 @@ class NeedsScans(LinkposeError):
         self.log, self.filter = log, name
 
 
+class NothingApplied(LinkposeError):
+    """A filter rejected all `rejected` measurements of the log. `log` names it, `filter` is the filter."""
+
+    def __init__(self, log: str, name: str, rejected: int) -> None:
+        super().__init__(
+            f"{log}: {name} applied none of the measurements ({rejected} rejected), so there is no estimate; check "
+            "the units (m, s, rad), the start, and the places of the beacons or the map"
+        )
+        self.log, self.filter, self.rejected = log, name, rejected
+
+
 # ---- values ----
 
 

@@ -186,6 +186,9 @@ MORE: dict[str, dict[str, Producer]] = {
             read_beacons, "id,x_m,y_m\n5,0,0\n05,1,1\n"
         ),
         "…, line …: … is no finite number; complete or delete the row": reading(read_truth, "time_s,x_m,y_m\n0,,1\n"),
+        "… applied none of the measurements (… rejected), so there is no estimate; check the units (m, s, rad), the start, and the places of the beacons or the map": (
+            log_of("0,pose,0,0,0\n1,range,1,90,\n", lambda log: lp.localize(log, beacons=BEACONS))
+        ),
         "the pose was never known, so there is nothing to compare with the truth": scored([], path_of(0.0, 1.0)),
         "the true path (… to … s) has no pose at the log's times (… to … s); give the truth of this log": scored(
             [0.0, 0.5], path_of(7.0, 7.5)

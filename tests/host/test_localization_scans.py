@@ -13,7 +13,7 @@ from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at
 from linkpose.localization.events import Event, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
@@ -65,7 +65,7 @@ def drive():
 def test_a_scan_match_is_accurate_and_honest(drive):
     run, grid = drive
     start = tuple(run.pose[0] + (0.3, -0.3, 0.08))
-    track = localize(as_log(run.readings), "scan-match", Settings(start=start), grid)
+    track = estimate_track(as_log(run.readings), "scan-match", Settings(start=start), grid)
     result = score_track(track, run.truth)
     assert result.position_rmse_m < 0.06
     assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
@@ -82,7 +82,7 @@ def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
         for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
             grown = np.roll(blocked, step, axis) & (rng.random(blocked.shape) < 0.4)
             blocked |= grown.astype(np.uint8)
-    track = localize(
+    track = estimate_track(
         as_log(run.readings), "scan-match", Settings(start=tuple(run.pose[0])), GridMap(blocked, grid.geometry)
     )
     result = score_track(track, run.truth)
@@ -93,7 +93,7 @@ def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
 
 def test_without_a_start_the_pose_is_unknown_and_then_right(drive):
     run, grid = drive
-    track = localize(as_log(run.readings), "scan-match", Settings(), grid)
+    track = estimate_track(as_log(run.readings), "scan-match", Settings(), grid)
     assert not track.known[0]
     assert np.isnan(track.state[0]).all()
     assert track.known.mean() > 0.6
@@ -108,7 +108,7 @@ def test_a_robot_that_was_carried_is_found_again(drive):
     log = as_log(run.readings)
     for event in as_log([replace(reading, time_s=reading.time_s + shift) for reading in other.readings[900:]]):
         log.append(event)
-    track = localize(log, "scan-match", Settings(start=tuple(run.pose[0])), grid)
+    track = estimate_track(log, "scan-match", Settings(start=tuple(run.pose[0])), grid)
     assert track.relocated >= 1
     true = np.interp(track.time_s[-1] - shift, other.time_s, other.pose[:, 0])
     assert track.known[-1] and abs(track.state[-1, 0] - true) < 0.2
@@ -118,18 +118,18 @@ def test_monte_carlo_localisation_is_seeded(drive):
     run, grid = drive
     log = as_log(run.readings)
     settings = Settings(start=tuple(run.pose[0]), start_std=(0.2, 0.05), particles=300, seed=2)
-    tracks = [localize(log, "mcl", chosen, grid) for chosen in (settings, settings, replace(settings, seed=3))]
+    tracks = [estimate_track(log, "mcl", chosen, grid) for chosen in (settings, settings, replace(settings, seed=3))]
     assert (tracks[0].state == tracks[1].state).all()
     assert (tracks[0].state != tracks[2].state).any()
     assert score_track(tracks[0], run.truth).position_rmse_m < 0.3
     with pytest.raises(LinkposeError, match="does not state where the robot starts"):
-        localize(log, "mcl", Settings(), grid)
+        estimate_track(log, "mcl", Settings(), grid)
 
 
 def test_scans_without_echo_change_nothing():
     grid = office_map()
     silent = Scan(1.0, np.full(181, np.nan), np.linspace(-1.5, 1.5, 181), (0.0, 0.0, 0.0), 80.0)
     log = [Event(0.0, "pose", (12.0, 12.0, 0.0)), Event(0.0, "odometry", (0.0, 0.0)), silent]
-    track = localize(log, "scan-match", Settings(), grid)
+    track = estimate_track(log, "scan-match", Settings(), grid)
     assert track.applied == 0
     assert track.state[-1] == pytest.approx([12.0, 12.0, 0.0])
