@@ -30,9 +30,7 @@ _BLOCK_S = 0.2  # one comparison (s). Doubled: a jump is found 0.2 s later, and 
 _SUM_DRIFT, _SUM_LIMIT, _SUM_MOST = 0.75, 5.0, 15.0
 # Gyro and mice may differ by this share of the turn (1σ): scale of the gyro, positions of the mice. Doubled: a jump is
 # found on straights only.
-_SHARE = 0.02
-# The share of the motion that slipping mice lose varies by this (1σ), from block to block.
-_SLIP_SHARE = 0.05
+_SHARE = 0.03
 # A jump: this many σ; a fit that is better than the other one by this much (−2 log of the ratio of likelihoods), with
 # χ² per block below the third number; no larger than the fourth (rad/s, the data sheet's ±20 °/s). Doubled: found later.
 _JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
@@ -42,7 +40,7 @@ _FEWEST_BLOCKS = 4
 _PATIENCE_BLOCKS = 50
 # Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
 # both 1σ. Doubled: no visible change, as long as both are possible.
-_LOST_STD, _VEERING_STD = 0.5, 0.1
+_LOST_STD, _VEERING_STD = 0.25, 0.1
 _SILENT_S = 0.05  # a mouse without a count for so long does not move (s)
 _JUMP_SHARE = 0.03  # of a jump of the bias: its σ beyond that of the fit
 _REPAIR_SHARE = 0.3  # of a correction of the heading or the position: its σ
@@ -75,6 +73,9 @@ def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
         judges = m.sound
     if number(judges) < 2:
         return -1
+    if judges != state.doubt.judges:  # a fault has been found or is over: compare anew
+        state.doubt.judges = judges
+        _forget(state.doubt)
     for i in range(m.count):
         if judges >> i & 1 and mice[i].silent_s < _SILENT_S:
             counting |= 1 << i
@@ -151,7 +152,9 @@ def _add_step(state: Record, m: Record, mice: Records, turn_rate: float, motion:
     doubt.block_s += m.step
     doubt.block_gyro += (m.mean_rate - state.at.bias) * m.step
     doubt.block_mice += turn_rate * m.step
-    doubt.block_way += m.fit.real * m.step if motion else 0.0
+    if motion:
+        doubt.block_way += m.fit.real * m.step
+        doubt.block_moved_s += m.step
     variance = m.step * m.step * m.fit_turn_variance
     rounding = variance * _rounding_share(m, mice) if motion else 0.0
     if rounding > doubt.block_rounding:
@@ -162,7 +165,7 @@ def _add_step(state: Record, m: Record, mice: Records, turn_rate: float, motion:
     if doubt.block_s >= _BLOCK_S - 1e-9:
         _finish_block(state, m)
         doubt.block_s = doubt.block_gyro = doubt.block_mice = doubt.block_way = doubt.block_variance = 0.0
-        doubt.block_rounding = 0.0
+        doubt.block_rounding = doubt.block_moved_s = 0.0
 
 
 @inner
@@ -188,13 +191,13 @@ def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     doubt, turn = state.doubt, state.doubt.block_gyro
     doubt.span += span
     doubt.blocks += 1
-    if doubt.blocks == 1:  # a change within this block fits neither
+    if doubt.blocks == 1 or doubt.block_moved_s < 0.5 * span:  # a change within a block, or a lift, fits neither
         return
     weight = 1.0 / variance
     doubt.jump_square += weight * span * span
     doubt.jump_product += weight * span * off
     doubt.jump_cost += weight * off * off
-    weight, way = 1.0 / (variance + (_SLIP_SHARE * turn) ** 2), doubt.block_way
+    way = doubt.block_way
     doubt.turn_square += weight * turn * turn
     doubt.turn_way += weight * turn * way
     doubt.way_square += weight * way * way
@@ -213,7 +216,7 @@ def is_doubtful(state: Record) -> bool:
 def _decide(state: Record, m: Record) -> None:
     """Accept the hypothesis that fits decisively better; keep both while none does."""
     doubt = state.doubt
-    if doubt.blocks < _FEWEST_BLOCKS:
+    if doubt.blocks < _FEWEST_BLOCKS or doubt.jump_square == 0.0:
         return
     jump = doubt.jump_product / doubt.jump_square
     by_jump = doubt.jump_cost - jump * doubt.jump_product
@@ -255,7 +258,14 @@ def agree(state: Record) -> None:
     doubt = state.doubt
     doubt.position, doubt.heading = complex(state.at.x, state.at.y), state.at.heading
     doubt.start = doubt.position
-    doubt.up = doubt.down = doubt.span = 0.0
+    doubt.up = doubt.down = 0.0
+    _forget(doubt)
+
+
+@inner
+def _forget(doubt: Record) -> None:
+    """Forget the blocks so far."""
+    doubt.span = 0.0
     doubt.jump_square = doubt.jump_product = doubt.jump_cost = 0.0
     doubt.turn_square = doubt.turn_way = doubt.way_square = 0.0
     doubt.turn_off = doubt.way_off = doubt.off_square = 0.0

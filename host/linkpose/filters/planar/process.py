@@ -36,7 +36,12 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
-_RECENT_TURN = 0.3  # turning (rad²/s) over which another floor must still show
+# Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
+# (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
+_ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# While the last turn is off by so many standard deviations, the mice are not calibrated. Doubled: positions of the mice
+# take up the scale of another floor.
+_OFF_Z = 3.0
 # The bias that the fault tests assume is this much less certain than the filter's (rad/s): slow drift of a gyro.
 _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
@@ -96,7 +101,7 @@ def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) 
 
 
 @inner
-def _watch_floor(state: Record, m: Record, p: Record) -> None:
+def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
     if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
@@ -106,15 +111,19 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
-    keep = math.exp(-turn * turn * m.step / _RECENT_TURN)
-    state.recent_square = keep * state.recent_square + turn * turn * m.step
-    state.recent_product = keep * state.recent_product + turn * m.turn_rate * m.step
+    _add_to_turn(state, turn, m.turn_rate, m.step)
+    by_scales = _variance_by_scales(state, m, mice)
+    state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
     if state.turn_square < _FLOOR_TURN or is_doubtful(state):
         return
     off = state.turn_product / state.turn_square - 1.0
-    if abs(off) <= _FLOOR_SHARE + _FLOOR_Z * math.sqrt(state.turn_variance) / state.turn_square:
+    noise = math.sqrt(by_scales + state.turn_variance / state.turn_square**2)
+    if abs(off) <= _FLOOR_SHARE + _FLOOR_Z * noise:
         return
-    if (state.recent_product / state.recent_square - 1.0) / off < 0.5:  # a slip that is over
+    latest, before = _off_of_turn(state), state.off_of_turn
+    if latest == 0.0:
+        latest, before = before, state.off_of_turn_before
+    if not (latest / off > 0.5 and before / off > 0.5):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
@@ -122,7 +131,50 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     _correct_way(state, off)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    state.is_off = False
     state.floors += 1
+
+
+@inner
+def _variance_by_scales(state: Record, m: Record, mice: Records) -> float:
+    """Variance of the share by which the mice in use turn too much, by the uncertainty of their scales."""
+    centre, count = 0j, number(m.used)
+    for i in range(m.count):
+        if m.used >> i & 1:
+            centre += scaled(1.0 / count, mice[i].arm)
+    total = spread = 0.0
+    for i in range(m.count):
+        if m.used >> i & 1:
+            own = square(mice[i].arm - centre)
+            spread += own
+            for k in range(m.count):
+                if m.used >> k & 1:
+                    other = square(mice[k].arm - centre)
+                    total += own * other * state.covariance[MICE + OF_MOUSE * i + SCALE, MICE + OF_MOUSE * k + SCALE]
+    return max(total, 0.0) / max(spread * spread, 1e-12)
+
+
+@inner
+def _off_of_turn(state: Record) -> float:
+    """Share by which the mice turn more than the gyro in the current turn; 0 while it is too short."""
+    if state.recent_square < _ONE_TURN:
+        return 0.0
+    off: float = state.recent_product / state.recent_square - 1.0
+    return off
+
+
+@inner
+def _add_to_turn(state: Record, by_gyro: float, by_mice: float, dt: float) -> None:
+    """Add a step to the current turn: rates of both (rad/s). Another direction, or going straight, ends it."""
+    if abs(by_gyro) < _TURN_END_RAD_S or by_gyro * state.turn_rate < 0.0:
+        off = _off_of_turn(state)
+        if off != 0.0:
+            state.off_of_turn, state.off_of_turn_before = off, state.off_of_turn
+        state.recent_square = state.recent_product = 0.0
+    state.turn_rate = by_gyro
+    state.recent_square += by_gyro * by_gyro * dt
+    state.recent_product += by_gyro * by_mice * dt
 
 
 @inner
@@ -235,7 +287,7 @@ def _correct(
         return False
     before = complex(state.at.vx, state.at.vy)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, 0.0 if is_doubtful(state) else limit):
+    if not update(state, limit if is_patient else math.inf, 0.0 if is_doubtful(state) or state.is_off else limit):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -325,7 +377,7 @@ def _step(
         agree(state)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
-    _watch_floor(state, m, q)
+    _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)
 

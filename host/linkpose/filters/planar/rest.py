@@ -22,7 +22,7 @@ _REST_S = 0.3
 # A rate that a silent robot's gyro shows for so long (s), constant within its noise, is a new bias: nobody turns a
 # lifted robot so steadily. Doubled: a bias that has jumped is found later.
 _NEW_BIAS_S = 2.0
-_LARGEST_RAD_S = 0.12  # a larger rate is a turn (7 °/s)
+_LARGEST_RAD_S = 0.35  # a larger rate is a turn: the data sheet's bias is within ±20 °/s
 _UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
 _DRIFTED_Z = 4.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
 _GUARD_Z = 5.0  # standard normal quantile of the guards
@@ -92,8 +92,10 @@ def _is_new_bias(state: Record, mean: float, noise: float, time_s: float) -> boo
         return False
     jump = mean - state.at.bias
     state.covariance[BIAS, BIAS] += jump * jump
-    # The robot has turned with the new bias since the rest began; nobody knows since when before.
-    state.at.heading -= jump * state.rest_s
+    if is_doubtful(state):  # the pose by the mice has not turned with the new bias
+        take_other_pose(state)
+    else:
+        state.at.heading -= jump * state.rest_s
     _widen_heading(state, jump)
     state.strange_s = 0.0
     state.jumps += 1

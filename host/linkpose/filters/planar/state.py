@@ -52,11 +52,13 @@ _DOUBT = np.dtype(
         ("start", "c16"),  # position then, in n (m)
         ("position", "c16"),  # by the mice alone since then, in n (m)
         ("heading", "f8"),  # rad
+        ("judges", "i8"),  # bit mask of the mice that are compared with the gyro
         # The current block.
         ("block_s", "f8"),
         ("block_gyro", "f8"),  # turn by the gyro, less its bias (rad)
         ("block_mice", "f8"),  # turn by the mice (rad)
         ("block_way", "f8"),  # ahead, by the mice (m)
+        ("block_moved_s", "f8"),  # time in which the mice counted (s)
         ("block_variance", "f8"),  # of the difference of both turns, by noise that accumulates (rad²)
         ("block_rounding", "f8"),  # and by whole counts (rad²)
         # Cumulative sums of the difference over its σ, for either sign.
@@ -101,8 +103,12 @@ _FIELDS = [
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
     ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
-    ("recent_square", "f8"),  # the first two over the last turn only
+    ("recent_square", "f8"),  # the first two over the current turn only
     ("recent_product", "f8"),
+    ("turn_rate", "f8"),  # of the gyro, less its bias, in the last step (rad/s)
+    ("off_of_turn", "f8"),  # share by which the mice turned more than the gyro in the last turn
+    ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
+    ("off_of_turn_before", "f8"),  # and in the one before
     ("doubt", _DOUBT),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
