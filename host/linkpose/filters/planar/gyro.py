@@ -32,7 +32,7 @@ _SUM_DRIFT, _SUM_LIMIT, _SUM_MOST = 0.75, 5.0, 15.0
 # found on straights only.
 _SHARE = 0.03
 # A jump: this many σ; a fit that is better than the other one by this much (−2 log of the ratio of likelihoods), with
-# χ² per block below the third number; no larger than the fourth (rad/s, the data sheet's ±20 °/s). Doubled: found later.
+# χ² per block below the third number; no larger than the fourth (rad/s, the data sheet's ±20 °/s). Doubled: later.
 _JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
 _SUM_CALIBRATED = 2.0  # beyond it, the mice are not calibrated. Doubled: a jump spoils the calibration
 _FEWEST_BLOCKS = 4
@@ -102,7 +102,8 @@ def _rounding_share(m: Record, mice: Records) -> float:
     for i in range(m.count):
         if m.sound >> i & 1:
             per_step = mice[i].metres_per_count / m.step
-            return min(1.0, ROUNDING * per_step * per_step * mice[i].weight)
+            share: float = ROUNDING * per_step * per_step * mice[i].weight
+            return min(1.0, share)
     return 1.0
 
 
@@ -189,6 +190,7 @@ def _finish_block(state: Record, m: Record) -> None:
 def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     """Add the terms of both fits: off = J span (a jump), off = c turn + e way (errors of the mice)."""
     doubt, turn = state.doubt, state.doubt.block_gyro
+    doubt.age += span
     doubt.span += span
     doubt.blocks += 1
     if doubt.blocks == 1 or doubt.block_moved_s < 0.5 * span:  # a change within a block, or a lift, fits neither
@@ -258,7 +260,7 @@ def agree(state: Record) -> None:
     doubt = state.doubt
     doubt.position, doubt.heading = complex(state.at.x, state.at.y), state.at.heading
     doubt.start = doubt.position
-    doubt.up = doubt.down = 0.0
+    doubt.up = doubt.down = doubt.age = 0.0
     _forget(doubt)
 
 
@@ -272,6 +274,13 @@ def _forget(doubt: Record) -> None:
     doubt.blocks = 0
     for i in range(len(doubt.by_scale)):
         doubt.by_scale[i] = doubt.by_angle[i] = 0.0
+
+
+@inner
+def explains(state: Record, jump: float) -> bool:
+    """Whether a bias that is wrong by `jump` (rad/s) since the doubt began explains most of the difference in heading."""
+    turned_by, expected = state.at.heading - state.doubt.heading, jump * state.doubt.age
+    return is_doubtful(state) and abs(turned_by - expected) < 0.5 * abs(expected)
 
 
 @inner

@@ -12,7 +12,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.mice.state import Record
-from linkpose.filters.planar.gyro import is_doubtful, take_other_pose
+from linkpose.filters.planar.gyro import explains, take_other_pose
 from linkpose.filters.planar.measure import update
 from linkpose.filters.planar.state import BIAS, HEADING, QUEUE
 
@@ -24,7 +24,7 @@ _REST_S = 0.3
 _NEW_BIAS_S = 2.0
 _LARGEST_RAD_S = 0.35  # a larger rate is a turn: the data sheet's bias is within ±20 °/s
 _UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
-_DRIFTED_Z = 4.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
+_DRIFTED_Z = 5.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
 _GUARD_Z = 5.0  # standard normal quantile of the guards
 # The gyro's noise may be three times the assumed one: the data sheet gives 0.05 °/s, real sensors reach 0.13 °/s.
 _NOISE_MARGIN = 9.0
@@ -92,7 +92,7 @@ def _is_new_bias(state: Record, mean: float, noise: float, time_s: float) -> boo
         return False
     jump = mean - state.at.bias
     state.covariance[BIAS, BIAS] += jump * jump
-    if is_doubtful(state):  # the pose by the mice has not turned with the new bias
+    if explains(state, jump):  # the pose by the mice has not turned with the new bias
         take_other_pose(state)
     else:
         state.at.heading -= jump * state.rest_s
@@ -123,7 +123,7 @@ def _use_oldest(state: Record) -> None:
     variance = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
     if off * off > _DRIFTED_Z**2 * variance:  # the bias has drifted by more than assumed
         state.covariance[BIAS, BIAS] += off * off
-        if is_doubtful(state):
+        if explains(state, off):
             take_other_pose(state)
             state.since_rest_s = _BLOCK_S
         _widen_heading(state, off)

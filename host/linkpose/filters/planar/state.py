@@ -52,6 +52,7 @@ _DOUBT = np.dtype(
         ("start", "c16"),  # position then, in n (m)
         ("position", "c16"),  # by the mice alone since then, in n (m)
         ("heading", "f8"),  # rad
+        ("age", "f8"),  # time since then (s)
         ("judges", "i8"),  # bit mask of the mice that are compared with the gyro
         # The current block.
         ("block_s", "f8"),
