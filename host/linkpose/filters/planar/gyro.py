@@ -36,6 +36,9 @@ _SHARE = 0.03
 _JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
 _SUM_CALIBRATED = 2.0  # beyond it, the mice are not calibrated. Doubled: a jump spoils the calibration
 _FEWEST_BLOCKS = 4
+# Mice that agree again (|z| below the second number) in so many blocks, in which a jump would show by so many σ, end
+# the doubt. Doubled: σ stays large for longer after a lift.
+_CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
 # Blocks after which hypotheses that both fit badly are dropped (10 s): neither a jump nor a slip.
 _PATIENCE_BLOCKS = 50
 # Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
@@ -180,10 +183,20 @@ def _finish_block(state: Record, m: Record) -> None:
     z = off / math.sqrt(total)
     doubt.up = min(max(0.0, doubt.up + z - _SUM_DRIFT), _SUM_MOST)
     doubt.down = min(max(0.0, doubt.down - z - _SUM_DRIFT), _SUM_MOST)
-    if doubt.up == 0.0 and doubt.down == 0.0:
+    if _is_over(state, z, math.sqrt(total)) or (doubt.up == 0.0 and doubt.down == 0.0):
         agree(state)
     elif max(doubt.up, doubt.down) > _SUM_LIMIT:
         _decide(state, m)
+
+
+@inner
+def _is_over(state: Record, z: float, std: float) -> bool:
+    """Whether moving mice have agreed for some blocks in which a jump that explains the headings would have shown."""
+    doubt = state.doubt
+    turned_by, span = state.at.heading - doubt.heading, doubt.block_s
+    would_show = abs(turned_by) * span > _SHOWS_Z * std * doubt.age and doubt.block_moved_s > 0.5 * span
+    doubt.calm = doubt.calm + 1 if would_show and abs(z) < _CALM_Z else 0
+    return bool(doubt.calm >= _CALM_BLOCKS)
 
 
 @inner
@@ -261,6 +274,7 @@ def agree(state: Record) -> None:
     doubt.position, doubt.heading = complex(state.at.x, state.at.y), state.at.heading
     doubt.start = doubt.position
     doubt.up = doubt.down = doubt.age = 0.0
+    doubt.calm = 0
     _forget(doubt)
 
 
@@ -278,7 +292,7 @@ def _forget(doubt: Record) -> None:
 
 @inner
 def explains(state: Record, jump: float) -> bool:
-    """Whether a bias that is wrong by `jump` (rad/s) since the doubt began explains most of the difference in heading."""
+    """Whether a bias that is wrong by `jump` (rad/s) since the doubt began explains the headings' difference."""
     turned_by, expected = state.at.heading - state.doubt.heading, jump * state.doubt.age
     return is_doubtful(state) and abs(turned_by - expected) < 0.5 * abs(expected)
 

@@ -10,7 +10,7 @@ from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
 from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
-from linkpose.filters.mice.state import NOBODY, Record, Records
+from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.gyro import agree, is_doubtful, watch_gyro
 from linkpose.filters.planar.measure import arm, update

@@ -37,6 +37,8 @@ def watch_rest(state: Record, is_silent: bool, rate: float, step: float, time_s:
     if not is_silent:
         _end_rest(state)
         return
+    if state.at_rest and math.isfinite(rate) and _contradicts(state, rate):
+        _end_rest(state)
     state.rest_s += step
     if math.isfinite(rate):
         state.block_s += step
@@ -50,7 +52,17 @@ def watch_rest(state: Record, is_silent: bool, rate: float, step: float, time_s:
 
 
 @inner
+def _contradicts(state: Record, rate: float) -> bool:
+    """Whether one rate (rad/s) shows that the robot turns."""
+    limit2 = state.covariance[BIAS, BIAS] + _NOISE_MARGIN * state.gyro_variance
+    return bool((rate - state.at.bias) ** 2 > _GUARD_Z**2 * limit2)
+
+
+@inner
 def _end_rest(state: Record) -> None:
+    """The robot has begun to turn within the current block, in which the filter took it to stand still."""
+    if state.at_rest and state.block_count > 0:
+        state.at.heading += (state.block_sum / state.block_count - state.at.bias) * state.block_s
     state.rest_s = state.block_s = state.block_sum = state.block_squares = 0.0
     state.block_count = state.queued = 0
     state.at_rest = False

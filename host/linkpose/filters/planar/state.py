@@ -53,6 +53,7 @@ _DOUBT = np.dtype(
         ("position", "c16"),  # by the mice alone since then, in n (m)
         ("heading", "f8"),  # rad
         ("age", "f8"),  # time since then (s)
+        ("calm", "i8"),  # blocks in a row in which gyro and mice agreed
         ("judges", "i8"),  # bit mask of the mice that are compared with the gyro
         # The current block.
         ("block_s", "f8"),
