@@ -244,7 +244,7 @@ def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
     (tmp_path / "file").touch()
     places = ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "LOCALAPPDATA", "USERPROFILE")
     nowhere = dict.fromkeys(places, tmp_path / "file" / "below")
-    code = "import linkpose.compiling as c\nc._the_folder = lambda: None\n" + PREPARE
+    code = "import linkpose.compiling as c\nc._the_cache = lambda: None\n" + PREPARE
     assert "in each run" in run(code, HOST, NUMBA_DISABLE_JIT=1, **nowhere)
 
 
