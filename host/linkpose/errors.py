@@ -328,6 +328,18 @@ class NeedsScans(LinkposeError):
         self.log, self.filter = log, name
 
 
+class MapMismatch(LinkposeError):
+    """The scans fit another form of the map much better. `log` names their log; `share` of the beams hit a wall of the
+    map, and `changed_share` of the map as `change` describes it.
+    """
+
+    def __init__(self, log: str, change: str, share: float, changed_share: float) -> None:
+        super().__init__(
+            f"{log}: {share:.0%} of the beams end at a wall of the map, and {changed_share:.0%} if the map is {change}"
+        )
+        self.log, self.change, self.share, self.changed_share = log, change, share, changed_share
+
+
 class NothingApplied(LinkposeError):
     """A filter rejected all `rejected` measurements of the log. `log` names it, `filter` is the filter."""
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from test_localization_scans import flat_with_rooms, of_half_the_size, scans_in
 
 import linkpose as lp
 from linkpose import estimate
@@ -22,6 +23,7 @@ from linkpose.flashing.image import MARK, read_image
 from linkpose.localization.events import Log
 from linkpose.localization.localizer import Settings, check
 from linkpose.localization.logs import read_log
+from linkpose.localization.map_check import check_map
 from linkpose.localization.maps import load_map, save_map
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.plausibility import check_units
@@ -204,6 +206,9 @@ MORE: dict[str, dict[str, Producer]] = {
         "β … is below 0; 2 is best for Gaussian errors": raises(Transform(beta=-1.0).check),
     },
     "Maps": {
+        "…: … of the beams end at a wall of the map, and … if the map is …; correct the resolution in its YAML file": raises(
+            lambda: check_map(list(scans_in(flat_with_rooms())[:1]), of_half_the_size(flat_with_rooms()), 0.2, "a.log")
+        ),
         "cannot read the map …: …": lambda folder: load_map(folder / "none.yaml"),
         "… is not YAML; give the map's .yaml file, not its image": map_file("image: [\n"),
         "… uses YAML aliases (*name); write each value out": map_file("image: &a m.png\nresolution: *a\n"),

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, MapMismatch
 from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at
-from linkpose.localization.events import Event, Scan
+from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.localizer import estimate_track
+from linkpose.localization.map_check import check_map
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
@@ -133,3 +134,54 @@ def test_scans_without_echo_change_nothing():
     track = estimate_track(log, "scan-match", Settings(), grid)
     assert track.applied == 0
     assert track.state[-1] == pytest.approx([12.0, 12.0, 0.0])
+
+
+def flat_with_rooms() -> GridMap:
+    """A flat of 8 x 6 m whose walls no mirror image has, with cells of 0.1 m."""
+    blocked = np.zeros((60, 80), np.uint8)
+    blocked[[0, -1], :] = blocked[:, [0, -1]] = OCCUPIED
+    blocked[:38, 30] = blocked[20, 30:60] = blocked[40:47, 55:62] = blocked[52:, 12] = OCCUPIED
+    return GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0]))
+
+
+def scans_in(grid: GridMap) -> list[Scan]:
+    """Scans of 90 beams all around from four places, by steps of a quarter of a cell along each beam."""
+    cell, angles, steps = grid.geometry[0], np.radians(np.arange(0, 360, 4.0)), np.arange(0.0, 12.0, 0.025)
+    scans = []
+    for time, (x, y, heading) in enumerate([(1.5, 1.5, 0.3), (1.0, 4.5, 2.0), (5.0, 4.5, -1.0), (6.5, 1.0, 1.2)]):
+        across = ((x + np.outer(np.cos(angles + heading), steps)) / cell).astype(int).clip(0, 79)
+        along = ((y + np.outer(np.sin(angles + heading), steps)) / cell).astype(int).clip(0, 59)
+        ranges = steps[np.argmax(grid.blocked[along, across] == OCCUPIED, axis=1)]
+        scans.append(Scan(float(time), ranges, angles, (0.0, 0.0, 0.0), 80.0))
+    return scans
+
+
+def of_half_the_size(grid: GridMap) -> GridMap:
+    """The map with half of its resolution."""
+    return GridMap(grid.blocked, grid.geometry * (0.5, 1, 1, 1))
+
+
+def test_a_map_that_the_scans_fit_only_mirrored_or_at_another_scale_is_named():
+    grid = flat_with_rooms()
+    scans = scans_in(grid)
+    mirrored: Log = [replace(scan, ranges_m=scan.ranges_m[::-1]) for scan in scans]
+    for log, wrong, words in (
+        (mirrored, grid, "mirrored"),
+        (list[Event | Scan](scans[:1]), of_half_the_size(grid), "twice as large"),
+    ):
+        with pytest.raises(MapMismatch, match=f"if the map is {words}") as raised:
+            check_map(log, wrong, 0.2, "a.log")
+        assert raised.value.changed_share > 0.95 > raised.value.share
+
+
+def test_a_map_of_another_place_and_an_odometry_that_contradicts_the_scans_are_named():
+    grid = flat_with_rooms()
+    log: Log = list(scans_in(grid)[:2])
+    assert check_map(log, grid, 0.9, "a.log") == ""
+    assert "check the odometry" in check_map(log, grid, 0.3, "a.log")
+    rng = np.random.default_rng(5)
+    elsewhere: Log = [
+        Scan(float(i), rng.uniform(0.5, 6.0, 90), np.radians(np.arange(0, 360, 4.0)), (0.0, 0.0, 0.0), 80.0)
+        for i in range(2)
+    ]
+    assert "check whether the map is of this place" in check_map(elsewhere, grid, 0.2, "a.log")

@@ -15,6 +15,7 @@ from linkpose.localization.kalman import CONSTANT_VELOCITY
 from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import Method, check, estimate_track, most_at_once
 from linkpose.localization.logs import read_log
+from linkpose.localization.map_check import check_map
 from linkpose.localization.maps import load_map
 from linkpose.localization.measuring import default_constants
 from linkpose.localization.odometry import with_mice_odometry
@@ -162,6 +163,9 @@ class PreparedLog:
         tracks: dict[str, Track] = {}
         for method, chosen in settings.items():
             track = estimate_track(self.log, method, chosen, self.grid, self.beacons, str(self.origin))
+            if method == "scan-match" and self.grid is not None:
+                share = track.applied / max(track.applied + track.rejected, 1)
+                remarks += tuple(filter(None, [check_map(self.log, self.grid, share, str(self.origin))]))
             track.check_applied(str(self.origin), method)
             tracks[method] = track
         return Paths(tracks, self.origin, remarks, next(iter(settings.values())))
