@@ -25,6 +25,9 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
         if "height" in e.quantities
         else "`linkpose info RECORDING` shows which sensors work"
     ),
+    errors.UnknownPicture: lambda e: (
+        "`linkpose plot ESTIMATE.csv -o FILE.html` plays an estimate in 3-D" if e.path.endswith(".html") else ""
+    ),
     errors.PortNotFound: lambda e: _nearest_port(e.port) + "`linkpose ports` lists the ports",
     errors.NotASerialPort: lambda e: "`linkpose ports` lists the ports",
     errors.NoBoardFound: lambda e: (
