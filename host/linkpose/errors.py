@@ -78,6 +78,10 @@ class CannotWrite(FileError):
         self.reason = reason
 
 
+class FileChanged(CannotWrite):
+    """Another program removed, replaced, cut or wrote into a file while it was being written. `reason` says which."""
+
+
 class MissingLibrary(LinkposeError):
     """A file format or a live output needs a library that is not installed. `library` is its name."""
 
