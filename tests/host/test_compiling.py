@@ -61,8 +61,8 @@ def test_an_edit_in_another_file_and_a_renamed_class_are_seen(package, tmp_path)
     assert run(HEIGHT, host, **place) == "1.5 1"
     edit(package / "filters" / "_vector.py", "return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]", "return 4.0")
     assert run(HEIGHT, host, **place) == "2.0 0"
-    edit(package / "filters" / "baro.py", "StartState", "Beginning")
-    assert run(HEIGHT.replace("StartState", "Beginning"), host, **place) == "2.0 0"
+    edit(package / "filters" / "baro.py", "BaroParameters", "Parameters")
+    assert run(HEIGHT.replace("BaroParameters", "Parameters"), host, **place) == "2.0 0"
 
 
 def test_the_compiler_itself_and_each_source_of_machine_code_change_the_folder(package, cache, monkeypatch):

@@ -71,7 +71,10 @@ class ImuCalibration(NamedTuple):
 
 
 class ImuSamples(NamedTuple):
-    """The arrays of a block that the paper's filters read, for compiled code."""
+    """The arrays of a block that the inertial filters read, for compiled code.
+
+    Filters that run live pass the arrays one by one: see `_records.fields`.
+    """
 
     time_s: Floats  # (N,)
     accel: Floats  # (N, 3) m/s², as recorded

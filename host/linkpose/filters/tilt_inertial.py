@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration, ImuSamples
+from linkpose.filters._imu import ImuCalibration
 from linkpose.filters._records import record_of
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
@@ -101,7 +101,8 @@ class TiltInertialFilter:
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
         estimates = np.empty(len(block), ESTIMATE)
-        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
+        readings = block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags
+        process(*readings, self._imu, self._record, self._states, estimates)
         table: Floats = estimates.view(np.float64).reshape(len(block), _WIDTH).take(_COLUMNS, axis=1)
         np.minimum(table, _MOST, out=table)
         table *= _UNITS

@@ -246,8 +246,7 @@ class _Repeats:
             counts = np.where(inside, rows - start, rows + 1 + count)
             begins = np.where(inside, time_s[start], begin_s)
         self._count, self._begin_s = counts[-1], begins[-1]
-        with np.errstate(invalid="ignore"):
-            return counts, time_s[:, None] - begins
+        return counts, time_s[:, None] - begins
 
 
 def _has_run(same: Bools, length: int) -> bool:
@@ -381,6 +380,9 @@ class _Held:
 
     def _count_readings(self, fresh: Bools, repeats: NDArray[np.int64]) -> NDArray[np.int64]:
         """How many new readings in a row had the same value, up to each sample."""
+        if len(fresh) == 1:  # live
+            self._readings = int(fresh[0]) + (self._readings if repeats[0] else 0)
+            return np.array([self._readings])
         total = np.cumsum(fresh) + self._readings
         before = np.concatenate([[self._readings], total[:-1]])
         changed = repeats == 0
