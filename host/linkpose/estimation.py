@@ -277,7 +277,8 @@ class LiveEstimator:
         for f, results in zip(self._filters, self._results, strict=True):
             if len(results) < len(self._blocks) and self._is_ready(f.name):
                 results.extend(f.process(waiting) for waiting in self._blocks[len(results) :])
-        return self._complete_rows(), self._newest
+        rows = self._complete_rows()
+        return rows, rows[-1] if len(rows) and not self._blocks else self._newest_row()
 
     def finish(self) -> Floats:
         """The rows that were not complete yet. All filters must be ready, or are compiled now."""
@@ -287,7 +288,6 @@ class LiveEstimator:
 
     def _complete_rows(self) -> Floats:
         count = min((len(results) for results in self._results), default=0)
-        self._newest = self._newest_row()
         if not count or not self._is_ready(TEXT):
             return np.empty((0, 1 + sum(self._width)))
         rows = [

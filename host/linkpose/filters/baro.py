@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, ImuSamples, read_accel, read_gyro
+from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, ImuSamples, read_accel, read_gyro, unpacked
 from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
@@ -76,6 +76,10 @@ class BaroParameters(NamedTuple):
         j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
         return BaroParameters(ImuCalibration.of(rig.imu), j2s, rig.baro.pressure_noise_Pa)
 
+    def packed(self) -> Floats:
+        """(16,) its numbers in order: see `ImuCalibration.packed`."""
+        return np.array([*self.imu.packed(), *self.j2s, self.noise_Pa])
+
 
 class BaroFilter:
     """Method D of [Link] over blocks of samples."""
@@ -85,7 +89,7 @@ class BaroFilter:
 
     def __init__(self, rig: Rig) -> None:
         self._states = fresh_start()
-        self._parameters = BaroParameters.of(rig)
+        self._parameters = BaroParameters.of(rig).packed()
 
     @property
     def rejected(self) -> int:
@@ -103,6 +107,12 @@ class BaroFilter:
             self._parameters, self._states, out,
         )  # fmt: skip
         return out
+
+
+@inner
+def unpacked_baro(a: Floats) -> BaroParameters:
+    """The parameters that `packed` gave."""
+    return BaroParameters(unpacked(a), (a[12], a[13], a[14]), a[15])
 
 
 @inner
@@ -196,11 +206,12 @@ def _process(
     flags: NDArray[np.uint32],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
-    q: BaroParameters,
+    parameters: Floats,
     states: Any,
     out: Floats,
 ) -> None:
     samples, baro, state = ImuSamples(time_s, accel, gyro, flags), BaroSamples(pressure_Pa, fresh), states[0]
+    q = unpacked_baro(parameters)
     for i in range(len(samples.time_s)):
         if average_start(samples, baro, i, q.imu, state):
             height, noise, other = measure(samples, baro, i, q, state)

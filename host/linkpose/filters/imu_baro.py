@@ -36,6 +36,7 @@ from linkpose.filters.baro import (
     metres_per_pascal,
     start_height,
     start_variance,
+    unpacked_baro,
 )
 from linkpose.filters.tilt import (
     TiltParameters,
@@ -83,7 +84,7 @@ class ImuBaroFilter:
         self.tilt_parameters = tilt or TiltParameters()
         self.vertical_parameters = vertical or VerticalParameters()
         self._tilt, self._start, self._vertical = fresh_tilt(), fresh_start(), zeros(1, _VERTICAL)
-        self._baro_parameters = BaroParameters.of(rig)
+        self._baro_parameters = BaroParameters.of(rig).packed()
 
     @property
     def rejected(self) -> int:
@@ -98,7 +99,7 @@ class ImuBaroFilter:
         out = np.empty((len(block), 4))
         _process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, block.pressure_Pa, block.baro_fresh,
-            self._baro_parameters, self.tilt_parameters, self.vertical_parameters,
+            self._baro_parameters, self.tilt_parameters.accel_memory, self.vertical_parameters,
             self._tilt, self._start, self._vertical, out,
         )  # fmt: skip
         return out
@@ -169,8 +170,8 @@ def _process(
     flags: NDArray[np.uint32],
     pressure_Pa: Floats,
     fresh: NDArray[np.bool_],
-    rig: BaroParameters,
-    tilt_parameters: TiltParameters,
+    parameters: Floats,
+    accel_memory: float,
     q: VerticalParameters,
     tilt_states: Any,
     starts: Any,
@@ -178,6 +179,7 @@ def _process(
     out: Floats,
 ) -> None:
     samples, baro = ImuSamples(times_s, accel, gyro, flags), BaroSamples(pressure_Pa, fresh)
+    rig = unpacked_baro(parameters)
     now, start, vertical = load_state(tilt_states[0]), starts[0], verticals[0]
     mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
     innovation = vec.load(vertical.innovation)
@@ -187,7 +189,7 @@ def _process(
         now, has_force, force, has_rate = advance(now, samples, i, rig.imu)
         rejected += not (has_force and has_rate)
         if has_force:
-            now = correct_by_accel(now, force, tilt_parameters.accel_memory, rig.imu)
+            now = correct_by_accel(now, force, accel_memory, rig.imu)
         has_pressure = average_start(samples, baro, i, rig.imu, start)
         known = start.pressure[1] > 0.0
         if known and vertical.started[0] == 0.0:

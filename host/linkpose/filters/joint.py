@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from linkpose.compiling import compiled, inner
 from linkpose.errors import MissingJ2S
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration, ImuSamples
+from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration, ImuSamples, unpacked
 from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.tilt import (
@@ -78,7 +78,7 @@ class JointFilter:
         self.parameters = parameters or TiltParameters()
         self._states, self._histories = fresh_tilt(), zeros(1, _HISTORY)
         self._histories["time"] = math.nan
-        self._imu = ImuCalibration.of(rig.imu)
+        self._imu = ImuCalibration.of(rig.imu).packed()
         self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.std_of_axes_m
 
     @property
@@ -95,7 +95,7 @@ class JointFilter:
         joint = (self._j2s, self._j2s_std)
         _process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, joint, self._states, self._histories, out,
+            self._imu, self.parameters.accel_memory, joint, self._states, self._histories, out,
         )  # fmt: skip
         return out
 
@@ -163,14 +163,14 @@ def _process(
     accel: Floats,
     gyro: Floats,
     flags: NDArray[np.uint32],
-    imu: ImuCalibration,
-    parameters: TiltParameters,
+    calibration: Floats,
+    accel_memory: float,
     joint: tuple[Vec, Vec],
     states: Any,
     histories: Any,
     out: Floats,
 ) -> None:
-    samples = ImuSamples(time_s, accel, gyro, flags)
+    samples, imu = ImuSamples(time_s, accel, gyro, flags), unpacked(calibration)
     now, history = load_state(states[0]), histories[0]
     d, d_std = joint
     t1, t2 = history.time[0], history.time[1]
@@ -182,7 +182,7 @@ def _process(
         # A comparison with NaN is False: no derivative across a gap or an unusable reading.
         derivable = has_force and has_rate and now.time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S
         if has_force and not (derivable and vec.trace(now.covariance) > _UNSETTLED_RAD2):
-            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+            now = correct_by_accel(now, force, accel_memory, imu)
         if derivable:
             c = weights(now.time - t1, t1 - t2)
             now = correct_by_joint(now, force, c, w1, w2, d, imu)

@@ -133,7 +133,7 @@ class JointInertialFilter:
         self._states = [
             fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES
         ]
-        self._imu = ImuCalibration.of(rig.imu)
+        self._imu = ImuCalibration.of(rig.imu).packed()
 
     @property
     def states(self) -> tuple[Any, Any]:

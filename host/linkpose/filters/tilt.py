@@ -48,6 +48,7 @@ from linkpose.filters._imu import (
     read_gyro,
     rotation_variance,
     unknown_accel,
+    unpacked,
 )
 from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Sym, Vec
@@ -118,7 +119,7 @@ class TiltFilter:
     def __init__(self, rig: Rig, parameters: TiltParameters | None = None) -> None:
         self.parameters = parameters or TiltParameters()
         self._states = fresh_tilt()
-        self._imu = ImuCalibration.of(rig.imu)
+        self._imu = ImuCalibration.of(rig.imu).packed()
         self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
         self._j2s_std = rig.joint.std_of_axes_m
 
@@ -135,7 +136,7 @@ class TiltFilter:
         out = np.empty((len(block), 4))
         _process(
             block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
-            self._imu, self.parameters, self._j2s, self._j2s_std, self._states, out,
+            self._imu, self.parameters.accel_memory, self._j2s, self._j2s_std, self._states, out,
         )  # fmt: skip
         return out
 
@@ -312,21 +313,21 @@ def _process(
     accel: Floats,
     gyro: Floats,
     flags: NDArray[np.uint32],
-    imu: ImuCalibration,
-    parameters: TiltParameters,
+    calibration: Floats,
+    accel_memory: float,
     j2s: Vec,
     j2s_std: Vec,
     states: Any,
     out: Floats,
 ) -> None:
-    samples = ImuSamples(time_s, accel, gyro, flags)
+    samples, imu = ImuSamples(time_s, accel, gyro, flags), unpacked(calibration)
     now = load_state(states[0])
     rejected = 0
     for i in range(len(samples.time_s)):
         now, has_force, force, has_rate = advance(now, samples, i, imu)
         rejected += not (has_force and has_rate)
         if has_force:
-            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+            now = correct_by_accel(now, force, accel_memory, imu)
             now = average_accel(now)
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan

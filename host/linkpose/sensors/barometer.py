@@ -58,8 +58,6 @@ class Barometer(NamedTuple):
         Python's integers take a tenth of the time that NumPy needs for arrays of length 1. Below 2³¹ Pa no intermediate
         result exceeds 64 bits, so that arrays give the same numbers.
         """
-        import numpy as np
-
         if self.family == DeviceFamily.BMP180:
             try:
                 words = bmp180.Bmp180Calibration.of(self.words)
@@ -68,5 +66,7 @@ class Barometer(NamedTuple):
                 return math.nan, math.nan
             if abs(pascals) < 1 << 31:
                 return tenths / 10, float(pascals)
+        import numpy as np
+
         temperature, pressure = self.compensate(np.array([ut]), np.array([up]))
         return float(temperature[0]), float(pressure[0])

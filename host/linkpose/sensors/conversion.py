@@ -180,7 +180,7 @@ class Converter:
         self.settings = settings
         self.mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
         self._table = _Table.of(settings)
-        self._rows = self._table.rows
+        self._rows, self._has_imu2, self._has_mag = self._table.rows, settings.has_imu2, settings.has_mag
         self._mag_count: int | None = None  # of the last sample; None where it had no valid reading
         self._has_baro = settings.barometer.is_sound
         self._baro_count: int | None = None  # of the last sample; None where that had no valid reading
@@ -191,10 +191,10 @@ class Converter:
         values = self._table.convert(raw.counts, flags)
         accel, temperature, gyro = _inertial(values, 0)
         others: dict[str, Any] = {}
-        if self.settings.has_imu2:
+        if self._has_imu2:
             accel2, temperature2, gyro2 = _inertial(values, _IMU2_COLUMN)
             others |= {"accel2_m_s2": accel2, "gyro2_rad_s": gyro2, "imu2_temp_degC": temperature2}
-        if self.settings.has_mag:
+        if self._has_mag:
             valid = flags & MAG_VALID != 0
             fresh, self._mag_count = _new_readings(valid, raw.counts[:, _MAG_COUNT], self._mag_count)
             others |= {"mag_uT": np.ascontiguousarray(values[:, _MAG_COLUMN : _MAG_COLUMN + 3]), "mag_fresh": fresh}
@@ -229,15 +229,15 @@ class Converter:
         flags, counts = place.flags, cast("tuple[int, ...]", sample[self._table.fields])
         baro_fresh = self._receive_baro(flags, sample)
         values = [
-            _rounded(count * scale + offset, steps) if flags & valid else math.nan
+            round((count * scale + offset) * steps, 0) / steps if flags & valid else math.nan
             for count, (scale, offset, steps, valid) in zip(counts, self._rows, strict=True)
         ]
         row = np.array([(*values, _rounded(place.time_s, _TIME_STEPS), *self._baro)])
         others: dict[str, Any] = {}
-        if self.settings.has_imu2:
+        if self._has_imu2:
             accel2, temperature2, gyro2 = _inertial(row, _IMU2_COLUMN)
             others |= {"accel2_m_s2": accel2, "gyro2_rad_s": gyro2, "imu2_temp_degC": temperature2}
-        if self.settings.has_mag:
+        if self._has_mag:
             before, self._mag_count = self._mag_count, sample.mag_count if flags & MAG_VALID else None
             fresh = self._mag_count is not None and self._mag_count != before
             others |= {"mag_uT": row[:, _MAG_COLUMN : _MAG_COLUMN + 3], "mag_fresh": np.array([fresh])}

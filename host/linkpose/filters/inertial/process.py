@@ -26,6 +26,7 @@ from linkpose.filters._imu import (
     read_gyro,
     rotation_variance,
     unknown_accel,
+    unpacked,
 )
 from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
@@ -91,13 +92,13 @@ _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
 @compiled
 def process(
     times_s: Floats, accels: Floats, gyros: Floats, all_flags: NDArray[np.uint32],
-    imu: ImuCalibration, parameters: Record, states: Record, out: Record,
+    calibration: Floats, parameters: Record, states: Record, out: Record,
 ) -> None:  # fmt: skip
     """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
 
-    The first four arguments are the fields of `ImuSamples`.
+    The first four arguments are the fields of `ImuSamples`; `calibration` (12,) is a packed `ImuCalibration`.
     """
-    s, q = states[0], parameters[0]
+    s, q, imu = states[0], parameters[0], unpacked(calibration)
     for i in range(len(times_s)):
         time_s, flags = times_s[i], all_flags[i]
         accel, gyro = vec.row(accels, i), vec.row(gyros, i)
