@@ -1,4 +1,4 @@
-"""What a live sample costs from its bytes to its estimates on disk, one at a time as they come.
+"""What a live sample costs from its bytes to its estimates on disk, health checks included, one at a time as they come.
 
     python tests/bench/pipeline.py [--json]
 
@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from _report import Row, report
 
-from linkpose.estimation import EstimateWriter, Estimator
+from linkpose.estimation import EstimateWriter, Estimator, LiveEstimator
 from linkpose.recording.writer import RecordingWriter, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.devices import found
+from linkpose.sensors.health import HealthMonitor, expected_sensors
 from linkpose.sensors.timeline import BoardClock, Timeline
 from linkpose.simulation import board
 from linkpose.simulation.link import LinkRun
@@ -35,6 +36,7 @@ def main() -> None:
         decoder, timeline, clock = StreamDecoder(), Timeline(100), BoardClock()
         converter, estimator = Converter(settings), Estimator([], run.rig, found(hello))
         estimator.warm_up()
+        live, monitor = LiveEstimator(estimator, lambda _: True), HealthMonitor(100, expected_sensors(hello, 0))
         head = metadata(hello, settings, "bench", run.rig, {})
         recording = RecordingWriter(Path(folder, "r.csv"), head, layout_of(settings), force=False)
         estimates = EstimateWriter(Path(folder, "e.csv"), head, estimator.columns, force=False)
@@ -45,7 +47,9 @@ def main() -> None:
                 place = timeline.place(sample, clock, 0.0)
                 block = converter.convert_placed([sample], [place])
                 recording.write_block(block)
-                estimates.write(estimator.text(estimator.process(block.measurements)))
+                checked, _ = monitor.check(block.measurements)
+                rows, _ = live.process(checked)
+                estimates.write(estimator.text(rows))
             took.append(1e6 * (time.perf_counter() - began))
     name = f"{len(estimator.filters)} filters"
     report(

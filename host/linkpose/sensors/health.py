@@ -6,6 +6,7 @@ programs are checked too. They are causal: blocks of any length give the same re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -341,6 +342,8 @@ class _Imu:
 
     def _judge(self, codes: Codes, values: Floats, temp: Floats, flags: NDArray[np.integer[Any]]) -> Codes:
         """Add to `codes` what a sample shows by itself."""
+        if len(codes) == 1 and self._is_plausible(values[0].tolist(), temp.item(), int(flags[0])):
+            return codes
         codes[(temp < TEMPERATURE_RANGE_DEGC[0]) | (temp > TEMPERATURE_RANGE_DEGC[1])] = Cause.OUT_OF_RANGE
         codes[~values[:, :3].any(axis=1)] = Cause.BLANK  # not even gravity
         codes[~np.isfinite(values).all(axis=1)] = Cause.SILENT
@@ -348,6 +351,12 @@ class _Imu:
             for flag, cause in self._flags.causes.items():
                 codes[flags & flag != 0] = cause
         return codes
+
+    def _is_plausible(self, values: list[float], temp: float, flags: int) -> bool:
+        """Whether a sample shows no fault by itself: live, numbers take a tenth of the time of arrays of length 1."""
+        low, high = TEMPERATURE_RANGE_DEGC
+        is_complete = math.isfinite(sum(values)) and any(values[:3])
+        return is_complete and not (temp < low or temp > high) and not flags & self._caused
 
     def _check_axes(self, same: Bools, counts: NDArray[np.int64], time_s: Floats) -> Floats:
         """How long each axis has repeated while the two others of its kind changed; 0 for less than STUCK_REPEATS."""
@@ -373,6 +382,8 @@ class _Held:
         counts, held_s = self._value.run(same, time_s)
         readings = self._count_readings(fresh, counts[:, 0])
         _, stale_s = self._fresh.run(~fresh[:, None], time_s)
+        if len(codes) == 1 and readings[0] < self._frozen_repeats and not stale_s[0, 0] >= self._stale_s:  # live
+            return codes
         with np.errstate(invalid="ignore"):
             codes[(readings >= self._frozen_repeats) & (held_s[:, 0] >= self._frozen_s)] = Cause.FROZEN
             codes[stale_s[:, 0] >= self._stale_s] = Cause.FROZEN
@@ -401,6 +412,8 @@ class _Baro:
     def check(self, pressure: Floats, fresh: Bools, time_s: Floats) -> Codes:
         """Cause (N,) of each sample."""
         codes = self._held.check(pressure[:, None], fresh, time_s)
+        if len(codes) == 1 and PRESSURE_RANGE_PA[0] <= pressure[0] <= PRESSURE_RANGE_PA[1]:  # live
+            return codes
         codes[(pressure < PRESSURE_RANGE_PA[0]) | (pressure > PRESSURE_RANGE_PA[1])] = Cause.OUT_OF_RANGE
         codes[np.isnan(pressure)] = Cause.SILENT
         return codes
