@@ -2,7 +2,8 @@
 
     python tests/fuzz.py [--inputs N] [--seed S] [NAME ...]
 
-Without NAME, every reader and every command gets N inputs (default 100 000; a fiftieth for commands). An input fails
+Without NAME, every reader and every command gets N inputs (default 100 000; a fiftieth for commands), and each file
+argument of each command gets all nasty files of hostile.py ("arguments"). An input fails
 when it raises anything but a LinkposeError, takes more than 10 s, or needs more than 1 GB. Failing inputs are kept in
 fuzz-failures/, and the status is 1.
 """
@@ -10,19 +11,26 @@ fuzz-failures/, and the status is 1.
 from __future__ import annotations
 
 import argparse
+import json
 import random
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
 import time
 import traceback
 import warnings
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 sys.path[:0] = [str(Path(__file__).parent / "host"), str(Path(__file__).parents[1] / "host")]
 
 from fuzzing import Target, commands, mutate, read_mutated, targets  # noqa: E402
+from hostile import INPUTS, KINDS, OUTPUTS, PLACES, valid_files, words  # noqa: E402
+
+from linkpose.evaluation import markers  # noqa: E402
 
 LONGEST_S = 10
 MOST_BYTES = 1 << 30
@@ -41,14 +49,45 @@ def main() -> int:
     chosen = parser.parse_args()
     signal.signal(signal.SIGALRM, _alarm)
     failures = 0
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, mock.patch.object(markers.subprocess, "run", _Forks().run):
         readers = {name: (target, chosen.inputs) for name, target in targets(Path(folder)).items()}
         for name, target in commands(Path(folder)).items():
             readers[f"command {name}"] = (target, max(1, chosen.inputs // COMMAND_SHARE))
         for name, (target, inputs) in readers.items():
             if not chosen.names or name in chosen.names:
                 failures += _run(name, target, inputs, chosen.seed)
+        if not chosen.names or "arguments" in chosen.names:
+            failures += _arguments(Path(folder))
     return 1 if failures else 0
+
+
+def _arguments(folder: Path) -> int:
+    """All nasty inputs and outputs of hostile.py, each in a process of its own, as a user runs it."""
+    (valid := folder / "valid").mkdir()
+    files, failures, slowest = valid_files(valid), 0, 0.0
+    pairs = [(command, kind, make) for command in INPUTS.values() for kind, make in KINDS.items()]
+    pairs += [(command, kind, make) for command in OUTPUTS.values() for kind, make in PLACES.items()]
+    for number, (command, kind, make) in enumerate(pairs):
+        (own := folder / f"arguments-{number}").mkdir()
+        make(at := own / "a.csv")
+        started = time.monotonic()
+        call = [sys.executable, "-m", "linkpose", *words(command, files, at)]
+        try:
+            done = subprocess.run(
+                call, capture_output=True, text=True, timeout=3 * LONGEST_S, errors="replace", stdin=subprocess.DEVNULL
+            )
+            bad = done.returncode not in (0, 1, 2) or any(
+                word in done.stderr for word in ("Traceback", "please report")
+            )
+            shown = done.stderr[-300:]
+        except subprocess.TimeoutExpired:
+            bad, shown = True, "no end"
+        slowest = max(slowest, time.monotonic() - started)
+        if bad:
+            failures += 1
+            print(f"arguments: {command} with {kind}: {shown}", flush=True)
+    print(f"{'arguments':22} {len(pairs)} inputs, {failures} failures, slowest {slowest:.2f} s", flush=True)
+    return failures
 
 
 def _run(name: str, target: Target, inputs: int, seed: int) -> int:
@@ -84,6 +123,51 @@ def _run(name: str, target: Target, inputs: int, seed: int) -> int:
         flush=True,
     )
     return failures
+
+
+# Runs a program of the form `python -c PROGRAM WORDS`, which reads a C3D file, in a fork that has the libraries.
+# A new interpreter for each file takes 0.4 s.
+_FORKS = """
+import io, json, os, resource, signal, sys, tempfile
+import ezc3d, numpy
+numpy.savez(io.BytesIO(), a=0)  # imports what it needs
+for line in sys.stdin:
+    program, words, timeout = json.loads(line)
+    with tempfile.TemporaryFile() as errors:
+        pid = os.fork()
+        if pid == 0:
+            signal.setitimer(signal.ITIMER_REAL, timeout)
+            os.dup2(errors.fileno(), 2)
+            sys.argv = ["-c", *words]
+            try:
+                exec(program, {})
+            except BaseException as error:
+                os.write(2, f"{type(error).__name__}: {error}".encode(errors="replace"))
+                os._exit(1)
+            os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        errors.seek(0)
+        print(json.dumps([code, errors.read().decode(errors="replace")]), flush=True)
+"""
+
+
+class _Forks:
+    """In place of `subprocess.run`."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self, command: list[str], timeout: float, **_: Any) -> subprocess.CompletedProcess[str]:
+        if self._process is None:
+            pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+            self._process = subprocess.Popen([sys.executable, "-c", _FORKS], **pipes)
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(json.dumps([command[2], command[3:], timeout]) + "\n")
+        self._process.stdin.flush()
+        code, errors = json.loads(self._process.stdout.readline())
+        if code == -signal.SIGALRM:
+            raise subprocess.TimeoutExpired(command, timeout)
+        return subprocess.CompletedProcess(command, code, "", errors)
 
 
 def _alarm(*_: object) -> None:

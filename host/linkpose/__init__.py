@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from linkpose.board import Board as open
     from linkpose.estimation import Estimates, estimate
     from linkpose.filters import create as create_filter
+    from linkpose.localization.paths import Paths, localize
     from linkpose.recording.reader import Recording
     from linkpose.recording.reader import load_recording as load
     from linkpose.sensors.measurements import Measurements
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from linkpose.wire.messages import VERSION as __version__
 
 __all__ = [
-    "Board", "Estimates", "LinkposeError", "Measurements", "Recording", "Rig", "__version__", "create_filter", "errors",
-    "estimate", "load", "open",
+    "Board", "Estimates", "LinkposeError", "Measurements", "Paths", "Recording", "Rig", "__version__", "create_filter",
+    "errors", "estimate", "load", "localize", "open",
 ]  # fmt: skip
 
 # Public name -> (module, name there).
@@ -39,6 +40,8 @@ _HOMES = {
     "Estimates": ("linkpose.estimation", "Estimates"),
     "estimate": ("linkpose.estimation", "estimate"),
     "create_filter": ("linkpose.filters", "create"),
+    "Paths": ("linkpose.localization.paths", "Paths"),
+    "localize": ("linkpose.localization.paths", "localize"),
     "Recording": ("linkpose.recording.reader", "Recording"),
     "load": ("linkpose.recording.reader", "load_recording"),
     "Measurements": ("linkpose.sensors.measurements", "Measurements"),

@@ -78,6 +78,10 @@ class CannotWrite(FileError):
         self.reason = reason
 
 
+class FileChanged(CannotWrite):
+    """Another program removed, replaced, cut or wrote into a file while it was being written. `reason` says which."""
+
+
 class MissingLibrary(LinkposeError):
     """A file format or a live output needs a library that is not installed. `library` is its name."""
 
@@ -326,6 +330,29 @@ class NeedsScans(LinkposeError):
     def __init__(self, log: str, name: str) -> None:
         super().__init__(f"{log} holds no laser scans, which the filter {name} needs")
         self.log, self.filter = log, name
+
+
+class MapMismatch(LinkposeError):
+    """The scans fit another form of the map much better. `log` names their log; `share` of the beams hit a wall of the
+    map, and `changed_share` of the map as `change` describes it.
+    """
+
+    def __init__(self, log: str, change: str, share: float, changed_share: float) -> None:
+        super().__init__(
+            f"{log}: {share:.0%} of the beams end at a wall of the map, and {changed_share:.0%} if the map is {change}"
+        )
+        self.log, self.change, self.share, self.changed_share = log, change, share, changed_share
+
+
+class NothingApplied(LinkposeError):
+    """A filter rejected all `rejected` measurements of the log. `log` names it, `filter` is the filter."""
+
+    def __init__(self, log: str, name: str, rejected: int) -> None:
+        super().__init__(
+            f"{log}: {name} applied none of the measurements ({rejected} rejected), so there is no estimate; check "
+            "the units (m, s, rad), the start, and the places of the beacons or the map"
+        )
+        self.log, self.filter, self.rejected = log, name, rejected
 
 
 # ---- values ----

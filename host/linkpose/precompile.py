@@ -2,6 +2,7 @@
 
 numba holds Python's global interpreter lock while it compiles: in this process, samples would wait. The other processes
 (`python -m linkpose.precompile NAME...`) store the machine code on disk, from where this process loads it in a moment.
+host/build_package.py runs the same command when pip builds a wheel.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from linkpose.sensors.devices import Sensors
 TEXT = "text"
 # The name of the search for the noises of a log, which `localize` runs before a filter.
 NOISES = "noises"
+# The name of the parsers of long CSV files and of raw captures.
+FILES = "files"
 POLL_S = 0.05  # between two looks at what the other processes have compiled
 
 
@@ -114,13 +117,19 @@ def prepare(names: Sequence[str], report: Callable[[str], object]) -> None:
 
 
 def compile_here(name: str) -> None:
-    """Compiles a filter, a method of localisation or the writer of text in this process, and marks it as stored."""
+    """Compiles a filter, a method of localisation, TEXT, NOISES or FILES in this process, and marks it as stored."""
     if name == TEXT:
         import numpy as np
 
         from linkpose.recording.fixedpoint import format_rows
 
         format_rows(np.zeros((1, 1)), np.zeros(1, dtype=np.int64))
+    elif name == FILES:
+        from linkpose.recording import fastnumbers
+        from linkpose.wire import capture
+
+        fastnumbers.parse(b"0\n", 1)
+        capture.decode_capture(b"\0")
     elif name in filters.NAMES:
         filters.warm_up([name])
     elif name == NOISES:

@@ -34,6 +34,7 @@ _LENGTH_DIGITS = (
     _Digits(0.995, 3, 1e2, 1, "cm"),
     _Digits(math.inf, 1, 1.0, 1, "m"),
 )
+UNKNOWN = "not known"  # in place of a value
 _MOST_DECIMALS = 4  # that a column of lengths aligns
 _MOST_ERROR_DECIMALS = 6
 _ANGLE_DECIMALS = ((0.0095, 3), (0.095, 2), (9.95, 1), (math.inf, 0))  # σ (°) below -> decimals
@@ -116,7 +117,7 @@ def working_sensors(health: Health) -> list[str]:
 
 def signed_angle(value_deg: float, decimals: int = 1) -> str:
     """An angle with its sign: +13.1°."""
-    return f"{value_deg:+.{decimals}f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
+    return minus(f"{value_deg:+.{decimals}f}°") if math.isfinite(value_deg) else UNKNOWN
 
 
 def angle_with_std(value_deg: float, std_deg: float) -> str:
@@ -151,13 +152,13 @@ def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
 def length_with_std(value_m: float, std_m: float) -> str:
     """A length and its standard deviation (m), to the same digit: 1.5906 m ±0.4 mm, 1.591 m ±1.2 cm."""
     if not math.isfinite(value_m):
-        return "not known yet"
+        return UNKNOWN
     return length_text(value_m, std_m) + (f" ±{std_text(std_m)}" if math.isfinite(std_m) else "")
 
 
 def length_text(value_m: float, std_m: float) -> str:
     """A length to the last digit of its standard deviation (m); a dash where it is not finite."""
-    return f"{value_m:.{_digits(std_m).of_value}f} m" if math.isfinite(value_m) else "–"
+    return minus(f"{value_m:.{_digits(std_m).of_value}f} m") if math.isfinite(value_m) else "–"
 
 
 def aligned_length(value_m: float, std_m: float) -> str:
@@ -182,6 +183,16 @@ def same_digits(first: float, *others: float) -> list[str]:
     """Errors as texts that end at the same digit, the third one of the first."""
     decimals = max(0, min(_MOST_ERROR_DECIMALS, 2 - math.floor(math.log10(first)))) if first > 0 else 0
     return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
+
+
+def minus(number: str) -> str:
+    """A number with a minus sign, which is as wide as a plus sign, in place of the hyphen."""
+    return number.replace("-", "−")
+
+
+def with_unit(number: str, unit: str) -> str:
+    """A number with its unit; the degree sign stands without a space: 0.4 cm, 0.4°."""
+    return number + ("" if unit == "°" else " ") + unit
 
 
 def counted(number: int, noun: str) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,9 +20,13 @@ from linkpose.localization.settings import CONSTANTS, Settings
 from linkpose.localization.tables import Beacons
 from linkpose.localization.vehicle import first_pose, kinds_of, place_from_ranges
 
+if TYPE_CHECKING:
+    import gtsam
+
 GATE = 3.0  # standard deviations: a usual choice of a user of filterpy
 CAUCHY = 2.0  # standard deviations
 ITERATIONS = 60
+EXACT_M = 1e-4  # standard deviation of a place that is known
 
 
 @dataclass
@@ -169,6 +174,8 @@ def filterpy_path(problem: Problem) -> tuple[Floats, Floats]:
 
 def gtsam_path(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
     """Times (N,) and positions (N, 2) of the batch optimum (Levenberg-Marquardt), from states `guess` (N, n)."""
+    if problem.form == "odometry" and not problem.constants:
+        return _gtsam_native(problem, guess)
     import gtsam
 
     k = len(problem.constants)
@@ -191,10 +198,51 @@ def gtsam_path(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
                 gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), gtsam.noiseModel.Diagonal.Sigmas(std)
             )
             graph.add(gtsam.CustomFactor(robust, [keys[i], shared] if k else [keys[i]], _range_error(problem, event)))
+    best = _optimum(graph, values)
+    return np.array([step.time_s for step in problem.steps]), np.array([best.atVector(key)[:2] for key in keys])
+
+
+def _gtsam_native(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
+    """As `gtsam_path`, for a robot with odometry and sensors without constants: GTSAM's own factors, which are fast."""
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    keys = [gtsam.symbol("x", i) for i in range(len(problem.steps))]
+    for key, state in zip(keys, guess, strict=True):
+        values.insert(key, gtsam.Pose2(*state))
+    places = {name: gtsam.symbol("b", i) for i, name in enumerate(problem.beacons)}
+    for name, key in places.items():
+        place = np.array(problem.beacons[name][:2])
+        values.insert(key, place)
+        graph.add(gtsam.PriorFactorPoint2(key, place, gtsam.noiseModel.Isotropic.Sigma(2, EXACT_M)))
+    start_noise = gtsam.noiseModel.Diagonal.Sigmas(problem.start_std)
+    graph.add(gtsam.PriorFactorPose2(keys[0], gtsam.Pose2(*problem.start), start_noise))
+    for i, step in enumerate(problem.steps):
+        if i:
+            noise = gtsam.noiseModel.Gaussian.Covariance(problem.motion(step, guess[i - 1])[2])
+            graph.add(gtsam.BetweenFactorPose2(keys[i - 1], keys[i], gtsam.Pose2(*step.way), noise))
+        for event in step.sightings:
+            std = problem.sighting(event, guess[i], np.zeros(0))[3][::-1]  # GTSAM has the bearing first
+            robust = gtsam.noiseModel.Robust.Create(
+                gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), gtsam.noiseModel.Diagonal.Sigmas(std)
+            )
+            pair = keys[i], places[event.beacon]
+            if event.kind == "range":
+                graph.add(gtsam.RangeFactor2D(*pair, event.values[0], robust))
+            else:
+                bearing = gtsam.Rot2(event.values[1])
+                graph.add(gtsam.BearingRangeFactor2D(*pair, bearing, event.values[0], robust))
+    best = _optimum(graph, values)
+    return np.array([step.time_s for step in problem.steps]), np.array([best.atPose2(k).translation() for k in keys])
+
+
+def _optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
+    """The minimum of a graph by Levenberg-Marquardt."""
+    import gtsam
+
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(ITERATIONS)
-    best = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    return np.array([step.time_s for step in problem.steps]), np.array([best.atVector(key)[:2] for key in keys])
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
 
 
 Error = Callable[..., Floats]

@@ -48,7 +48,7 @@ def main() -> None:
                 block = converter.convert_placed([sample], [place])
                 recording.write_block(block)
                 checked, _ = monitor.check(block.measurements)
-                rows, _ = live.process(checked)
+                rows = live.process(checked).complete
                 estimates.write(estimator.text(rows))
             took.append(1e6 * (time.perf_counter() - began))
     name = f"{len(estimator.filters)} filters"

@@ -27,7 +27,7 @@ from _report import RECORDINGS
 
 from linkpose.localization.carmen import Reading, flaser_angles, format_reading
 from linkpose.localization.events import Event
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
 from linkpose.localization.logs import read_log
 from linkpose.localization.measuring import default_constants
 from linkpose.localization.noise import RangeNoise
@@ -282,7 +282,7 @@ def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
     yield {"filter": "filterpy ekf", "position_rmse_m": score(time_s, path, None, truth).position_rmse_m}
     if not batch:
         return
-    track = localize(log, "ekf", replace(settings, smooth=True), None, beacons)
+    track = estimate_track(log, "ekf", replace(settings, smooth=True), None, beacons)
     columns = [np.interp(time_s, track.time_s, column) for column in track.position_m[:, :2].T]
     if problem.form == "odometry":
         columns.append(np.interp(time_s, track.time_s, np.unwrap(np.asarray(track.heading_rad))))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from test_localization_scans import flat_with_rooms, of_half_the_size, scans_in
 
 import linkpose as lp
 from linkpose import estimate
@@ -22,6 +23,7 @@ from linkpose.flashing.image import MARK, read_image
 from linkpose.localization.events import Log
 from linkpose.localization.localizer import Settings, check
 from linkpose.localization.logs import read_log
+from linkpose.localization.map_check import check_map
 from linkpose.localization.maps import load_map, save_map
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.plausibility import check_units
@@ -186,6 +188,9 @@ MORE: dict[str, dict[str, Producer]] = {
             read_beacons, "id,x_m,y_m\n5,0,0\n05,1,1\n"
         ),
         "…, line …: … is no finite number; complete or delete the row": reading(read_truth, "time_s,x_m,y_m\n0,,1\n"),
+        "… applied none of the measurements (… rejected), so there is no estimate; check the units (m, s, rad), the start, and the places of the beacons or the map": (
+            log_of("0,pose,0,0,0\n1,range,1,90,\n", lambda log: lp.localize(log, beacons=BEACONS))
+        ),
         "the pose was never known, so there is nothing to compare with the truth": scored([], path_of(0.0, 1.0)),
         "the true path (… to … s) has no pose at the log's times (… to … s); give the truth of this log": scored(
             [0.0, 0.5], path_of(7.0, 7.5)
@@ -201,6 +206,9 @@ MORE: dict[str, dict[str, Producer]] = {
         "β … is below 0; 2 is best for Gaussian errors": raises(Transform(beta=-1.0).check),
     },
     "Maps": {
+        "…: … of the beams end at a wall of the map, and … if the map is …; correct the resolution in its YAML file": raises(
+            lambda: check_map(list(scans_in(flat_with_rooms())[:1]), of_half_the_size(flat_with_rooms()), 0.2, "a.log")
+        ),
         "cannot read the map …: …": lambda folder: load_map(folder / "none.yaml"),
         "… is not YAML; give the map's .yaml file, not its image": map_file("image: [\n"),
         "… uses YAML aliases (*name); write each value out": map_file("image: &a m.png\nresolution: *a\n"),

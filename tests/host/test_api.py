@@ -130,9 +130,23 @@ def python_blocks(page: Path) -> list[str]:
     return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
+def write_drive(folder: Path) -> None:
+    """log.csv, beacons.csv and truth.csv of a robot that drives 1 m/s along x among four beacons."""
+    beacons = {"1": (0, 5), "2": (0, -5), "3": (20, 5), "4": (20, -5)}
+    rows = ["0,pose,0,0,0"]
+    for i in range(20):
+        rows.append(f"{i},odometry,1,0,")
+        rows += [f"{i},range,{name},{np.hypot(x - i, y):.3f}," for name, (x, y) in beacons.items()]
+    (folder / "log.csv").write_text("\n".join(["time_s,kind,a,b,c", *rows]) + "\n")
+    places = [f"{name},{x},{y}" for name, (x, y) in beacons.items()]
+    (folder / "beacons.csv").write_text("\n".join(["id,x_m,y_m", *places]) + "\n")
+    (folder / "truth.csv").write_text("\n".join(["time_s,x_m,y_m", *(f"{i},{i},0" for i in range(20))]) + "\n")
+
+
 def test_the_page_on_python_runs(swing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "swing.csv").write_bytes(swing.read_bytes())
+    write_drive(tmp_path)
     namespace: dict[str, object] = {}
     blocks = python_blocks(DOCS / "python.md")
     assert len(blocks) >= 5

@@ -191,7 +191,8 @@ def test_a_dash_is_the_standard_output(tmp_path: Path) -> None:
 def test_a_terminal_without_greek_letters_gets_a_replacement(encoding: str) -> None:
     done = run("evaluate", "--help", PYTHONIOENCODING=encoding)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
-    assert "σ".encode(encoding, "replace") in done.stdout
+    assert b"has a standard deviation s," in b" ".join(done.stdout.split()) or "σ".encode(encoding, "replace") != b"?"
+    assert b"?" not in done.stdout
     refused = run("estimate", "σ.csv", "--j2s", "σ", PYTHONIOENCODING=encoding)
     assert refused.returncode == 2 and b"Traceback" not in refused.stderr
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from linkpose.cli.localize import command
 from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.likelihood import run_filter
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Truth, score_track
@@ -80,7 +80,7 @@ def test_noises_are_estimated_from_the_log_and_make_the_filter_consistent() -> N
     assert tuned.turn_std_rad_s < 0.05
     assert tuned.error_time_s == tuned.drift_std_m == 0.0
     assert tuned.turn_std_rad_s >= LEAST_TURN_RAD_S
-    assumed, found = (score_track(localize(log, "ekf", s, None, BEACONS), truth) for s in (settings(), tuned))
+    assumed, found = (score_track(estimate_track(log, "ekf", s, None, BEACONS), truth) for s in (settings(), tuned))
     assert found.position_rmse_m < 0.8 * assumed.position_rmse_m
     assert found.within_2_sigma is not None and found.within_2_sigma > 0.88
 
@@ -98,7 +98,8 @@ def test_errors_that_persist_become_states_or_count_less() -> None:
     white = replace(stream, error_time_s=0.0)
     for smooth in (False, True):
         tracks = [
-            localize(log, "ekf", replace(each, smooth=smooth), None, BEACONS) for each in (drifting, stream, white)
+            estimate_track(log, "ekf", replace(each, smooth=smooth), None, BEACONS)
+            for each in (drifting, stream, white)
         ]
         assert tracks[0].names == ("x_m", "y_m", "heading_rad")
         shares = [score_track(track, truth).within_2_sigma or 0.0 for track in tracks]
@@ -128,7 +129,7 @@ def test_too_few_measurements_leave_the_noises_as_they_are() -> None:
 def test_a_robot_that_was_carried_among_beacons_is_found_again(name: str, bearings: bool) -> None:
     """Carried to the other side of the circle: found within 5 s of the third range that contradicts (two a second)."""
     log, truth = drive(5, duration_s=80.0, carried=(40.0, 19.0), bearings=bearings)
-    track = localize(log, name, settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)  # type: ignore[arg-type]
+    track = estimate_track(log, name, settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)  # type: ignore[arg-type]
     error = np.linalg.norm(track.position_m - truth.position_at(track.time_s), axis=1)
     assert track.relocated >= 1
     assert np.max(error[track.time_s < 39.9]) < 0.5
@@ -144,7 +145,7 @@ def test_one_beacon_with_a_fault_does_not_relocate_the_robot() -> None:
         else event
         for event in log
     ]
-    track = localize(faulty, "ekf", settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)
+    track = estimate_track(faulty, "ekf", settings(turn_std_rad_s=0.03, speed_std_m_s=0.03), None, BEACONS)
     assert track.relocated == 0
     assert score_track(track, truth).position_max_m < 0.5
 
@@ -168,7 +169,7 @@ def test_the_unscented_filter_survives_what_the_extended_one_survives() -> None:
     path = Truth(table[:, 0], table[:, 1:3], None)
     rms = {}
     for name in ("ekf", "ukf"):
-        track = localize(log, name, settings(ranges=RangeNoise("fixed", 1.0)), None, beacons)  # type: ignore[arg-type]
+        track = estimate_track(log, name, settings(ranges=RangeNoise("fixed", 1.0)), None, beacons)  # type: ignore[arg-type]
         error = np.linalg.norm(track.position_m[:, :2] - path.position_at(track.time_s), axis=1)
         rms[name] = float(np.sqrt(np.mean(error[(track.time_s < 130.0) | (track.time_s > 260.0)] ** 2)))
     assert rms["ukf"] < 1.1 * rms["ekf"] < 4.0
@@ -179,12 +180,12 @@ def test_the_bias_of_each_beacon_is_estimated_with_an_honest_deviation(bearings:
     offsets = (0.5, -0.3, 0.0, 0.8)
     log, truth = drive(8, offsets=offsets, bearings=bearings)
     tuned = tune(log, settings(estimate=("bias:each",)), BEACONS, TUNABLE)
-    track = localize(log, "ekf", tuned, None, BEACONS)
+    track = estimate_track(log, "ekf", tuned, None, BEACONS)
     for name, offset in zip(BEACONS, offsets, strict=True):
         at = track.names.index(f"range_bias_{name}_m")
         assert abs(track.state[-1, at] - offset) < max(3.0 * track.std[-1, at], 0.1)
         assert track.std[-1, at] < 0.15
-    one = localize(log, "ekf", replace(tuned, estimate=("bias",)), None, BEACONS)
+    one = estimate_track(log, "ekf", replace(tuned, estimate=("bias",)), None, BEACONS)
     assert score_track(track, truth).position_rmse_m < 0.6 * score_track(one, truth).position_rmse_m
 
 
@@ -196,7 +197,7 @@ def test_scale_and_bias_of_landmark_ranges_are_estimated() -> None:
         else event
         for event in log
     ]
-    track = localize(longer, "ekf", settings(estimate=("scale", "bias"), turn_std_rad_s=0.05), None, BEACONS)
+    track = estimate_track(longer, "ekf", settings(estimate=("scale", "bias"), turn_std_rad_s=0.05), None, BEACONS)
     values = dict(zip(track.names, zip(track.state[-1], track.std[-1], strict=True), strict=True))
     for name, true in (("range_scale_error", 0.05), ("range_bias_m", 0.2)):
         value, std = values[name]

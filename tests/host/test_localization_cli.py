@@ -10,8 +10,11 @@ import sys
 import numpy as np
 import pytest
 
+import linkpose as lp
+from linkpose.errors import InvalidValue
 from linkpose.localization.ekf import ekf_step
-from linkpose.localization.localizer import localize, warm_up
+from linkpose.localization.events import Event
+from linkpose.localization.localizer import estimate_track, warm_up
 from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.settings import Settings
@@ -76,7 +79,7 @@ def test_a_filter_that_is_compiled_is_not_compiled_again(indoor):
     read = read_log(log)
     events, start = read.events, read.start
     for name, step in (("ekf", ekf_step), ("ukf", ukf_step)):
-        localize(events[:50], name, Settings(start=start), load_map(grid))
+        estimate_track(events[:50], name, Settings(start=start), load_map(grid))
         assert len(step.signatures) == 1
 
 
@@ -270,7 +273,11 @@ def test_an_interrupted_stream_ends_well(streamed):
         ([*START, "1,range,A1,five,\n"], [], "'five' is not a number"),
         ([*START[:1], "0,odometry,0,0,\n", "1,range,A1,5,\n"], [], "add --start"),
         ([*START, *(f"{i},range,A1,{5000 + i},\n" for i in range(1, 30))], [], "look like millimetres"),
-        ([*START, *(f"{i},range,A1,90,\n" for i in range(1, 3))], ["--estimate", "none"], "applied none of 2 measure"),
+        (
+            [*START, *(f"{i},range,A1,90,\n" for i in range(1, 3))],
+            ["--estimate", "none"],
+            "applied none of the measure",
+        ),
         (START, ["--plot", "a.png", "--json"], "does not use --plot, --json"),
         (START, ["--smooth"], "no --smooth"),
     ],
@@ -320,3 +327,57 @@ def test_turn_rates_of_a_carmen_log_are_not_degrees(indoor, linkpose, tmp_path):
     result = linkpose("localize", moved, "--map", grid, "--start", "12,12,0")
     assert "degrees" not in result.err
     assert result.status == 0
+
+
+def test_the_python_face_gives_what_the_command_writes(dive, linkpose, tmp_path):
+    log, beacons, truth = dive
+    assert linkpose("localize", log, "--beacons", beacons, *KNOWN, "--smooth", "-o", tmp_path / "path.csv").status == 0
+    written = read_table(tmp_path / "path.csv", "estimate")
+    paths = lp.localize(str(log), beacons=beacons, range_std_m=0.25, drift_std_m=0.0, smooth=True)
+    assert paths.filters == ("ekf",) and len(paths) == len(written)
+    assert list(paths) == list(written.columns)
+    np.testing.assert_allclose(paths["ekf_x_m"], written.columns["ekf_x_m"], atol=1e-6)
+    np.testing.assert_array_equal(paths.ekf.position_m[:, 0], paths["ekf_x_m"])
+    assert paths.score(truth)["ekf"].position_rmse_m < 0.3
+    assert tuple(paths.to_pandas().columns) == paths.columns
+    paths.save(tmp_path / "saved.csv")
+    assert (tmp_path / "saved.csv").read_bytes() == (tmp_path / "path.csv").read_bytes()
+    with pytest.raises(AttributeError, match="no filter ukf; there are ekf"):
+        paths.ukf  # noqa: B018
+    with pytest.raises(KeyError, match="no column x"):
+        paths["x"]
+
+
+def test_a_log_and_beacons_in_memory():
+    """A tag that stands still among three beacons, with a row out of order."""
+    log = [Event(0.1 * i, "range", (math.hypot(x - 3.0, y - 4.0),), name) for i in range(30) for name, x, y in TRIANGLE]
+    paths = lp.localize([*log[1:], log[0]], beacons={name: (x, y) for name, x, y in TRIANGLE}, estimate=())
+    assert paths.remarks[0] == "1 event moved into the order of time"
+    assert paths["ekf_x_m"][-1] == pytest.approx(3.0, abs=0.05)
+
+
+TRIANGLE = (("1", 0.0, 0.0), ("2", 10.0, 0.0), ("3", 0.0, 10.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"start_std": (0.0, 1.0)}, "start_std is (0.0, 1.0); both must be above 0"),
+        ({"start": (1.0, 2.0)}, "start is (1.0, 2.0); it must be x, y, heading"),
+        ({"start": "here"}, 'or "auto"'),
+        ({"gate": 1.5}, "gate is 1.5; it must be a probability"),
+        ({"noise": "loud"}, "noise is 'loud'; it must be one of fixed"),
+        ({"range_std_m": 0.0}, "range_std_m is 0.0; it must be above 0"),
+        ({"speed_std_m_s": math.nan}, "speed_std_m_s is nan; it must be finite"),
+        ({"drift_std_m": -1.0}, "drift_std_m is -1.0; it must not be below 0"),
+        ({"estimate": ("luck",)}, "estimate has 'luck', which is none of scale"),
+        ({"estimate": ("bias", "bias:each")}, "which exclude each other"),
+        ({"filters": ["kalman"]}, "filters has 'kalman', which is none of scan-match"),
+        ({"beacons": {"1": (0.0,)}}, "beacons has 1 coordinates for 1; give x, y"),
+    ],
+)
+def test_arguments_that_cannot_be_are_named(options, reason):
+    log = [Event(0.0, "pose", (0.0, 0.0, 0.0)), Event(1.0, "range", (5.0,), "1")]
+    with pytest.raises(InvalidValue) as raised:
+        lp.localize(log, **({"beacons": {"1": (5.0, 0.0)}} | options))
+    assert reason in str(raised.value)

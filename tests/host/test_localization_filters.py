@@ -22,7 +22,7 @@ from linkpose.localization.kalman import (
     Measurement,
 )
 from linkpose.localization.linalg import wrap_angle
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
 from linkpose.localization.noise import RangeNoise, check_correlation, equicorrelated
 from linkpose.localization.odometry import with_mice_odometry
 from linkpose.localization.settings import Settings
@@ -316,7 +316,7 @@ def test_consistency_and_outliers_underwater(name):
             velocity_std_m_s=0.06,
             start_std=(0.3, 0.05),
         )
-        track = localize(run.log, name, settings, None, BEACONS)
+        track = estimate_track(run.log, name, settings, None, BEACONS)
         rows = track.time_s > 2.0
         error = track.position_m[rows] - run.motion.truth.position_at(track.time_s[rows])
         nees.append(np.mean(np.einsum("ij,ijk,ik->i", error, np.linalg.inv(track.covariance[rows][:, :3, :3]), error)))
@@ -353,7 +353,7 @@ def test_scale_and_bias_of_the_range_sensor_are_found(name):
     settings = Settings(RangeNoise("fixed", 0.1), speed_std_m_s=0.02, turn_std_rad_s=0.02)
     for word, options, value in (("scale", {"scale": 1.07}, 0.07), ("bias", {"bias": 0.4}, 0.4)):
         log, beacons, truth = drive_among_beacons(**options)
-        track = localize(log, name, replace(settings, estimate=(word,)), None, beacons)
+        track = estimate_track(log, name, replace(settings, estimate=(word,)), None, beacons)
         estimate, std = track.state[-1, -1], track.std[-1, -1]
         assert abs(estimate - value) < 4 * std < 0.1
         assert np.linalg.norm(track.position_m[-100:] - truth(track.time_s[-100:]), axis=1).max() < 0.2
@@ -362,7 +362,7 @@ def test_scale_and_bias_of_the_range_sensor_are_found(name):
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
 def test_rides_out_a_silence_of_the_beacons(name):
     log, beacons, truth = drive_among_beacons(silent=(15.0, 45.0))
-    track = localize(
+    track = estimate_track(
         log, name, Settings(RangeNoise("fixed", 0.1), speed_std_m_s=0.02, turn_std_rad_s=0.02), None, beacons
     )
     spread = np.hypot(track.std[:, 0], track.std[:, 1])
@@ -377,7 +377,7 @@ def test_a_hopeless_log_ends_without_failure():
     """Ranges that fit nowhere: the pose is opened again and again, but never beyond what a filter can hold."""
     log, beacons, _ = drive_among_beacons(scale=7.0, bias=30.0)
     for name in ("ekf", "ukf"):
-        track = localize(log, name, Settings(RangeNoise("fixed", 0.01)), None, beacons)
+        track = estimate_track(log, name, Settings(RangeNoise("fixed", 0.01)), None, beacons)
         assert track.widened > 5
         assert np.isfinite(track.state).all()
 
@@ -394,7 +394,7 @@ def test_mice_drive_a_robot_that_slides(tmp_path):
         settings = Settings(
             RangeNoise("fixed", 0.1), start=(10.0, 5.0, math.pi / 2), speed_std_m_s=0.02, turn_std_rad_s=0.02
         )
-        track = localize(slid, name, settings, None, beacons)
+        track = estimate_track(slid, name, settings, None, beacons)
         assert np.linalg.norm(track.position_m - truth(track.time_s), axis=1).max() < 0.2
         assert wrap_angle(track.heading_rad[-1] - 0.2 * track.time_s[-1] - math.pi / 2) == pytest.approx(0.0, abs=0.05)
     path.write_text("time_s,mice_vx_m_s,mice_vy_m_s,mice_wz_rad_s\n1000,0,0,0\n")
@@ -406,7 +406,7 @@ def test_a_wrong_start_is_opened_again():
     """Everything is refused from 6 m off; after ten refusals the pose is widened until it fits."""
     log, beacons, truth = drive_among_beacons()
     settings = Settings(RangeNoise("fixed", 0.1), start=(14.0, 9.5, 0.0), start_std=(0.1, 0.1))
-    track = localize(log, "ukf", settings, None, beacons)
+    track = estimate_track(log, "ukf", settings, None, beacons)
     assert track.widened > 0
     assert np.linalg.norm(track.position_m[-100:] - truth(track.time_s[-100:]), axis=1).max() < 0.5
 
@@ -429,7 +429,7 @@ def test_a_tag_without_odometry_moves_and_finds_its_start():
     log, beacons = tag_among_beacons()
     settings = Settings(RangeNoise("fixed", 0.05), estimate=("bias",))
     for smooth in (False, True):
-        track = localize(log, "ekf", replace(settings, smooth=smooth), None, beacons)
+        track = estimate_track(log, "ekf", replace(settings, smooth=smooth), None, beacons)
         true = np.column_stack((2.0 * np.cos(0.4 * track.time_s), 2.0 * np.sin(0.4 * track.time_s)))
         error = np.linalg.norm(track.position_m - true, axis=1)
         assert np.sqrt(np.mean(error[50:] ** 2)) < (0.05 if smooth else 0.1)
@@ -443,10 +443,10 @@ def test_a_bias_for_each_beacon_and_the_verdict_on_its_noise():
     log, beacons = tag_among_beacons(0.0)
     log = [replace(e, values=(e.values[0] + 0.3,)) if e.beacon == "0xDD05" else e for e in log]
     settings = Settings(RangeNoise("fixed", 0.05), estimate=("bias:each",))
-    track = localize(log, "ekf", settings, None, beacons)
+    track = estimate_track(log, "ekf", settings, None, beacons)
     biases = [track.state[-1, track.names.index(f"range_bias_{name}_m")] for name in beacons]
     assert np.array(biases) - biases[0] == pytest.approx([0.0, 0.3, 0.0, 0.0], abs=0.08)
-    small = localize(log, "ekf", replace(settings, ranges=RangeNoise("fixed", 0.01), gate=None), None, beacons)
+    small = estimate_track(log, "ekf", replace(settings, ranges=RangeNoise("fixed", 0.01), gate=None), None, beacons)
     assert "times too small" in small.consistency.verdicts()[0].sentence()
     assert {verdict.sensor for verdict in small.consistency.verdicts(each=True)} == {f"range:{b}" for b in beacons}
 
@@ -456,7 +456,7 @@ def test_smoothing_lowers_the_error_in_a_silence_of_the_beacons():
     settings = Settings(RangeNoise("fixed", 0.1), speed_std_m_s=0.02, turn_std_rad_s=0.02)
     errors = []
     for smooth in (False, True):
-        track = localize(log, "ekf", replace(settings, smooth=smooth), None, beacons)
+        track = estimate_track(log, "ekf", replace(settings, smooth=smooth), None, beacons)
         rows = (track.time_s > 30.0) & (track.time_s < 45.0)
         error = track.position_m[rows] - truth(track.time_s[rows])
         errors.append(np.sqrt(np.mean(np.sum(error**2, axis=1))))

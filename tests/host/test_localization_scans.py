@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, MapMismatch
 from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at
-from linkpose.localization.events import Event, Scan
+from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
+from linkpose.localization.map_check import check_map
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
@@ -65,7 +66,7 @@ def drive():
 def test_a_scan_match_is_accurate_and_honest(drive):
     run, grid = drive
     start = tuple(run.pose[0] + (0.3, -0.3, 0.08))
-    track = localize(as_log(run.readings), "scan-match", Settings(start=start), grid)
+    track = estimate_track(as_log(run.readings), "scan-match", Settings(start=start), grid)
     result = score_track(track, run.truth)
     assert result.position_rmse_m < 0.06
     assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
@@ -82,7 +83,7 @@ def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
         for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
             grown = np.roll(blocked, step, axis) & (rng.random(blocked.shape) < 0.4)
             blocked |= grown.astype(np.uint8)
-    track = localize(
+    track = estimate_track(
         as_log(run.readings), "scan-match", Settings(start=tuple(run.pose[0])), GridMap(blocked, grid.geometry)
     )
     result = score_track(track, run.truth)
@@ -93,7 +94,7 @@ def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
 
 def test_without_a_start_the_pose_is_unknown_and_then_right(drive):
     run, grid = drive
-    track = localize(as_log(run.readings), "scan-match", Settings(), grid)
+    track = estimate_track(as_log(run.readings), "scan-match", Settings(), grid)
     assert not track.known[0]
     assert np.isnan(track.state[0]).all()
     assert track.known.mean() > 0.6
@@ -108,7 +109,7 @@ def test_a_robot_that_was_carried_is_found_again(drive):
     log = as_log(run.readings)
     for event in as_log([replace(reading, time_s=reading.time_s + shift) for reading in other.readings[900:]]):
         log.append(event)
-    track = localize(log, "scan-match", Settings(start=tuple(run.pose[0])), grid)
+    track = estimate_track(log, "scan-match", Settings(start=tuple(run.pose[0])), grid)
     assert track.relocated >= 1
     true = np.interp(track.time_s[-1] - shift, other.time_s, other.pose[:, 0])
     assert track.known[-1] and abs(track.state[-1, 0] - true) < 0.2
@@ -118,18 +119,69 @@ def test_monte_carlo_localisation_is_seeded(drive):
     run, grid = drive
     log = as_log(run.readings)
     settings = Settings(start=tuple(run.pose[0]), start_std=(0.2, 0.05), particles=300, seed=2)
-    tracks = [localize(log, "mcl", chosen, grid) for chosen in (settings, settings, replace(settings, seed=3))]
+    tracks = [estimate_track(log, "mcl", chosen, grid) for chosen in (settings, settings, replace(settings, seed=3))]
     assert (tracks[0].state == tracks[1].state).all()
     assert (tracks[0].state != tracks[2].state).any()
     assert score_track(tracks[0], run.truth).position_rmse_m < 0.3
     with pytest.raises(LinkposeError, match="does not state where the robot starts"):
-        localize(log, "mcl", Settings(), grid)
+        estimate_track(log, "mcl", Settings(), grid)
 
 
 def test_scans_without_echo_change_nothing():
     grid = office_map()
     silent = Scan(1.0, np.full(181, np.nan), np.linspace(-1.5, 1.5, 181), (0.0, 0.0, 0.0), 80.0)
     log = [Event(0.0, "pose", (12.0, 12.0, 0.0)), Event(0.0, "odometry", (0.0, 0.0)), silent]
-    track = localize(log, "scan-match", Settings(), grid)
+    track = estimate_track(log, "scan-match", Settings(), grid)
     assert track.applied == 0
     assert track.state[-1] == pytest.approx([12.0, 12.0, 0.0])
+
+
+def flat_with_rooms() -> GridMap:
+    """A flat of 8 x 6 m whose walls no mirror image has, with cells of 0.1 m."""
+    blocked = np.zeros((60, 80), np.uint8)
+    blocked[[0, -1], :] = blocked[:, [0, -1]] = OCCUPIED
+    blocked[:38, 30] = blocked[20, 30:60] = blocked[40:47, 55:62] = blocked[52:, 12] = OCCUPIED
+    return GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0]))
+
+
+def scans_in(grid: GridMap) -> list[Scan]:
+    """Scans of 90 beams all around from four places, by steps of a quarter of a cell along each beam."""
+    cell, angles, steps = grid.geometry[0], np.radians(np.arange(0, 360, 4.0)), np.arange(0.0, 12.0, 0.025)
+    scans = []
+    for time, (x, y, heading) in enumerate([(1.5, 1.5, 0.3), (1.0, 4.5, 2.0), (5.0, 4.5, -1.0), (6.5, 1.0, 1.2)]):
+        across = ((x + np.outer(np.cos(angles + heading), steps)) / cell).astype(int).clip(0, 79)
+        along = ((y + np.outer(np.sin(angles + heading), steps)) / cell).astype(int).clip(0, 59)
+        ranges = steps[np.argmax(grid.blocked[along, across] == OCCUPIED, axis=1)]
+        scans.append(Scan(float(time), ranges, angles, (0.0, 0.0, 0.0), 80.0))
+    return scans
+
+
+def of_half_the_size(grid: GridMap) -> GridMap:
+    """The map with half of its resolution."""
+    return GridMap(grid.blocked, grid.geometry * (0.5, 1, 1, 1))
+
+
+def test_a_map_that_the_scans_fit_only_mirrored_or_at_another_scale_is_named():
+    grid = flat_with_rooms()
+    scans = scans_in(grid)
+    mirrored: Log = [replace(scan, ranges_m=scan.ranges_m[::-1]) for scan in scans]
+    for log, wrong, words in (
+        (mirrored, grid, "mirrored"),
+        (list[Event | Scan](scans[:1]), of_half_the_size(grid), "twice as large"),
+    ):
+        with pytest.raises(MapMismatch, match=f"if the map is {words}") as raised:
+            check_map(log, wrong, 0.2, "a.log")
+        assert raised.value.changed_share > 0.95 > raised.value.share
+
+
+def test_a_map_of_another_place_and_an_odometry_that_contradicts_the_scans_are_named():
+    grid = flat_with_rooms()
+    log: Log = list(scans_in(grid)[:2])
+    assert check_map(log, grid, 0.9, "a.log") == ""
+    assert "check the odometry" in check_map(log, grid, 0.3, "a.log")
+    rng = np.random.default_rng(5)
+    elsewhere: Log = [
+        Scan(float(i), rng.uniform(0.5, 6.0, 90), np.radians(np.arange(0, 360, 4.0)), (0.0, 0.0, 0.0), 80.0)
+        for i in range(2)
+    ]
+    assert "check whether the map is of this place" in check_map(elsewhere, grid, 0.2, "a.log")

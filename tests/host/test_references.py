@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 
 import numpy as np
 import pytest
@@ -180,4 +181,15 @@ def test_a_c3d_file_on_which_ezc3d_crashes_is_named(tmp_path):
     data[at] = 130
     path.write_bytes(bytes(data))
     with pytest.raises(FileFormatError, match=r"take.c3d is damaged or no C3D file: .*; export the take again"):
+        read_any(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory of a process is bounded on Linux only")
+@pytest.mark.parametrize(("bound", "reason"), [("_MOST_BYTES", "needs more than"), ("_LONGEST_S", "does not finish")])
+def test_the_time_and_the_memory_to_read_a_c3d_file_are_bounded(tmp_path, monkeypatch, bound, reason):
+    """A damaged file of 8 kB took 11.5 GB, and more than a minute."""
+    path = c3d(tmp_path / "take.c3d", ["S_O", "S_X", "S_Y"])
+    monkeypatch.setattr("linkpose.evaluation.markers._MOST_BYTES_PER_BYTE", 0)
+    monkeypatch.setattr(f"linkpose.evaluation.markers.{bound}", 0)
+    with pytest.raises(FileFormatError, match=f"take.c3d is damaged or no C3D file: ezc3d {reason}"):
         read_any(path)

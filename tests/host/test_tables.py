@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from linkpose.errors import FileExists, FileFormatError
+from linkpose.localization.events import beacon_name
 from linkpose.localization.tables import read_beacons
 from linkpose.recording import columns
 from linkpose.recording.csvfile import CsvFile, head
@@ -265,6 +266,13 @@ def test_any_bytes_are_a_table_or_a_sentence(tmp_path_factory, data):
         assert str(path) in str(error)
     else:
         assert len({len(column) for column in table.columns.values()}) == 1
+
+
+def test_long_names_take_time_in_proportion_to_their_length(tmp_path):
+    """With patterns that go back, these names took half a minute and minutes."""
+    (tmp_path / "a.csv").write_text("a" * 100_000 + "\tb\n1\t2\n")
+    assert read_table(tmp_path / "a.csv").columns["b"].tolist() == [2.0]
+    assert beacon_name("0" * 300_000 + "x").endswith("0x")
 
 
 def test_a_plain_file_has_its_metadata_beside_it(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,31 +14,27 @@ import click
 from linkpose.cli import options
 from linkpose.cli.live import Console, ending_well
 from linkpose.cli.page import PageOptions
-from linkpose.errors import LinkposeError
+from linkpose.errors import InvalidValue
+from linkpose.localization.options import ESTIMATED_NOISES, LocalizationOptions, check_constants, check_start_std
 from linkpose.presentation import counted
 
 if TYPE_CHECKING:
-    from linkpose.localization.events import Log
     from linkpose.localization.localizer import Method
-    from linkpose.localization.settings import Settings
-    from linkpose.localization.tables import Beacons, PathScore
+    from linkpose.localization.tables import PathScore
     from linkpose.localization.track import Track
-    from linkpose.recording.table import Table
 
-# The noises that are estimated from the log where the user does not state them: option -> its name in `tuning`, and the
-# value for streams, laser scans, and logs of fewer than 100 measurements.
-NOISES = {
-    "range_std": ("range", 0.1), "range_growth": ("growth", 0.02), "bearing_std": ("bearing", 0.05),
-    "speed_std": ("speed", 0.1), "turn_std": ("turn", 0.1), "velocity_std": ("velocity", 0.1),
-    "acceleration_std": ("acceleration", 1.0),
-}  # fmt: skip
-FROM_LOG = "Default: estimated from the log; in a stream, or with few measurements,"
-POSITIVE = options.FiniteRange(min=0, min_open=True)
+POSITIVE, NOT_NEGATIVE = options.FiniteRange(min=0, min_open=True), options.FiniteRange(min=0)
+DEFAULTS = LocalizationOptions()
 
 
-def _default(noise: str) -> str:
-    """The last sentence of the help text of an option for one of NOISES."""
-    return f"{FROM_LOG} {NOISES[noise][1]:g}."
+def _number(
+    flag: str, name: str, kind: click.ParamType[Any], text: str
+) -> Callable[[options.Function], options.Function]:
+    """The option of the number `name` of LocalizationOptions, with its default."""
+    default = getattr(DEFAULTS, name)
+    if default is None and (assumed := ESTIMATED_NOISES[name][1]) is not None:
+        text += f" Default: estimated from the log; in a stream, or with few measurements, {assumed:g}."
+    return click.option(flag, name, type=kind, default=default, show_default=default is not None, help=text)
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
@@ -74,19 +71,28 @@ def gate_probability(ctx: click.Context, param: click.Parameter, value: str) -> 
     return probability
 
 
-def estimated_constants(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> tuple[str, ...]:
-    """The words of --estimate, each once."""
-    from linkpose.localization.settings import ESTIMATED
+def estimated_constants(ctx: click.Context, param: click.Parameter, value: tuple[str, ...]) -> tuple[str, ...] | None:
+    """The words of --estimate, each once; None where it is not given, () for `none`."""
+    words = list(dict.fromkeys(word.strip() for item in value for word in item.split(",")))
+    if words in ([], ["none"]):
+        return () if words else None
+    _check(check_constants, words)
+    return tuple(words)
 
-    words = [word.strip() for item in value for word in item.split(",")]
-    if words == ["none"]:
-        return ("none",)
-    for word in words:
-        if word not in ESTIMATED:
-            raise click.BadParameter(f"{word!r} is none of {', '.join(ESTIMATED)}")
-        if f"{word}:each" in words:
-            raise click.BadParameter(f"{word} and {word}:each exclude each other; name one")
-    return tuple(dict.fromkeys(words))
+
+def start_std(ctx: click.Context, param: click.Parameter, value: str) -> tuple[float, ...]:
+    """M,RAD as two numbers above 0."""
+    std = Numbers("M,RAD").convert(value, param, ctx)
+    _check(check_start_std, std)
+    return std
+
+
+def _check(check: Callable[[Any], None], value: object) -> None:
+    """Raises BadParameter for a value for which `check` raises InvalidValue."""
+    try:
+        check(value)
+    except InvalidValue as error:
+        raise click.BadParameter(str(error).removeprefix(f"{error.name} ")) from None
 
 
 def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, ...] | str | None:
@@ -129,17 +135,11 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--noise",
     type=click.Choice(["fixed", "adaptive", "affine"]),
-    default="affine",
+    default=DEFAULTS.noise,
     show_default=True,
     help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)².",
 )
-@click.option(
-    "--correlation",
-    type=options.FiniteRange(),
-    default=0.0,
-    show_default=True,
-    help="Between ranges taken at one instant.",
-)
+@_number("--correlation", "correlation", options.FiniteRange(), "Between ranges taken at one instant.")
 @click.option(
     "--gate",
     callback=gate_probability,
@@ -148,51 +148,45 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     metavar="P|off",
     help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
 )
-@click.option("--range-std", type=POSITIVE, help=f"σ of a range (m). {_default('range_std')}")
-@click.option(
+@_number("--range-std", "range_std_m", POSITIVE, "σ of a range (m).")
+@_number(
     "--range-growth",
-    type=options.FiniteRange(min=0),
-    help=f"Growth k of the range's standard deviation with --noise affine (m/m). {_default('range_growth')}",
+    "range_growth",
+    NOT_NEGATIVE,
+    "Growth k of the range's standard deviation with --noise affine (m/m).",
 )
-@click.option("--eta", type=POSITIVE, default=1.0, show_default=True, help="η of --noise adaptive.")
-@click.option("--bearing-std", type=POSITIVE, help=f"σ of a bearing (rad). {_default('bearing_std')}")
-@click.option("--depth-std", type=POSITIVE, default=0.05, show_default=True, help="σ of a depth (m).")
-@click.option("--attitude-std", type=POSITIVE, default=0.01, show_default=True, help="σ of a yaw reading (rad).")
-@click.option("--speed-std", type=POSITIVE, help=f"σ of one odometry sample's speed (m/s). {_default('speed_std')}")
-@click.option("--turn-std", type=POSITIVE, help=f"σ of one odometry sample's turn rate (rad/s). {_default('turn_std')}")
-@click.option(
-    "--velocity-std", type=POSITIVE, help=f"σ of one velocity sample on each axis (m/s). {_default('velocity_std')}"
-)
-@click.option(
+@_number("--eta", "eta", POSITIVE, "η of --noise adaptive.")
+@_number("--bearing-std", "bearing_std_rad", POSITIVE, "σ of a bearing (rad).")
+@_number("--depth-std", "depth_std_m", POSITIVE, "σ of a depth (m).")
+@_number("--attitude-std", "attitude_std_rad", POSITIVE, "σ of a yaw reading (rad).")
+@_number("--speed-std", "speed_std_m_s", POSITIVE, "σ of one odometry sample's speed (m/s).")
+@_number("--turn-std", "turn_std_rad_s", POSITIVE, "σ of one odometry sample's turn rate (rad/s).")
+@_number("--velocity-std", "velocity_std_m_s", POSITIVE, "σ of one velocity sample on each axis (m/s).")
+@_number(
     "--acceleration-std",
-    type=POSITIVE,
-    help=f"σ of the acceleration on each axis of a log without odometry (m/s²). {_default('acceleration_std')}",
+    "acceleration_std_m_s2",
+    POSITIVE,
+    "σ of the acceleration on each axis of a log without odometry (m/s²).",
 )
-@click.option(
+@_number(
     "--error-time",
-    type=options.FiniteRange(min=0),
-    help="Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
-    "count less. Default: estimated for landmarks and in streams; with few measurements 0, and 0.5 for landmarks.",
+    "error_time_s",
+    NOT_NEGATIVE,
+    "Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
+    "count less. Default: estimated for landmarks; with few measurements 0, and 0.5 for landmarks.",
 )
-@click.option(
+@_number(
     "--drift-std",
-    type=options.FiniteRange(min=0),
-    help="σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose. "
-    f"{FROM_LOG} 0.",
+    "drift_std_m",
+    NOT_NEGATIVE,
+    "σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose.",
 )
-@click.option(
-    "--drift-time",
-    type=POSITIVE,
-    default=10.0,
-    show_default=True,
-    help="Time for which this part persists (s); estimated with it.",
-)
-@click.option(
+@_number("--drift-time", "drift_time_s", POSITIVE, "Time for which this part persists (s); estimated with it.")
+@_number(
     "--motion-correlation",
-    type=options.FiniteRange(),
-    default=0.0,
-    show_default=True,
-    help="Between the errors of speed and turn rate.",
+    "motion_correlation",
+    options.FiniteRange(),
+    "Between the errors of speed and turn rate.",
 )
 @click.option(
     "--estimate",
@@ -211,36 +205,33 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "Default: the log's own pose, else auto.",
 )
 @click.option(
-    "--start-std", type=Numbers("M,RAD"), default="0.5,0.1", show_default=True, help="Standard deviation of the start."
+    "--start-std",
+    callback=start_std,
+    metavar="M,RAD",
+    default=",".join(map(str, DEFAULTS.start_std)),
+    show_default=True,
+    help="Standard deviation of the start.",
 )
 @click.option(
     "--transform",
     type=click.Choice(["unscented", "scaled"]),
-    default="unscented",
+    default=DEFAULTS.transform,
     show_default=True,
     help="Sigma points √(n + κ) σ out, as the thesis has them, or α times that: better in a map with many edges.",
 )
-@click.option(
-    "--alpha",
-    type=options.FiniteRange(0, 1, min_open=True),
-    default=0.1,
-    show_default=True,
-    help="α of --transform scaled.",
-)
-@click.option(
-    "--beta", type=options.FiniteRange(min=0), default=2.0, show_default=True, help="β of --transform scaled."
-)
-@click.option("--kappa", type=options.FiniteRange(min=0), default=0.0, show_default=True, help="κ of either transform.")
+@_number("--alpha", "alpha", options.FiniteRange(0, 1, min_open=True), "α of --transform scaled.")
+@_number("--beta", "beta", NOT_NEGATIVE, "β of --transform scaled.")
+@_number("--kappa", "kappa", NOT_NEGATIVE, "κ of either transform.")
 @click.option("--smooth", is_flag=True, help="Smooth the path afterwards with all measurements.")
-@click.option("--particles", type=click.IntRange(10, 1000000), default=2000, show_default=True, help="Of --filter mcl.")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of --filter mcl.")
+@_number("--particles", "particles", click.IntRange(10, 1000000), "Of --filter mcl.")
+@_number("--seed", "seed", click.IntRange(min=0), "Of --filter mcl.")
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
     "--plot",
     "picture",
     type=options.FILE,
     metavar="PICTURE",
-    help="Draw the paths with 2σ ellipses over the map or the beacons, and the truth (.png, .pdf, .svg).",
+    help="Draw the paths with 2σ ellipses, map, beacons and truth (.png, .pdf, .svg), or play them (.html).",
 )
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
@@ -277,87 +268,53 @@ def command(
     page.check()
     if map_path is None and beacons_path is None:
         raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
-    from linkpose import precompile
-    from linkpose.localization.localizer import check, localize, most_at_once
-    from linkpose.localization.logs import read_log
-    from linkpose.localization.maps import load_map
-    from linkpose.localization.plausibility import check_units
-    from linkpose.localization.tables import read_beacons, read_truth, score_track
-
     console = Console(quiet, verbose=False)
+    methods = cast("tuple[Method, ...]", filters)
+    chosen = LocalizationOptions(**settings)
     if str(log) == "-":
         given: dict[str, object] = {"--map": map_path, "--odometry": odometry_path, "--plot": picture}
         given |= {"--truth": truth_path, "--json": json_lines or None, "--view": has_page or None}
         _refuse_in_stream(given | {"-o": None if str(output) == "-" else output})
-        _stream(settings, filters, read_beacons(beacons_path) if beacons_path else {}, console)
+        _stream(chosen, methods, beacons_path, console)
         return
-    grid = load_map(map_path) if map_path else None
-    beacons = read_beacons(beacons_path) if beacons_path else {}
+    from linkpose import precompile
+    from linkpose.localization.paths import prepare
+    from linkpose.localization.surroundings import Surroundings
+    from linkpose.localization.tables import read_truth
+
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
+        from linkpose.page.animation import FORMATS
         from linkpose.plotting import check_output
 
-        check_output(picture, force)
-    read = read_log(log)
-    for remark in read.remarks:
-        console.report(remark)
-    events = read.events
-    if odometry_path is not None:
-        from linkpose.localization.odometry import with_mice_odometry
-
-        events = with_mice_odometry(events, odometry_path)
-    has_scans = any(event.kind == "scan" for event in events)
-    default: Method = "scan-match" if has_scans else "ekf"
-    names = cast("list[Method]", list(dict.fromkeys(filters))) or [default]
-    settings["estimate"] = _estimated(settings["estimate"], events, console)
-    free = _free_noises(settings)
-    chosen = {name: _settings(settings, name, read.start) for name in names}
-    if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
-        check_units(events, beacons, str(log))
-    for method in names:
-        check(events, method, chosen[method], grid, beacons, str(log))
-    if chosen[names[0]].ranges.correlation and most_at_once(events) == 1:
-        console.report("no two ranges of this log are of one instant: --correlation changes nothing")
-    if _has_no_odometry(events):
-        console.report(
-            "the log has no odometry: a constant-velocity model is used (--acceleration-std), "
-            "at the mean height of the beacons"
-        )
-    console.compile([*names, precompile.NOISES] if beacons and not has_scans else names)
-    if beacons and not has_scans:
-        chosen = _tuned(events, chosen, beacons, free, console)
-    tracks: dict[str, Track] = {
-        method: localize(events, method, chosen[method], grid, beacons, str(log)) for method in names
-    }
-    for name, track in tracks.items():
-        _require_measurements(log, name, track)
+        check_output(picture, force, FORMATS)
     options.refuse_mixed_output(output, json_lines)
+    prepared = prepare(log, map_path, beacons_path, odometry_path, methods, chosen)
+    for remark in prepared.remarks:
+        console.report(remark)
+    console.compile([*prepared.settings, precompile.NOISES] if prepared.estimates_noises else list(prepared.settings))
+    paths = prepared.run()
+    for remark in paths.remarks[len(prepared.remarks) :]:
+        console.report(remark)
     if output is not None:
-        from linkpose.localization.output import write_tracks
+        paths.save(output, force=force)
+    tables = [paths.table]
+    if truth_path is not None and (picture is not None or has_page):
+        from linkpose.evaluation.references import read_for_picture
 
-        write_tracks(output, tracks, log, force)
+        tables.append(read_for_picture(truth_path, "z"))
+    surroundings = Surroundings(prepared.grid, prepared.beacons, paths.tracks[paths.filters[0]].rejected_xy_m)
     if picture is not None:
-        from linkpose import plotting
+        from linkpose.page.animation import save_picture
 
-        scene = plotting.PathBackground(grid, beacons, tracks[names[0]].rejected_xy_m)
-        figure, _ = plotting.plot_tables(_tables(tracks, log, truth_path), [], scene)
-        plotting.save(figure, picture, force)
-    for name, track in tracks.items():
-        result = score_track(track, truth) if truth else None
+        save_picture(picture, tables, [], surroundings, force)
+    scores = paths.score(truth) if truth else {}
+    for name, track in paths.tracks.items():
+        result = scores.get(name)
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
     if has_page:
-        from linkpose.page.scene import Surroundings
-
-        page.play(_tables(tracks, log, truth_path), [], Surroundings(grid, beacons), console)
-
-
-def _tables(tracks: dict[str, Track], log: Path, truth: Path | None) -> list[Table]:
-    """The paths and the truth as `plot` reads them from their files."""
-    from linkpose.evaluation.references import read_for_picture
-    from linkpose.localization.output import table_of
-
-    return [table_of(tracks, log), *([read_for_picture(truth, "z")] if truth is not None else [])]
+        page.play(tables, [], surroundings, console)
 
 
 def _refuse_in_stream(given: dict[str, object]) -> None:
@@ -366,138 +323,33 @@ def _refuse_in_stream(given: dict[str, object]) -> None:
         raise click.UsageError(f"a stream from standard input does not use {', '.join(unused)}; leave it out")
 
 
-def _stream(settings: dict[str, Any], filters: tuple[str, ...], beacons: Beacons, console: Console) -> None:
+def _stream(
+    chosen: LocalizationOptions, filters: tuple[Method, ...], beacons_path: Path | None, console: Console
+) -> None:
     """Reads rows from standard input and writes a row of CSV for each, until the input ends or the user interrupts."""
     import sys
 
     from linkpose import precompile
-    from linkpose.localization.output import header_line, row_line
     from linkpose.localization.stream import Stream
+    from linkpose.localization.tables import read_beacons
 
-    name = filters[0] if filters else "ekf"
-    if len(filters) > 1 or name not in ("ekf", "ukf") or not beacons or settings["smooth"]:
+    name: Method = filters[0] if filters else "ekf"
+    if len(filters) > 1 or name not in ("ekf", "ukf") or beacons_path is None or chosen.smooth:
         raise click.UsageError("standard input takes --beacons, one --filter ekf or ukf, and no --smooth")
-    words = settings["estimate"]
-    settings["estimate"] = () if words == ("none",) else words
-    free = _free_noises(settings)
-    method = cast("Method", name)
+    beacons = read_beacons(beacons_path)
     console.compile([name, precompile.NOISES])
-    stream = Stream(method, _settings(settings, method, None), beacons, free, not words, console.report)
+    stream = Stream(name, chosen, beacons, console.report)
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")
-    last = None
     with contextlib.suppress(KeyboardInterrupt), ending_well():
-        for row in stream.rows(sys.stdin):
-            if last is None:
-                click.echo(header_line(name, stream.states))
-            click.echo(row_line(row))
+        for line in stream.csv_lines(sys.stdin):
+            click.echo(line)
             sys.stdout.flush()
-            last = row
     for remark in stream.remarks():
         console.report(remark)
-    if stream.run is not None and last is not None:
-        track = stream.run.track([last])
-        _require_measurements(Path("standard input"), name, track)
+    track = stream.track()
+    if track is not None:
         console.report(_sentence(name, track, None))
-
-
-def _estimated(words: tuple[str, ...], events: Log, console: Console) -> tuple[str, ...]:
-    """The constants to estimate: as given, or those that the ranges determine."""
-    from linkpose.localization.events import Event
-    from linkpose.localization.measuring import default_constants
-    from linkpose.localization.vehicle import kinds_of
-
-    if words:
-        return () if words == ("none",) else words
-    beacons = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
-    found = default_constants(kinds_of(events), len(beacons))
-    if found:
-        console.report("scale error and bias of the ranges are estimated, too (--estimate none: not)")
-    return found
-
-
-def _free_noises(given: dict[str, Any]) -> tuple[str, ...]:
-    """The noises that the user did not state, which get their values for logs that do not determine them."""
-    free = [name for option, (name, _) in NOISES.items() if given[option] is None]
-    for option, (_, value) in NOISES.items():
-        given[option] = value if given[option] is None else given[option]
-    if given["noise"] != "affine" and "growth" in free:
-        free.remove("growth")
-    free += [name for option, name in (("error_time", "error_time"), ("drift_std", "drift")) if given[option] is None]
-    given["drift_std"] = given["drift_std"] or 0.0
-    return (*free, "yaw")
-
-
-def _tuned(
-    events: Log, chosen: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...], console: Console
-) -> dict[Method, Settings]:
-    """The settings of all filters with the free noises estimated from the log, and a line that reports them."""
-    from linkpose.localization.tuning import described, tune
-
-    first = next(iter(chosen.values()))
-    tuned = tune(events, first, beacons, free)
-    if tuned is first:
-        return chosen
-    console.report(f"noises estimated from the log: {described(tuned, events)}")
-    return dict.fromkeys(chosen, tuned)
-
-
-def _has_no_odometry(events: Log) -> bool:
-    from linkpose.localization.kalman import CONSTANT_VELOCITY
-    from linkpose.localization.vehicle import kinds_of, vehicle_of
-
-    return vehicle_of(kinds_of(events)) is CONSTANT_VELOCITY
-
-
-def _require_measurements(log: Path, name: str, track: Track) -> None:
-    """Raises LinkposeError where no measurement was applied: the path would be dead reckoning."""
-    if track.applied == 0:
-        raise LinkposeError(
-            f"{log}: {name} applied none of {counted(track.rejected, 'measurement')}, so there is no estimate; "
-            "check the units (m, s, rad), --start, and the places of the beacons or the map"
-        )
-
-
-def _settings(given: dict[str, Any], name: Method, own_start: tuple[float, float, float] | None) -> Settings:
-    from linkpose.localization.noise import RangeNoise
-    from linkpose.localization.settings import Settings
-    from linkpose.localization.ukf import Transform
-
-    scaled = given["transform"] == "scaled"
-    if min(given["start_std"]) <= 0:
-        raise click.BadParameter(
-            "both must be above 0; a start without uncertainty could not be corrected", param_hint="--start-std"
-        )
-    # Odometry's own frame is the map's in a simulation only: scan-match checks the whole map instead.
-    start = given["start"] if name == "scan-match" else given["start"] or own_start
-    if start == "auto":
-        start = None
-    return Settings(
-        ranges=RangeNoise(
-            given["noise"], given["range_std"], given["eta"], given["range_growth"], given["correlation"]
-        ),
-        bearing_std_rad=given["bearing_std"],
-        depth_std_m=given["depth_std"],
-        attitude_std_rad=given["attitude_std"],
-        speed_std_m_s=given["speed_std"],
-        turn_std_rad_s=given["turn_std"],
-        motion_correlation=given["motion_correlation"],
-        velocity_std_m_s=given["velocity_std"],
-        gate=given["gate"],
-        transform=Transform(given["alpha"], given["beta"], given["kappa"])
-        if scaled
-        else Transform(kappa=given["kappa"]),
-        estimate=tuple(dict.fromkeys(given["estimate"])),
-        start=start,
-        start_std=given["start_std"],
-        acceleration_std_m_s2=given["acceleration_std"],
-        error_time_s=given["error_time"],
-        drift_std_m=given["drift_std"],
-        drift_time_s=given["drift_time"],
-        smooth=given["smooth"],
-        particles=given["particles"],
-        seed=given["seed"],
-    )
 
 
 def _summary(name: str, track: Track, result: PathScore | None) -> dict[str, object]:

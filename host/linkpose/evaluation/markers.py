@@ -27,7 +27,12 @@ from linkpose.sensors.measurements import Floats
 _METRES = {"m": 1.0, "meters": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, "mm": 0.001, "millimeters": 0.001}
 _FARTHEST_M = 1e6
 _LARGEST = 1e15  # of a coordinate in any unit; larger ones count as hidden
-_LONGEST_S = 60  # to read a C3D file: an hour of ten markers takes 1 s
+# Bounds of the process that reads a C3D file, for an empty file and for each byte. An hour of ten markers at 100 Hz
+# (60 MB) takes 2 s and 0.2 GB; starting takes up to 3 s on a busy machine. Twice of them: a damaged file costs twice.
+_LONGEST_S = 8.0
+_LONGEST_S_PER_BYTE = 2e-7
+_MOST_BYTES = 400_000_000
+_MOST_BYTES_PER_BYTE = 10
 _LONGEST_REASON = 200
 _HEAD_LINES = 5  # of a TRC file, before its frames
 
@@ -52,9 +57,9 @@ def read_c3d(path: Path, up: str | None) -> Table:
     except ImportError as error:
         raise MissingLibrary("ezc3d", path) from error
     try:
-        check_sizes(read_bytes(path))
-        positions, names, rate_hz, unit, screen, first = _read_in_child(path)
-    except (Damaged, subprocess.TimeoutExpired) as error:
+        check_sizes(data := read_bytes(path))
+        positions, names, rate_hz, unit, screen, first = _read_in_child(path, len(data))
+    except Damaged as error:
         raise FileFormatError(path, f"{path} is damaged or no C3D file: {error}; export the take again") from error
     positions[~(np.abs(positions) < _LARGEST)] = np.nan
     if not 0 < rate_hz < _FARTHEST_M:
@@ -64,11 +69,18 @@ def read_c3d(path: Path, up: str | None) -> Table:
     return _reference(path, time_s, names, positions, unit, axis)
 
 
-# ezc3d crashes on some damaged files. A process of its own crashes alone.
+# On some damaged files, ezc3d crashes, needs minutes, or takes gigabytes: it has a process of its own with bounds.
 _CHILD = """
 import json, sys
 import ezc3d
 import numpy
+try:
+    import resource
+    pages = int(open("/proc/self/statm").read().split()[0])
+    limit = pages * resource.getpagesize() + int(sys.argv[3])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
+except (ImportError, OSError):
+    pass  # not Linux: the time alone is bounded
 file = ezc3d.c3d(sys.argv[1])
 points = file["parameters"]["POINT"]
 facts = [
@@ -83,18 +95,26 @@ numpy.savez(sys.argv[2], positions=positions, facts=json.dumps(facts))
 """
 
 
-def _read_in_child(path: Path) -> tuple[Floats, list[str], float, str, str, int]:
-    """Positions (N, markers, 3), names, rate (Hz), unit, vertical axis of the screen, and number of the first frame.
+def _read_in_child(path: Path, size: int) -> tuple[Floats, list[str], float, str, str, int]:
+    """Positions (N, markers, 3), names, rate (Hz), unit, vertical axis of the screen, and number of the first frame,
+    of a file of `size` bytes.
 
-    Raises Damaged where ezc3d cannot read the file.
+    Raises Damaged where ezc3d cannot read the file within the bounds.
     """
+    most_bytes = _MOST_BYTES + _MOST_BYTES_PER_BYTE * size
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "take.npz")
-        child = [sys.executable, "-c", _CHILD, str(path.resolve()), str(out)]
-        done = subprocess.run(child, capture_output=True, text=True, errors="replace", timeout=_LONGEST_S)
+        child = [sys.executable, "-c", _CHILD, str(path.resolve()), str(out), str(most_bytes)]
+        longest_s = _LONGEST_S + _LONGEST_S_PER_BYTE * size
+        try:
+            done = subprocess.run(child, capture_output=True, text=True, errors="replace", timeout=longest_s)
+        except subprocess.TimeoutExpired:
+            raise Damaged(f"ezc3d does not finish within {longest_s:.0f} s") from None
         if done.returncode:
-            last = (done.stderr.strip().splitlines() or ["ezc3d has crashed"])[-1]
-            raise Damaged(last[:_LONGEST_REASON] if done.returncode > 0 else "ezc3d has crashed")
+            last = (done.stderr.strip().splitlines() or [""])[-1]
+            if "MemoryError" in last or "bad_alloc" in last:
+                last = f"ezc3d needs more than {most_bytes / 1e6:.0f} MB for it"
+            raise Damaged(last[:_LONGEST_REASON] if last and done.returncode > 0 else "ezc3d has crashed")
         with np.load(out) as found:
             return found["positions"], *json.loads(str(found["facts"]))
 

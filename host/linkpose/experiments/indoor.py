@@ -19,8 +19,9 @@ from linkpose.localization.events import Log, Scan
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.linalg import Floats
-from linkpose.localization.localizer import localize
-from linkpose.localization.noise import NoiseModel, RangeNoise
+from linkpose.localization.localizer import estimate_track
+from linkpose.localization.noise import RangeNoise
+from linkpose.localization.options import NoiseModel
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score
 from linkpose.localization.ukf import Transform
@@ -44,7 +45,7 @@ def compare(seeds: int, progress: Progress = iter) -> list[Variant]:
         for variant in compared:
             if variant.others["unmapped"] == unmapped:
                 settings = _settings(variant, log, errors, run)
-                track = localize(log, variant.filter, settings, grid)
+                track = estimate_track(log, variant.filter, settings, grid)
                 variant.scores.append(score(track.time_s, track.position_m, track.heading_rad, run.truth))
     return compared
 
@@ -160,7 +161,7 @@ def drive(seed: int) -> DrawnDrive:
     log, paths = as_log(run.readings), {}
     for figure, (name, noise, rho) in FIGURES.items():
         variant = Variant(name, noise, rho, GATE, _others(rho, "unscented", UNMAPPED[-1]))
-        track = localize(log, name, _settings(variant, log, errors, run), grid)
+        track = estimate_track(log, name, _settings(variant, log, errors, run), grid)
         words = f"{name.upper()}, {noise} R" + (f", R and Q off-diagonal (ρ = {rho:g})" if rho else "")
         paths[figure] = path_of(name, words, track, run.truth, np.unwrap(run.pose[:, 2]))
     odometry = np.array([reading.odometry[:2] for reading in run.readings])

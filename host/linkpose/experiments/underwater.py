@@ -17,7 +17,7 @@ from linkpose.experiments.paths import ComparedPath, path_of
 from linkpose.experiments.variants import ClaimVerdict, Progress, Variant, verdict
 from linkpose.localization.kalman import FilterName
 from linkpose.localization.linalg import Floats
-from linkpose.localization.localizer import localize
+from linkpose.localization.localizer import estimate_track
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score
@@ -127,7 +127,7 @@ def _dive(case: Case, seed: int) -> None:
     run = simulate_underwater(seed, errors, DURATION_S, case.timing == "synchronous")
     case.counts.update(_counts(run))
     for variant, detection in zip(case.variants, case.detections, strict=True):
-        track = localize(run.log, variant.filter, _settings(errors, variant), None, BEACONS)
+        track = estimate_track(run.log, variant.filter, _settings(errors, variant), None, BEACONS)
         variant.scores.append(score(track.time_s, track.position_m, track.heading_rad, run.motion.truth))
         detection.add(run, track)
 
@@ -242,5 +242,5 @@ def dive(seed: int) -> Dive:
 def _estimated(seed: int, name: FilterName, words: str, correlated: bool, outliers: int) -> ComparedPath:
     errors = Case(TIMINGS[0], correlated, outliers).errors()
     run = simulate_underwater(seed, errors, DURATION_S)
-    track = localize(run.log, name, _settings(errors, Variant(name, "fixed", 0.0, GATE)), None, BEACONS)
+    track = estimate_track(run.log, name, _settings(errors, Variant(name, "fixed", 0.0, GATE)), None, BEACONS)
     return path_of(name, words, track, run.motion.truth, np.unwrap(run.motion.pose[:, 5]))

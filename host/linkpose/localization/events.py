@@ -209,7 +209,7 @@ def _read_row(path: Path, line: int, row: list[str], numbers: _Numbers) -> Event
 def beacon_name(cell: str) -> str:
     """One spelling for a beacon: 5, 05 and 5.0 are the same; any other name stays as it is."""
     name = cell.strip()
-    match = re.fullmatch(r"0*(\d+)(?:\.0*)?", name)
+    match = re.fullmatch(r"0*(0|[1-9]\d*)(?:\.0*)?", name)
     return match[1] if match else name
 
 

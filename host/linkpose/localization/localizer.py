@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ class Row(NamedTuple):
     covariance: Floats
 
 
-def localize(
+def estimate_track(
     log: Log,
     name: Method,
     settings: Settings,
@@ -110,9 +111,9 @@ def warm_up(names: Iterable[Method]) -> None:
     in_a_round_room: Log = [*at_one_place, Scan(0.2, np.ones(37), angles, (0.0, 0.0, 0.0), 5.0)]
     for name in names:
         if name in ("mcl", "scan-match"):
-            localize(in_a_round_room, name, Settings(), _round_room())
+            estimate_track(in_a_round_room, name, Settings(), _round_room())
         else:
-            localize(at_one_place, name, Settings())
+            estimate_track(at_one_place, name, Settings())
 
 
 def _round_room() -> GridMap:
@@ -212,19 +213,37 @@ class Localizer:
         return self._row()
 
     def use(self, settings: Settings) -> None:
-        """Continues with other noises; what is estimated stays the same."""
+        """Continues with other noises. Adds states for errors of the ranges that drift where there were none yet."""
+        has_drifts = bool(self.settings.drift_std_m)
         self.settings = self.sensors.settings = settings
         self.filter.noise_root = noise_root(settings, self.vehicle)
+        if settings.drift_std_m and not has_drifts:
+            self._add_drifts()
         self.filter.drifts = drifts_of(settings, self.filter.motion)
 
-    def track(self, rows: Sequence[Row]) -> Track:
-        """The path of all rows, with the counts so far, without the drifts of the ranges.
-
-        Raises LinkposeError for an estimate that is infinite.
+    def _add_drifts(self) -> None:
+        """Adds a state for the drifting error of each beacon's ranges. The pose so far has assumed that there is none,
+        so that it is off by as much.
         """
-        states = self.filter.motion.states
-        size = sum(not name.startswith(DRIFT) for name in states)  # drifts come last
-        state = np.array([row.state[:size] for row in rows])
+        before, beacons = self.filter, self.sensors.beacons
+        motion = before.motion.extended(tuple(map(drift_state, beacons)))
+        n, size = len(before.state), len(motion.states)
+        covariance = np.eye(size) * self.settings.drift_std_m**2
+        covariance[:n, :n] = before.covariance
+        covariance[[0, 1], [0, 1]] += self.settings.drift_std_m**2
+        state = np.concatenate((before.state, np.zeros(size - n)))
+        self.filter = replace(before, motion=motion, state=state, covariance=covariance)
+        self.sensors = MeasurementBuilder(self.settings, motion, beacons, self.sensors)
+        self.relocator = Relocator(motion, self.sensors)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the states in a row: all but the drifts of the ranges, which come last."""
+        return tuple(name for name in self.filter.motion.states if not name.startswith(DRIFT))
+
+    def track(self, rows: Sequence[Row]) -> Track:
+        """The path of all rows, with the counts so far. Raises LinkposeError for an estimate that is infinite."""
+        state = np.array([row.state for row in rows])
         time = np.array([row.time_s for row in rows])
         lost = np.flatnonzero(np.isinf(state).any(axis=1))
         if len(lost):
@@ -233,10 +252,10 @@ class Localizer:
                 "correct the odometry or velocity before it"
             )
         return Track(
-            states[:size],
+            self.states,
             time,
             state,
-            np.array([row.covariance[:size, :size] for row in rows]),
+            np.array([row.covariance for row in rows]),
             self.applied,
             self.rejected,
             frozenset(self.rejected_sightings),
@@ -246,15 +265,17 @@ class Localizer:
         )
 
     def _row(self) -> Row:
-        state, covariance = self.filter.state.copy(), self.filter.covariance.copy()
+        state, covariance = self.filter.state, self.filter.covariance
         if self.rivalry is not None:
-            covariance += self.rivalry
+            covariance = covariance + self.rivalry
         if not self.known:
-            state[:], covariance[:] = np.nan, np.nan
+            state, covariance = np.full_like(state, np.nan), np.full_like(covariance, np.nan)
         return self.finished(self.now, state, covariance)
 
     def finished(self, time_s: float, state: Floats, covariance: Floats) -> Row:
-        """The row with the errors of the map, which no measurement reduces."""
+        """The row with the errors that no measurement reduces, and without the states of the ranges' drifts."""
+        size = len(self.states)
+        state, covariance = state[:size].copy(), covariance[:size, :size].copy()
         if np.isnan(state).any():
             return Row(time_s, np.full_like(state, np.nan), np.full_like(covariance, np.nan))
         if not np.isfinite(state).all():

@@ -56,13 +56,16 @@ def _safe(beacon: str) -> str:
 class MeasurementBuilder:
     """Builds measurements for one motion model, with the constants that are estimated."""
 
-    def __init__(self, settings: Settings, motion: MotionModel, beacons: Beacons) -> None:
+    def __init__(
+        self, settings: Settings, motion: MotionModel, beacons: Beacons, before: MeasurementBuilder | None = None
+    ) -> None:
+        """`before` built the measurements so far, for a model with fewer states."""
         self.settings, self.beacons = settings, beacons
         self.states = motion.states
         self.height = self.states.index("z_m") if "z_m" in self.states else -1
-        self.last_range: dict[str, float] = {}
-        self.last_sighting_s: dict[str, float] = {}
-        self.last_independent_s: dict[str, float] = {}
+        self.last_range: dict[str, float] = before.last_range if before else {}
+        self.last_sighting_s: dict[str, float] = before.last_sighting_s if before else {}
+        self.last_independent_s: dict[str, float] = before.last_independent_s if before else {}
         self._columns = {
             beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
         }

@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
+from linkpose.localization.options import NoiseModel
 
-NoiseModel = Literal["fixed", "adaptive", "affine"]
 NEAREST = (
     0.01  # of the mean range: an adaptive variance takes no range for shorter, as a variance of 0 is no covariance
 )

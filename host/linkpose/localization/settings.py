@@ -16,7 +16,6 @@ CONSTANTS = {"scale": ("range_scale_error", "", 0.1), "bias": ("range_bias", "_m
 # with a lag-one correlation of 0.5 to 0.95 in the public log MRCLAM 7; radio ranges of Plaza 1 are independent.
 ERROR_TIME_S = {"range": 0.0, "bearing_range": 0.5}
 DRIFT = "range_drift"  # begins the name of a state with the drifting error of one beacon's ranges
-ESTIMATED = ("scale", "bias", "scale:each", "bias:each")
 
 
 @dataclass(frozen=True, slots=True)

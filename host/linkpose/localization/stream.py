@@ -12,9 +12,12 @@ from linkpose.errors import LinkposeError
 from linkpose.localization.events import NAMED, Event, Log, is_negative, stream_events
 from linkpose.localization.localizer import Localizer, Method, Row, check
 from linkpose.localization.measuring import default_constants
+from linkpose.localization.options import LocalizationOptions
+from linkpose.localization.output import header_line, row_line
 from linkpose.localization.plausibility import check_units
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons
+from linkpose.localization.track import Track
 from linkpose.localization.tuning import described, tune
 from linkpose.localization.vehicle import kinds_of
 from linkpose.presentation import counted
@@ -35,31 +38,37 @@ class Stream:
     def __init__(
         self,
         method: Method,
-        settings: Settings,
+        options: LocalizationOptions,
         beacons: Beacons,
-        free: tuple[str, ...],
-        constants: bool,
         report: Callable[[str], None],
     ) -> None:
-        """`free` names the noises that are estimated from the rows; with `constants`, the constants of the ranges that
-        the beacons determine are estimated too. `report` receives a line when other noises are in use.
-        """
+        """`report` receives a line when other noises are in use."""
         self.report = report
-        # States cannot be added to a filter under way: errors that drift have a correlation time only.
-        self.free = tuple(name for name in free if name != "drift")
-        self.method, self.settings, self.beacons = method, settings, beacons
-        self.constants = constants
+        self.method, self.options, self.beacons = method, options, beacons
+        self.settings = options.settings(options.estimate or ())
         self.run: Localizer | None = None
+        self.last: Row | None = None
         self.late = self.negative = 0
         self.is_cut = False
         self._rows: Log = []  # for the noises
         self._sightings = 0
         self._tuning: Future[Settings] | None = None
 
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states; empty until the head of the stream is complete."""
-        return self.run.filter.motion.states if self.run else ()
+    def csv_lines(self, lines: Iterable[str]) -> Iterator[str]:
+        """The header and a line for each row, as `rows` yields them."""
+        for row in self.rows(lines):
+            if self.last is None and self.run is not None:
+                yield header_line(self.method, self.run.states)
+            self.last = row
+            yield row_line(row)
+
+    def track(self) -> Track | None:
+        """The last row with the counts so far; None before the first. Raises NothingApplied."""
+        if self.run is None or self.last is None:
+            return None
+        track = self.run.track([self.last])
+        track.check_applied(ORIGIN, self.method)
+        return track
 
     def rows(self, lines: Iterable[str]) -> Iterator[Row]:
         """The estimate after each row, as soon as the head of the stream is read.
@@ -112,7 +121,7 @@ class Stream:
 
     def _start(self, head: Log) -> Localizer:
         kinds = kinds_of(head)
-        if self.constants and not self.settings.estimate and "bearing_range" not in kinds:
+        if self.options.estimate is None and "bearing_range" not in kinds:
             self.settings = replace(self.settings, estimate=default_constants(kinds, len(self.beacons)))
         check(head, self.method, self.settings, None, self.beacons, ORIGIN)
         return Localizer(head, self.method, self.settings, None, self.beacons)
@@ -127,8 +136,8 @@ class Stream:
         if event.kind not in NAMED:
             return
         self._sightings += 1
-        if self.free and self._sightings in TUNED_AFTER:
-            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self.free)
+        if self._sightings in TUNED_AFTER:
+            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self.options.free)
         elif self._tuning is not None and self._sightings in [int(USED_AFTER * after) for after in TUNED_AFTER]:
             tuned = self._tuning.result()
             run.use(tuned)

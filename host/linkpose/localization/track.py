@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from linkpose.errors import NothingApplied
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.linalg import Floats
 
@@ -32,6 +33,11 @@ class Track:
     widened: int
     relocated: int = 0
     consistency: Consistency = field(default_factory=Consistency)
+
+    def check_applied(self, origin: str, name: str) -> None:
+        """Raises NothingApplied where the filter applied no measurement, so that its path is dead reckoning."""
+        if self.applied == 0:
+            raise NothingApplied(origin, name, self.rejected)
 
     @property
     def position_m(self) -> Floats:

@@ -15,7 +15,8 @@ from linkpose.recording.delimited import Cells, DecimalMark, has_rows, last_comm
 from linkpose.recording.numbers import parse_rows
 from linkpose.sensors.measurements import Floats
 
-_PLAIN_HEADER = re.compile(rb"[^\";\t]*[A-Za-z_][^\";\t]*")
+_OF_OTHERS = re.compile(rb"[\";\t]")  # in a header that another program wrote
+_LETTER = re.compile(rb"[A-Za-z_]")
 
 
 class Part(NamedTuple):
@@ -85,7 +86,7 @@ class TextTable:
         header_end = data.find(b"\n", offset)
         header = data[offset:header_end] if header_end >= 0 else b""
         names = [name.strip() for name in header.decode("utf-8", "replace").split(",")]
-        if not _PLAIN_HEADER.fullmatch(header) or len(set(names)) < len(names) or "" in names:
+        if _OF_OTHERS.search(header) or not _LETTER.search(header) or len(set(names)) < len(names) or "" in names:
             return None
         self.names, self._before = names, text_lines(data[:header_end])
         part = self._part_of_linkpose(Chunk(data[header_end + 1 :], lines_before + 2, chunk.is_last, chunk.end))

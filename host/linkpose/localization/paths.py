@@ -1,0 +1,242 @@
+"""Localisation from Python: a log and a map or beacons in, paths out. `linkpose localize` is its first client."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast, get_args
+
+from linkpose.errors import InvalidValue
+from linkpose.localization.events import Event, Log, LogFile, beacon_name, in_order
+from linkpose.localization.grid import GridMap
+from linkpose.localization.kalman import CONSTANT_VELOCITY
+from linkpose.localization.linalg import Floats
+from linkpose.localization.localizer import Method, check, estimate_track, most_at_once
+from linkpose.localization.logs import read_log
+from linkpose.localization.map_check import check_map
+from linkpose.localization.maps import load_map
+from linkpose.localization.measuring import default_constants
+from linkpose.localization.odometry import with_mice_odometry
+from linkpose.localization.options import LocalizationOptions
+from linkpose.localization.output import table_of, write_tracks
+from linkpose.localization.plausibility import check_units
+from linkpose.localization.settings import Settings
+from linkpose.localization.tables import Beacons, PathScore, Truth, read_beacons, read_truth, score_track
+from linkpose.localization.track import Track
+from linkpose.localization.tuning import described, tune
+from linkpose.localization.vehicle import kinds_of, vehicle_of
+from linkpose.presentation import counted
+from linkpose.recording.table import Table
+
+if TYPE_CHECKING:
+    import pandas
+
+PathName = str | PathLike[str]
+Places = Mapping[str, Sequence[float]]
+IN_MEMORY = Path("the log")  # names a log that was not read from a file
+
+
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """What `localize` returns: the path of each filter, a row for each instant with a measurement.
+
+    `paths["ekf_x_m"]` is a column of the file that `save` writes, (N,) float64; NaN while the pose is not known.
+    `paths.ekf` is the filter's `Track`, with `position_m`, `heading_rad`, `std` and `covariance` as arrays.
+    """
+
+    tracks: dict[str, Track]  # by name of the filter
+    log: Path  # the log's file
+    remarks: tuple[str, ...]  # what was changed in the log, assumed, and estimated from it; one sentence each
+    settings: Settings  # of the first filter
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Names of the filters that ran."""
+        return tuple(self.tracks)
+
+    @property
+    def table(self) -> Table:
+        """All columns with the names of the file that `save` writes."""
+        return table_of(self.tracks, self.log)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """time_s, then <filter>_<state>_<unit>, standard deviations, and covariances of x, y and heading."""
+        return tuple(self.table.columns)
+
+    @property
+    def time_s(self) -> Floats:
+        """(N,) time of each row, s."""
+        return next(iter(self.tracks.values())).time_s
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def __getitem__(self, column: str) -> Floats:
+        columns = self.table.columns
+        if column not in columns:
+            raise KeyError(f"no column {column}; there are {', '.join(columns)}")
+        return columns[column]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __getattr__(self, name: str) -> Track:
+        for filter_name, track in self.tracks.items():
+            if filter_name.replace("-", "_") == name:
+                return track
+        raise AttributeError(f"no filter {name}; there are {', '.join(self.tracks)}")
+
+    def score(self, truth: Truth | PathName) -> dict[str, PathScore]:
+        """The errors of each filter's path against a true path or its file (time_s,x_m,y_m[,z_m][,heading_rad]).
+
+        Raises LinkposeError where they do not meet in time.
+        """
+        path = truth if isinstance(truth, Truth) else read_truth(Path(truth))
+        return {name: score_track(track, path) for name, track in self.tracks.items()}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A pandas.DataFrame with the same columns. Raises ImportError if pandas is not installed."""
+        import pandas
+
+        return pandas.DataFrame(self.table.columns)
+
+    def save(self, path: PathName, *, force: bool = False) -> None:
+        """Writes an estimate CSV, as `linkpose localize -o` does. Raises FileExists (unless `force`), CannotWrite."""
+        write_tracks(Path(path), self.tracks, self.log, force)
+
+
+def localize(
+    log: Log | PathName,
+    *,
+    map: GridMap | PathName | None = None,
+    beacons: Places | PathName | None = None,
+    odometry: PathName | None = None,
+    filters: Sequence[Method] = (),
+    **options: Any,
+) -> Paths:
+    """Estimates the path of a robot from a log of odometry and measurements, and a map or beacons.
+
+    Args:
+        log: a CARMEN log, a CSV (`time_s,kind,a,b,c`), or a list of `Event` and `Scan` in order of time.
+        map: a map_server YAML file or a `GridMap`, for a log with laser scans.
+        beacons: a file `id,x_m,y_m[,z_m]`, or id -> x, y[, z] (m).
+        odometry: an estimate of the mice on the log's clock; replaces the log's odometry.
+        filters: "scan-match", "ekf", "ukf", "mcl". Default: scan-match for a log with laser scans, ekf for others.
+        options: the attributes of `LocalizationOptions`, for example `smooth=True` or `start=(1.0, 2.0, 0.0)`.
+
+    Raises:
+        MissingMap, MissingBeacons, MissingStart, NeedsScans, NothingToEstimate, NothingApplied, InvalidValue, FileError
+        and other kinds of LinkposeError.
+    """
+    return prepare(log, map, beacons, odometry, filters, LocalizationOptions(**options)).run()
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedLog:
+    """A log with all that its localisation needs, read and checked."""
+
+    log: Log
+    origin: Path
+    grid: GridMap | None
+    beacons: Beacons
+    settings: dict[Method, Settings]  # of each filter
+    free: tuple[str, ...]  # noises to estimate from the log
+    remarks: tuple[str, ...]
+
+    @property
+    def estimates_noises(self) -> bool:
+        """Whether noises are estimated from the log: with beacons, unless the log holds laser scans."""
+        return bool(self.beacons) and "scan" not in kinds_of(self.log)
+
+    def run(self) -> Paths:
+        """Runs the filters one after the other. Raises NothingApplied where one could not use any measurement."""
+        settings, remarks = self.settings, self.remarks
+        if self.estimates_noises:
+            first = next(iter(settings.values()))
+            tuned = tune(self.log, first, self.beacons, self.free)
+            if tuned is not first:
+                settings = {name: replace(tuned, start=own.start) for name, own in settings.items()}
+                remarks += (f"noises estimated from the log: {described(tuned, self.log)}",)
+        tracks: dict[str, Track] = {}
+        for method, chosen in settings.items():
+            track = estimate_track(self.log, method, chosen, self.grid, self.beacons, str(self.origin))
+            if method == "scan-match" and self.grid is not None:
+                share = track.applied / max(track.applied + track.rejected, 1)
+                remarks += tuple(filter(None, [check_map(self.log, self.grid, share, str(self.origin))]))
+            track.check_applied(str(self.origin), method)
+            tracks[method] = track
+        return Paths(tracks, self.origin, remarks, next(iter(settings.values())))
+
+
+def prepare(
+    log: Log | PathName,
+    grid: GridMap | PathName | None,
+    beacons: Places | PathName | None,
+    odometry: PathName | None,
+    filters: Sequence[Method],
+    options: LocalizationOptions,
+) -> PreparedLog:
+    """Reads and checks what `localize` takes. Raises LinkposeError where the parts do not fit each other."""
+    grid = load_map(Path(grid)) if isinstance(grid, str | PathLike) else grid
+    places = _places(beacons)
+    read = _events(log)
+    origin = Path(log) if isinstance(log, str | PathLike) else IN_MEMORY
+    events, remarks = read.events, list(read.remarks)
+    if odometry is not None:
+        events = with_mice_odometry(events, Path(odometry))
+    kinds = kinds_of(events)
+    methods = _methods(filters, "scan-match" if "scan" in kinds else "ekf")
+    constants = options.estimate
+    if constants is None:
+        ranged = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
+        constants = default_constants(kinds, len(ranged))
+        if constants:
+            remarks.append("scale error and bias of the ranges are estimated, too")
+    # Odometry's own frame is the map's in a simulation only: scan-match checks the whole map instead.
+    settings = {
+        method: options.settings(constants, None if method == "scan-match" else read.start) for method in methods
+    }
+    if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
+        check_units(events, places, str(origin))
+    for method, chosen in settings.items():
+        check(events, method, chosen, grid, places, str(origin))
+    if options.correlation and most_at_once(events) == 1:
+        remarks.append("no two ranges of this log are of one instant, so their correlation changes nothing")
+    if vehicle_of(kinds) is CONSTANT_VELOCITY:
+        remarks.append("the log has no odometry: a constant-velocity model is used, at the mean height of the beacons")
+    return PreparedLog(events, origin, grid, places, settings, options.free, tuple(remarks))
+
+
+def _places(beacons: Places | PathName | None) -> Beacons:
+    """Beacons as name -> (x, y, z) in m. Raises InvalidValue, and LinkposeError for a file."""
+    if beacons is None:
+        return {}
+    if isinstance(beacons, str | PathLike):
+        return read_beacons(Path(beacons))
+    found: Beacons = {}
+    for name, place in beacons.items():
+        values = [float(value) for value in place]
+        if len(values) not in (2, 3):
+            raise InvalidValue("beacons", f"has {len(values)} coordinates for {name}; give x, y or x, y, z (m)")
+        found[beacon_name(str(name))] = (values[0], values[1], values[2] if len(values) == 3 else 0.0)
+    return found
+
+
+def _events(log: Log | PathName) -> LogFile:
+    """The log, read from its file or sorted."""
+    if isinstance(log, str | PathLike):
+        return read_log(Path(log))
+    events, moved = in_order(list(log))
+    remarks = (f"{counted(moved, 'event')} moved into the order of time",) if moved else ()
+    return LogFile(events, None, remarks)
+
+
+def _methods(names: Sequence[str], default: Method) -> list[Method]:
+    """The filters, each once. Raises InvalidValue."""
+    for name in names:
+        if name not in get_args(Method):
+            raise InvalidValue("filters", f"has {name!r}, which is none of {', '.join(get_args(Method))}")
+    return list(dict.fromkeys(cast("Sequence[Method]", names))) or [default]
