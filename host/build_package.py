@@ -48,9 +48,9 @@ LIMIT_S = 900.0  # for a compiler that hangs; 15 times the usual time
 
 
 def get_requires_for_build_wheel(config_settings: dict[str, object] | None = None) -> list[str]:
-    """The wheel's machine code requires numba at build time; an sdist and an editable installation do not."""
+    """The wheel's machine code requires numba and what the compiled modules import; an sdist requires neither."""
     others: list[str] = build_meta.get_requires_for_build_wheel(config_settings)
-    return others + (["numba>=0.60"] if any(_groups()) else [])
+    return others + (["numba>=0.60", "cobs>=1.2"] if any(_groups()) else [])
 
 
 class BuildPackage(build_py):  # type: ignore[misc]  # setuptools' class, seen as Any
@@ -99,9 +99,15 @@ class BuildWheel(bdist_wheel):  # type: ignore[misc]
 
 
 def _groups() -> list[tuple[str, ...]]:
-    """GROUPS, or those of their names that LINKPOSE_MACHINE_CODE lists."""
+    """GROUPS, or those of their names that LINKPOSE_MACHINE_CODE lists. Raises SystemExit for another name."""
     chosen = os.environ.get("LINKPOSE_MACHINE_CODE", "")
-    return [tuple(name for name in group if not chosen or name in chosen.split(",")) for group in GROUPS]
+    if chosen in ("", "no"):
+        return [] if chosen else list(GROUPS)
+    names = [name.strip() for name in chosen.split(",")]
+    known = [name for group in GROUPS for name in group]
+    if unknown := [name for name in names if name not in known]:
+        sys.exit(f"LINKPOSE_MACHINE_CODE names {unknown[0]!r}; set it to `no` or to some of {','.join(known)}")
+    return [tuple(name for name in group if name in names) for group in GROUPS]
 
 
 def _has_machine_code() -> bool:

@@ -15,7 +15,17 @@ from scipy.linalg import expm
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._records import record_of
-from linkpose.filters.inertial import free_velocity, gravity, joint_velocity, propagate, report, rest, update
+from linkpose.filters.inertial import (
+    free_velocity,
+    gravity,
+    hypotheses,
+    joint_velocity,
+    process,
+    propagate,
+    report,
+    rest,
+    update,
+)
 from linkpose.filters.inertial.hypotheses import DATA_SHEET
 from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, MG, PSI, SIZE, D, V, Z, fresh_state
 from linkpose.filters.joint_inertial import InertialParameters
@@ -271,6 +281,25 @@ def check_the_alignment_to_gravity(rng):
     np.testing.assert_allclose(s.covariance[Z:V, Z:V], expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[Z:V, BG:], lean @ p[:, BG:], rtol=0, atol=1e-9)
     np.testing.assert_allclose(s.covariance[V:BG, V:BG], 0.5 * np.eye(3), rtol=0, atol=1e-9)
+
+
+def check_the_level_of_the_sensor_errors(rng):
+    """Errors drawn as their prior says have a level of 1 in the mean, whatever share of them the motion resolves."""
+    _, s = random_state(rng)
+    prior, share = s.prior[BA:D], rng.uniform(0.3, 1.0, D - BA)
+    s.covariance[range(BA, D), range(BA, D)] = (1 - share) * prior
+    levels, row = [], empty_row()
+    for _ in range(400):
+        s.nominal[BA:D] = np.sqrt(share * prior) * rng.standard_normal(D - BA)
+        process._judge_parameters(s)
+        row.distance, row.resolved = s.distance, s.resolved
+        levels.append(hypotheses._level(row, 0.0))
+    np.testing.assert_allclose(s.resolved, share.sum(), rtol=1e-9)
+    assert abs(np.mean(levels) - 1) < 0.1
+    s.nominal[BA:D] = 0
+    process._judge_parameters(s)
+    row.distance, row.resolved = s.distance, s.resolved
+    assert hypotheses._level(row, 0.0) == 1 / (1 + s.resolved)
 
 
 def empty_row():

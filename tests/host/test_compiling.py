@@ -23,6 +23,13 @@ from linkpose.sensors.rig import Rig
 estimate = baro.BaroFilter(Rig().with_j2s((0.0, 0.0, 1.5))).process(filters._two_samples_at_rest())
 print(round(estimate[0, 0] * 9.8 / 9.8, 9), sum(baro._process.stats.cache_hits.values()))
 """
+# A compiled function that takes a fifth of the time to compile.
+TEXT = """
+import numpy as np
+from linkpose.recording import fixedpoint
+text = fixedpoint.format_rows(np.array([[1.25]]), np.array([2]))
+print(text.decode().strip(), sum(fixedpoint._format.stats.cache_hits.values()))
+"""
 
 
 @pytest.fixture
@@ -128,7 +135,7 @@ def test_where_nothing_can_be_written_the_steps_run_all_the_same(package, tmp_pa
     (package / "__pycache__").touch()
     places = dict.fromkeys(("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "LOCALAPPDATA", "USERPROFILE"), nowhere)
     before = set(tmp_path.rglob("*"))
-    assert run(HEIGHT, package.parent, **places) == "1.5 0"
+    assert run(TEXT, package.parent, **places) == "1.25 0"
     assert set(tmp_path.rglob("*")) == before
 
 
@@ -161,17 +168,16 @@ def test_the_code_is_kept_in_the_users_cache(platform, variables, place, package
     assert folder is not None and folder.parent == tmp_path / place / "linkpose"
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip"])
-@pytest.mark.parametrize("ending", [".nbi", ".nbc"])
+@pytest.mark.parametrize(("damage", "ending"), [("cut", ".nbi"), ("flip", ".nbc")])
 def test_a_damaged_file_is_compiled_and_stored_anew(ending, damage, package, tmp_path):
     host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
-    run(HEIGHT, host, **place)
+    run(TEXT, host, **place)
     for path in (tmp_path / "cache").rglob(f"*{ending}"):
         content = bytearray(path.read_bytes())
         content[len(content) // 2] ^= 4
         path.write_bytes(content if damage == "flip" else content[: len(content) // 3])
-    assert run(HEIGHT, host, **place) == "1.5 0"
-    assert run(HEIGHT, host, **place) == "1.5 1"
+    assert run(TEXT, host, **place) == "1.25 0"
+    assert run(TEXT, host, **place) == "1.25 1"
 
 
 def test_code_of_other_arguments_is_not_taken(tmp_path):
@@ -203,7 +209,7 @@ def test_a_full_disk_costs_no_more_than_the_compiling(tmp_path):
         "    return real(path, mode, *more, **others)\n"
         "builtins.open = fake\n"
     )
-    assert run(full + HEIGHT, HOST, NUMBA_CACHE_DIR=tmp_path) == "1.5 0"
+    assert run(full + TEXT, HOST, NUMBA_CACHE_DIR=tmp_path) == "1.25 0"
 
 
 def test_other_users_of_the_compiler_keep_their_place():
@@ -214,16 +220,16 @@ def test_other_users_of_the_compiler_keep_their_place():
 @pytest.mark.skipif(not hasattr(os, "geteuid"), reason="POSIX file modes")
 def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, tmp_path):
     host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
-    run(HEIGHT, host, **place)
+    run(TEXT, host, **place)
     files = list((tmp_path / "cache").rglob("*.nb?"))
     for path in files:
         path.chmod(0o666)
-    assert run(HEIGHT, host, **place) == "1.5 0"
-    assert run(HEIGHT, host, **place) == "1.5 1"
+    assert run(TEXT, host, **place) == "1.25 0"
+    assert run(TEXT, host, **place) == "1.25 1"
     folder = next((tmp_path / "cache" / "linkpose").iterdir())
     folder.chmod(0o777)
     elsewhere = {**place, "XDG_CACHE_HOME": tmp_path / "mine"}
-    assert run(HEIGHT, host, **elsewhere) == "1.5 0"
+    assert run(TEXT, host, **elsewhere) == "1.25 0"
     assert list((tmp_path / "mine").rglob("*.nbc"))
 
 

@@ -93,11 +93,11 @@ def within_2sigma(f, block, truth, rows=slice(None)):
 
 @pytest.mark.parametrize("errors", ["calibrated", "datasheet"])
 def test_every_sigma_is_true(errors):
-    """Tests 1 to 3, two seeds; tests/bench/sigma.py has twenty."""
+    """Tests 1 to 3, two seeds; tests/bench/sigma.py has twenty. The error of a run is nearly constant: few are out."""
     shares = []
     for test, seed in itertools.product((1, 2, 3), range(2)):
         shares.append(within_2sigma(JointInertialFilter(Rig().with_j2s(PAPER_J2S_M)), *recorded(test, seed, errors)))
-    assert np.min(shares) > 0.8 and np.mean(shares) > 0.93
+    assert np.min(shares) > 0.7 and 0.93 < np.mean(shares) < 0.985
 
 
 def test_sigma_at_rest_does_not_assume_a_calibration():

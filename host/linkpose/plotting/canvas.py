@@ -74,10 +74,16 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
     order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
     once = {label: handle for handle, label in order}
     if once:
+        labels = _by_rows(list(once), columns)
         axes.legend(
-            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False,
-            fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
+            [once[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+            frameon=False, fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
         )  # fmt: skip
+
+
+def _by_rows(labels: list[str], columns: int) -> list[str]:
+    """Labels in the order in which matplotlib, which fills a legend column by column, shows them row by row."""
+    return [label for column in range(columns) for label in labels[column::columns]]
 
 
 def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMATS) -> None:

@@ -39,12 +39,22 @@ def floor_level(s: Record, q: Record) -> float:
 
 
 @inner
+def misalignment_variance(s: Record, q: Record) -> float:
+    """Variance (rad²) of the relative rotation about one axis by constant errors of both sensors.
+
+    The level falls for as long as innovations are smaller than those of data-sheet sensors, so that a level below 1 is
+    an upper bound: the standard deviation, not the variance, follows it.
+    """
+    return float(2 * (min(s.level, 1.0) * q.misalignment_rad) ** 2)
+
+
+@inner
 def follow_innovation(s: Record, part: int, row: int, innovation: float, variance: float, h: float, q: Record) -> None:
     """Component `row` of an innovation of the joint (part 0) or of a hinge's axis (1), and its variance."""
     mean = s.moving_mean[part, row]
     mean += min(h / q.moving_mean_s, 1.0) * (innovation / math.sqrt(variance) - mean)
     s.moving_mean[part, row] = mean
-    if _turns(s):
+    if _turns(s) and s.rotation_std < q.level_std_rad:
         square = min(mean * mean * 2 * q.moving_mean_s / h, _MOST_SQUARE)
         s.moving_square[part] += min(h / q.level_s, 1.0) / 3 * (square - s.moving_square[part])
 
@@ -65,6 +75,6 @@ def follow_level(s: Record, h: float, q: Record) -> None:
         return
     axis = s.moving_square[1] / q.level_square * q.least_play_rad**2 / max(s.play_square, q.least_play_rad**2)
     ratio = min(max(s.moving_square[0] / q.level_square, axis), q.level_most_ratio)
-    if ratio > 1.0 or s.rotation_std < q.level_std_rad:
+    if s.rotation_std < q.level_std_rad:
         most = q.most_level if axis > 1.0 else max(s.level, 1.0)
         s.level = min(max(s.level * math.exp(h * q.level_rate * (ratio - 1.0)), q.least_level), most)

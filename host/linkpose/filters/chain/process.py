@@ -18,7 +18,7 @@ from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.angles import report_angles, set_frame
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
-from linkpose.filters.chain.level import begin_level, follow_level
+from linkpose.filters.chain.level import begin_level, follow_level, misalignment_variance
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
@@ -235,12 +235,13 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
         if s.has_axis > 0.0:
             update_stop(s, size, hinge_angle(s), q)
             apply_correction(s, size, hinge, base)
-        s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s))
+        first_and_now = 2 * misalignment_variance(s, q)
+        s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s) + first_and_now)
     if bank.spread:
         add_linearization_errors(s, hinge, h, q)
     follow_level(s, h, q)
     s.log_likelihood += q.tempering * likelihood
-    p, total = s.covariance, 0.0
+    p, total = s.covariance, 3 * misalignment_variance(s, q)
     for i in range(3):
         total += p[i, i] + p[OF_SENSOR + i, OF_SENSOR + i] - 2 * p[i, OF_SENSOR + i]
     s.rotation_std = math.sqrt(max(total, 0.0))
@@ -302,7 +303,7 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     for i in range(3):
         out.joint[i] = out.joint_std[i] = math.nan
     if hinge < 0 and out.rotation_std < q.unknown_rad:
-        report_angles(bank, best, out)
+        report_angles(bank, best, misalignment_variance(best, q), out)
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         if base >= 0:
@@ -315,8 +316,8 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
 
 
 @inner
-def _report_covariance(s: Record, out: Record) -> None:
-    """Covariance of the relative rotation in sensor 1's axes: R_1ᵀ P_(θ2 − θ1) R_1."""
+def _report_covariance(s: Record, out: Record, q: Record) -> None:
+    """Covariance of the relative rotation in sensor 1's axes: R_1ᵀ P_(θ2 − θ1) R_1, and that of misalignment."""
     p, o = s.covariance, OF_SENSOR
     for j in range(3):
         for i in range(3):
@@ -328,6 +329,7 @@ def _report_covariance(s: Record, out: Record) -> None:
         rotate_back(s.rotation[0], s.m[i], s.b)
         for j in range(3):
             out.covariance[i, j] = s.b[j]
+        out.covariance[i, i] += misalignment_variance(s, q)
 
 
 @inner
@@ -399,7 +401,7 @@ def process(
             _step(bank, states, gyro, accel, h, q, noise)
             _remember(bank, time_s, gyro, accel, False)
         _report(bank, states, out, q)
-        _report_covariance(states[bank.best], out)
+        _report_covariance(states[bank.best], out, q)
 
 
 @inner

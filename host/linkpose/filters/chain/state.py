@@ -79,6 +79,10 @@ class ChainParameters(NamedTuple):
     # Reached by a hinge's axis only: errors of the accelerometer turn with the link, and the axis shows them.
     most_level: float = 10.0
     least_floor_level: float = 0.06  # the same for floors of the residual and of the play: (2.5 mm/s)², not 10 mm/s
+    # Cross-axis errors of one sensor (data sheet: ±2 %, of which 1/√3 is the standard deviation) about one axis: a
+    # constant rotation between its gyro and its accelerometer, which no motion averages out and P does not hold.
+    # Doubled, σ of data-sheet sensors is twice their error after 30 s.
+    misalignment_rad: float = 0.0115
     level_std_rad: float = 0.1  # σ of the rotation above which the level does not fall
     # Play of a hinge (rad): σ before it has been measured, and the least; time over which it is measured (s).
     first_play_rad: float = 0.01
@@ -87,7 +91,9 @@ class ChainParameters(NamedTuple):
     # Play is correlated: one update counts as 1/10 of an independent one at 25 Hz. [D]; at 1, the heading follows a
     # play of 3°.
     play_correlation: float = 10.0
-    axis_std_rad: float = 0.3  # of the first estimate of the axis, from the direction of the relative rate
+    # Of the first estimate of the axis, from the direction of the relative rate. At 0.3, σ of simulated hinges is too
+    # small for a second or two after it.
+    axis_std_rad: float = 0.5
     axis_rotation: float = 0.1  # ∫‖ω_rel‖² dt that the first estimate needs (rad²/s)
     axis_share: float = 0.8  # of ∫ω_rel ω_relᵀ in its largest eigenvalue, ditto
     axis_memory_s: float = 10.0

@@ -143,7 +143,7 @@ def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         s.nominal[i] = s.start_mean[i]
         for j in range(SIZE):
             s.covariance[i, j] = s.start_covariance[i, j]
-    s.distance = _distance(s)
+    _judge_parameters(s)
     s.rate_noise = s.force_noise = 0.0
     s.covariance[PSI, PSI] = heading_variance
     if s.unmoved:
@@ -324,7 +324,7 @@ def _update(
         update_free_velocity(s, h, q)
         if has_rate and s.no_force_s + s.clipped_s == 0.0:
             update_bias_from_steadiness(s, rate, h, imu, q)
-    s.distance = _distance(s)
+    _judge_parameters(s)
     return taken
 
 
@@ -370,12 +370,17 @@ def _steady_force(s: Record, force: Vec, imu: ImuCalibration, q: Record) -> Vec:
 
 
 @inner
-def _distance(s: Record) -> float:
-    """Half the χ² of the estimated sensor errors under the prior; the gyro bias is left out: it may be any."""
-    square = 0.0
+def _judge_parameters(s: Record) -> None:
+    """Half the χ² of the estimated sensor errors under the prior, and how many of them the motion has resolved.
+
+    A right prior has an expected χ² of the latter, Σ (1 − σ²/prior). The gyro bias is left out: it may be any.
+    """
+    square = resolved = 0.0
     for i in range(BA, D):
-        square += s.nominal[i] * s.nominal[i] / s.prior[i]
-    return 0.5 * square
+        inverse = 1.0 / s.prior[i]
+        square += s.nominal[i] * s.nominal[i] * inverse
+        resolved += max(1.0 - s.covariance[i, i] * inverse, 0.0)
+    s.distance, s.resolved = 0.5 * square, resolved
 
 
 @inner

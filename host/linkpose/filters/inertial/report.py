@@ -32,7 +32,7 @@ def report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     if s.span == 0.0:  # the covariance belongs to this sample
         _follow_covariance(s)
     _report_stds(s, tilt, north, west, row)
-    row.distance = s.distance
+    row.distance, row.resolved = s.distance, s.resolved
     bias = sub_covariance(s.covariance, BA)
     across = vec.trace(bias) - vec.quadratic(bias, tilt)
     row.unknown = 1.5 * across / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])

@@ -56,6 +56,7 @@ _FIELDS = np.dtype(
         ("decay_s", "f8"),  # time constant with which they return to the prior (s)
         ("undecayed_s", "f8"),  # time since they last did (s)
         ("distance", "f8"),  # half the χ² of the estimated sensor errors under the prior
+        ("resolved", "f8"),  # number of sensor errors that the motion has resolved: the expected χ² of a right prior
         ("largest_distance", "f8"),  # beyond it the state is impossible
         # Last readings.
         ("force", *_VECTOR),  # specific force at `time` (m/s²)
@@ -144,7 +145,8 @@ ESTIMATE = np.dtype(
         ("value", "f8", (6,)),  # height Zᵀd, x, y (m); roll, pitch, yaw (rad)
         ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
-        ("distance", "f8"),  # `distance` of the state
+        ("distance", "f8"),  # `distance` and `resolved` of the state
+        ("resolved", "f8"),
         ("unknown", "f8"),  # share of the accelerometer's bias variance across Z that the motion has not resolved
     ],
     align=True,
