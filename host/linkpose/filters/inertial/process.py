@@ -10,6 +10,7 @@ import math
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
@@ -17,14 +18,15 @@ from linkpose.filters._imu import (
     GRAVITY,
     LONGEST_BLIND_S,
     LONGEST_HOLD_S,
+    Floats,
     ImuCalibration,
-    ImuSamples,
     blind_for,
     is_bounded,
     read_accel,
     read_gyro,
     rotation_variance,
     unknown_accel,
+    unpacked,
 )
 from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
@@ -94,13 +96,17 @@ _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
 
 @compiled
 def process(
-    samples: ImuSamples, imu: ImuCalibration, parameters: Record, states: Record, out: Record
+    times_s: Floats, accels: Floats, gyros: Floats, all_flags: NDArray[np.uint32],
+    calibration: Floats, parameters: Record, states: Record, out: Record,
 ) -> None:  # fmt: skip
-    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate."""
-    s, q = states[0], parameters[0]
-    for i in range(len(samples.time_s)):
-        time_s, flags = samples.time_s[i], samples.flags[i]
-        accel, gyro = vec.row(samples.accel, i), vec.row(samples.gyro, i)
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
+
+    The first four arguments are the fields of `ImuSamples`; `calibration` (12,) is a packed `ImuCalibration`.
+    """
+    s, q, imu = states[0], parameters[0], unpacked(calibration)
+    for i in range(len(times_s)):
+        time_s, flags = times_s[i], all_flags[i]
+        accel, gyro = vec.row(accels, i), vec.row(gyros, i)
         dead = is_frozen(s.last_readings, time_s, accel, gyro)
         has_force, force = read_accel(accel, flags, imu)
         has_rate, rate = read_gyro(gyro, flags, imu)
