@@ -82,8 +82,8 @@ _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
 # How much stronger the motion after a gap may be than the one before: factors of the mean square acceleration and of
-# the variance of the velocity. Chosen on BROAD 01 with gaps: with 4 and 1, 89 % of the errors in the 3 s after a gap are
-# within 2σ, with 4 and 2, 98 %. Without the motion before, the errors on BROAD are 20 to 30 % larger.
+# the variance of the velocity. Chosen on BROAD 01 with gaps: with 4 and 1, 89 % of the errors in the 3 s after a gap
+# are within 2σ, with 4 and 2, 98 %. Without the motion before, the errors on BROAD are 20 to 30 % larger.
 _GAP_ACCEL_GROWTH, _GAP_SPEED_GROWTH = 4.0, 2.0
 _LEAST_GAP_ACCEL_M2_S4 = 1.0  # at least: a slow hand, as σ of the tilt 6°
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
