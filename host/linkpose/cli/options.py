@@ -68,6 +68,10 @@ class SecondsType(click.ParamType):  # type: ignore[type-arg]
         return seconds
 
 
+# Of numbers in options: squares of larger ones, and divisions by smaller ones, leave the range of numbers in a filter.
+LARGEST, SMALLEST = 1e9, 1e-9
+
+
 class FiniteRange(click.FloatRange):
     """A number within bounds. click's own range accepts NaN and infinity, and shows an open end as None."""
 
@@ -79,6 +83,10 @@ class FiniteRange(click.FloatRange):
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):
             self.fail(f"{value!r} is not finite", param, ctx)
+        if abs(number) > LARGEST:
+            self.fail(f"{value!r} is beyond {LARGEST:g}", param, ctx)
+        if self.min_open and self.min == 0 and number < SMALLEST:
+            self.fail(f"{value!r} is nearer to 0 than {SMALLEST:g}", param, ctx)
         return number
 
 
