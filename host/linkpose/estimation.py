@@ -281,7 +281,7 @@ class LiveEstimator:
 
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
         """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
-        self._filters = estimator.filters
+        self._estimator, self._filters = estimator, estimator.filters
         self._excluded = estimator.excluded
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
@@ -290,6 +290,9 @@ class LiveEstimator:
 
     def process(self, block: Measurements) -> LiveRows:
         """Takes the next block, which may be empty."""
+        if len(block) and not self._blocks and self._are_all_ready():
+            rows = self._estimator.process(block)
+            return LiveRows(rows, rows[-1], rows[:0])
         if len(block):
             self._blocks.append(block)
         has_caught_up = False
@@ -302,6 +305,9 @@ class LiveEstimator:
         complete = self._take_complete()
         last = self._rows(len(self._blocks) - 1, len(self._blocks)) if self._blocks else complete
         return LiveRows(complete, last[-1] if len(block) else np.empty(0), caught_up)
+
+    def _are_all_ready(self) -> bool:
+        return self._is_ready(TEXT) and all(self._is_ready(f.name) for f in self._filters)
 
     def finish(self) -> Floats:
         """The rows that were not complete yet. All filters must be ready, or are compiled now."""

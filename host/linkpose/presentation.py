@@ -88,6 +88,11 @@ class Exclusions:
                 now |= {mouse for mouse in range(1, 9) if int(mask) >> (mouse - 1) & 1}
         self._since_s = {mouse: self._since_s.get(mouse, time_s) for mouse in now}
 
+    @property
+    def names(self) -> set[str]:
+        """The sensors that are left out: mouse1, ..."""
+        return {f"mouse{mouse}" for mouse in self._since_s}
+
     def lines(self) -> list[str]:
         """One line for each mouse that is left out."""
         return [
@@ -95,19 +100,19 @@ class Exclusions:
         ]
 
 
-def fault_lines(health: Health) -> list[str]:
-    """One line for each sensor that does not work, with what to check."""
+def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
+    """One line for each sensor that does not work, with what to check, and for each mouse that is left out."""
     lines = []
     for name, of in health.sensors.items():
         state = of.get("state")
-        if state in ("ok", "absent", None):
+        if state in ("ok", "absent", None) or name in exclusions.names:
             continue
         cure = "check VCC, SDA=A4, SCL=A5" if not name.startswith("mouse") else "check its cable and pull-ups"
         if state in _STATES:
             lines.append(f"{name.upper()} is {state}")
         else:
             lines.append(f"{name.upper()} {state.upper()}: {cure}")
-    return lines
+    return lines + exclusions.lines()
 
 
 def working_sensors(health: Health) -> list[str]:

@@ -71,6 +71,9 @@ def test_faults_and_exclusions_are_never_cut(width: int) -> None:
     shown = screen.render(health(imu={"state": "silent"}), width, 6).plain
     assert "IMU SILENT" in shown
     assert "mouse 2 LEFT OUT since 5.1 s" in shown
+    mice = {f"mouse{port}": {"state": "left out" if port == 2 else "ok"} for port in (1, 2, 3)}
+    shown = screen.render(health(**mice), width, 20).plain
+    assert all(state in shown for state in ("MOUSE1 ok", "MOUSE2 left out", "MOUSE3 ok")) and "MOUSE2 is" not in shown
 
 
 def test_an_unknown_height_is_said_to_be_unknown() -> None:
@@ -107,7 +110,9 @@ def test_dots_are_where_they_should_be() -> None:
 
 
 def test_the_path_ends_at_the_robot() -> None:
-    lines = path_map([0.0, 1.0, 1.0], [0.0, 0.0, 1.0], 20, 10)
+    lines, scale = path_map([0.0, 1.0, 1.0], [0.0, 0.0, 1.0], 20, 10)
+    # 1 m is 39 dots of 40 high; a character is two dots wide, and 0.2 m are four of them.
+    assert scale == "├──┤ 0.2 m" and path_map([math.nan], [0.0], 20, 10) == ([" " * 20] * 10, "")
     assert lines[0].rstrip("\u2800").endswith("o")
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import codecs
 
 ERRORS = "linkpose"  # name of the error handler, for `errors=` of a stream
-_ALIKE = str.maketrans("−–—─└┤│▸·…σχλωαβκηπΔµ²³×√‖≤≥≈→«»“”’", "----`||>-.sxlwabknpDu23xV|<>~><>\"\"'") | {
+_ALIKE = str.maketrans("−–—─└├┤│▸·…σχλωαβκηπΔµ²³×√‖≤≥≈→«»“”’", "----`|||>-.sxlwabknpDu23xV|<>~><>\"\"'") | {
     ord("±"): "+/-", ord("°"): " deg",
 }  # fmt: skip
 _FIRST_BRAILLE, _LAST_BRAILLE = 0x2800, 0x28FF

@@ -57,7 +57,7 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
 }
 
 # Errors that are wrong usage: a name on the command line that does not exist.
-WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture)
+WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture, errors.NamedTwice)
 
 
 def _nearest_port(name: str) -> str:

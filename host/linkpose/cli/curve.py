@@ -86,11 +86,14 @@ def _scale(low: float, high: float, least: float, steps: int) -> tuple[float, fl
     return start * unit, step * unit, max(0, -place)
 
 
-def path_map(xs: Sequence[float], ys: Sequence[float], width: int, height: int) -> list[str]:
-    """A path seen from above as lines of text, x to the right and y upwards, at one scale; `o` is where it is now."""
+def path_map(xs: Sequence[float], ys: Sequence[float], width: int, height: int) -> tuple[list[str], str]:
+    """A path seen from above as lines of text, x to the right and y upwards, and the line with its scale.
+
+    x and y have one scale; `o` is where the robot is now.
+    """
     known = [(x, y) for x, y in zip(xs, ys, strict=True) if math.isfinite(x) and math.isfinite(y)]
     if not known:
-        return [" " * width] * height
+        return [" " * width] * height, ""
     canvas = Canvas(width, height)
     lows, highs = ([pick(axis) for axis in zip(*known, strict=True)] for pick in (min, max))
     # Metres a dot; the smallest picture is a metre wide, so that a robot at rest does not jitter over the screen.
@@ -106,4 +109,12 @@ def path_map(xs: Sequence[float], ys: Sequence[float], width: int, height: int) 
     if before is not None:
         column, row = min(before[0] // 2, width - 1), min(before[1] // 4, height - 1)
         lines[row] = lines[row][:column] + "o" + lines[row][column + 1 :]
-    return lines
+    return lines, _scale_bar(2 * scale, width)
+
+
+def _scale_bar(metres: float, width: int) -> str:
+    """A bar of a round length, at most a third of `width` characters; `metres` is the width of one of them."""
+    longest = metres * width / 3
+    decade = 10.0 ** math.floor(math.log10(longest))
+    length = max(factor * decade for factor in (1, 2, 5) if factor * decade <= longest)
+    return f"├{'─' * (round(length / metres) - 2)}┤ {length:g} m"

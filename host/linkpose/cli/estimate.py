@@ -186,7 +186,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     report_findings(estimator, console)
     if request.output:
         console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
-        options.show_next(console.is_quiet, f"plot {request.output}")
+        options.show_next(console.is_quiet, "plot", request.output)
 
 
 def _smooth(estimator: Estimator) -> None:

@@ -76,13 +76,13 @@ def command(
 
 def _show(found: Evaluation, quiet: bool) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
+    from linkpose.cli.rendering import show_table
     from linkpose.presentation import same_digits
     from linkpose.quantities import unit_text, words
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("filter", no_wrap=True)
     table.add_column("error of", no_wrap=True)
     for name in ("RMSE", "mean", "worst", "95 %", "NEES", "in ±2σ"):
@@ -98,7 +98,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
             table.add_row(title, f"{words(name)} ({unit})", *figures, *sigma)
             title = ""
-    Console().print(table)
+    show_table(table)
     if quiet:
         return
     for score in found.scores:

@@ -31,8 +31,9 @@ def report_running(estimator: Estimator, joint: Joint | None, console: Console) 
         names = ", ".join(name for name, why in left_out.items() if why == reason)
         console.detail(f"not running: {names}: {reason}")
     missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
-    if missing and any(REGISTRY[f.name].sensors for f in estimator.filters):
-        console.report(f"{missing[0]}: {left_out[missing[0]]}")
+    is_robot = any(REGISTRY[f.name].is_odometric for f in estimator.filters)  # J2S is nothing to a robot
+    if missing and not is_robot and any(REGISTRY[f.name].sensors for f in estimator.filters):
+        console.report(left_out[missing[0]])
     others = " (-v: why not others)" if left_out else ""
     console.report(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
 

@@ -122,9 +122,9 @@ class Screen:
 
     def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
         """(priority, [(line, style), …]) from top to bottom."""
-        faults = [(part, "bold red") for line in fault_lines(health) for part in textwrap.wrap(line, width)]
-        faults += [(part, "bold red") for line in self._exclusions.lines() for part in textwrap.wrap(line, width)]
-        sections = [(9, [(self._head(health, width), "bold")]), (_FAULTS, faults)]
+        found = fault_lines(health, self._exclusions)
+        faults = [(part, "bold red") for line in found for part in textwrap.wrap(line, width)]
+        sections = [(9, [(line, "bold") for line in self._head(health, width)]), (_FAULTS, faults)]
         chain = next((name for name in self._filters if joint_angle(self._row.get(name, {})) is not None), None)
         link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
         if chain is not None:
@@ -147,9 +147,9 @@ class Screen:
 
     def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         path = self._paths.get(name, ())
-        lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
+        lines, scale = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
         head = (_HEADLINE, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
-        return [head, (6, [(line, "") for line in lines]), (4, self._pose_table(name))]
+        return [head, (6, [(line, "") for line in lines]), (2, [(scale, "dim")]), (4, self._pose_table(name))]
 
     def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         """The joint's angles, both heights (narrow screens drop the last ones), and the curve of the first angle."""
@@ -163,17 +163,20 @@ class Screen:
         curve_below = _curve_sections(7, self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
         return [(_HEADLINE, [("   ".join(parts), "")]), *curve_below]
 
-    def _head(self, health: Health, width: int) -> str:
-        """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
-        sensors = " ".join(
-            f"{name.upper()} {of['state']}" for name, of in health.sensors.items() if of.get("state") != "absent"
-        )
+    def _head(self, health: Health, width: int) -> list[str]:
+        """Title, time, rate, losses and the state of the sensors.
+
+        Narrow screens drop the title, then rate and time; the state of a sensor is never cut.
+        """
+        states = [f"{name.upper()} {of['state']}" for name, of in health.sensors.items() if of.get("state") != "absent"]
+        sensors = " ".join(states)
         lost = f"{health.lost} lost"
         parts = [f"linkpose  {self._title}", f"{self._time_s:.1f} s", f"{health.rate_hz:.0f} Hz", lost, sensors]
         for slow in (parts[0], parts[2], parts[1]):  # the slowest to change goes first
             if len("  ".join(filter(None, parts))) > width:
                 parts.remove(slow)
-        return "  ".join(filter(None, parts))
+        line = "  ".join(filter(None, parts))
+        return [line] if len(line) <= width else _packed([lost, *states], width)
 
     def _headline(self, name: str, width: int) -> str:
         """Height, roll, pitch and yaw; narrow screens drop the last ones."""
@@ -211,7 +214,7 @@ class Screen:
         for name, values in rows:
             x, y = (aligned_length(*values[q]) for q in (quantities.X, quantities.Y))
             heading = values[quantities.HEADING][0]
-            angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
+            angle = signed_angle(math.degrees(heading)) if math.isfinite(heading) else "–"
             line = f"{x:>10} {y:>10} {angle:>9}"
             lines.append((f"{'▸' if name == shown else ' '} {name:<16} {line}", "bold" if name == shown else ""))
         return lines

@@ -249,9 +249,9 @@ class Page:
             words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")
         if status.line:
             words.append(status.line)
-        faults = fault_lines(health) if health is not None else []
+        faults = fault_lines(health, self._exclusions) if health is not None else self._exclusions.lines()
         working = working_sensors(health) if health is not None else []
-        self._panel.draw_health(self._title, "   ".join(words), working, faults + self._exclusions.lines())
+        self._panel.draw_health(self._title, "   ".join(words), working, faults)
 
 
 def j2s_text(found: FoundJ2s) -> str:

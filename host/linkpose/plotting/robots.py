@@ -37,12 +37,15 @@ def path_panel(sources: Sources, scene: Surroundings | None) -> Callable[[Axes],
 
 
 def is_wide(sources: Sources, scene: Surroundings | None) -> bool:
-    """Whether a path, without a map, extends so much further along x than along y that a square would be empty."""
-    if scene is not None and scene.grid is not None:
+    """Whether path, map and beacons extend so much further along x than along y that a square would be empty."""
+    points = [np.column_stack([track.values[X], track.values[Y]]) for track in _with_path(sources)]
+    if scene is not None and points:
+        points.append(scene.corners_m())
+    known = [point[np.isfinite(point).all(axis=1)] for point in points]
+    if not any(map(len, known)):
         return False
-    tracks = _with_path(sources)
-    extents = [[np.ptp(v[np.isfinite(v)]) for v in (track.values[X], track.values[Y])] for track in tracks]
-    return bool(extents) and bool(max(e[0] for e in extents) > _WIDE_RATIO * max(e[1] for e in extents))
+    wide, high = np.ptp(np.vstack(known), axis=0)
+    return bool(wide > _WIDE_RATIO * high)
 
 
 def _with_path(sources: Sources) -> list[DrawnTrack]:
@@ -54,7 +57,7 @@ def time_panels(sources: Sources, scene: Surroundings | None = None) -> list[Tim
     found: list[TimePanel] = []
     shown = sources.tracks or sources.all
     if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
-        columns = 6 if is_wide(sources, scene) else 3
+        columns = 6 if is_wide(sources, scene) else 2
         if hides_best(sources, "position"):
             found.append((1.4, lambda axes: _position_errors(axes, sources, columns, best_only=True)))
         found.append((1.8, lambda axes: _position_errors(axes, sources, columns)))
