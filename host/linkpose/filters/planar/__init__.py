@@ -40,7 +40,7 @@ from linkpose.filters.planar.state import fresh_state as fresh_planar_state
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-__all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
+__all__ = ["FoundMouse", "GyroJumps", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
@@ -57,6 +57,15 @@ class FoundMouse:
     x_m: float
     y_m: float
     position_std_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class GyroJumps:
+    """Jumps of the gyro's bias that the mice or a rest have shown: how many, and the last one."""
+
+    count: int
+    last_rad_s: float
+    last_time_s: float
 
 
 class _PlanarFilter:
@@ -98,6 +107,12 @@ class _PlanarFilter:
     def distrusted(self) -> int:
         """Bit mask of the mice that are excluded now; bit 0 is mouse 1."""
         return int(self._mice_state[0].excluded)
+
+    @property
+    def gyro_jumps(self) -> GyroJumps:
+        """Jumps of the gyro's bias so far."""
+        state = self.state[0]
+        return GyroJumps(int(state.jumps), float(state.jump), float(state.jump_time))
 
     @property
     def found_mice(self) -> tuple[FoundMouse, ...]:

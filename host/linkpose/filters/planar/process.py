@@ -8,10 +8,11 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
-from linkpose.filters.mice.least_squares import ROUNDING, fit, squared_speed
+from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
-from linkpose.filters.mice.state import NOBODY, Record, Records
+from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
+from linkpose.filters.planar.gyro import agree, is_doubtful, watch_gyro
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
@@ -35,12 +36,17 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
+# Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
+# (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
+_ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# While the last turn is off by so many standard deviations, the mice are not calibrated. Doubled: positions of the mice
+# take up the scale of another floor.
+_OFF_Z = 3.0
 # The bias that the fault tests assume is this much less certain than the filter's (rad/s): slow drift of a gyro.
 _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
 # spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
 _SPOILT_Z = 2.0
-_REPAIR_SHARE = 0.3  # of the turn by which a wrong gyro's heading is corrected: σ of the correction
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -95,7 +101,7 @@ def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) 
 
 
 @inner
-def _watch_floor(state: Record, m: Record, p: Record) -> None:
+def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
     if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
@@ -105,37 +111,83 @@ def _watch_floor(state: Record, m: Record, p: Record) -> None:
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
-    if state.turn_square < _FLOOR_TURN:
+    _add_to_turn(state, turn, m.turn_rate, m.step)
+    by_scales = _variance_by_scales(state, m, mice)
+    state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
+    if state.turn_square < _FLOOR_TURN or is_doubtful(state):
         return
-    off = abs(state.turn_product / state.turn_square - 1.0)
-    if off <= _FLOOR_SHARE + _FLOOR_Z * math.sqrt(state.turn_variance) / state.turn_square:
+    off = state.turn_product / state.turn_square - 1.0
+    noise = math.sqrt(by_scales + state.turn_variance / state.turn_square**2)
+    if abs(off) <= _FLOOR_SHARE + _FLOOR_Z * noise:
+        return
+    latest, before = _off_of_turn(state), state.off_of_turn
+    if latest == 0.0:
+        latest, before = before, state.off_of_turn_before
+    if not (latest / off > 0.5 and before / off > 0.5):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
             state.covariance[a, b] += p.floor_scale**2
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
+    _correct_way(state, off)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    state.is_off = False
     state.floors += 1
 
 
 @inner
-def _turn_of_mice(m: Record, mice: Records) -> bool:
-    """Turn rate of the last step by the mice into `m.fit_turn`; False without one.
-
-    Where fewer than two mice are trusted, all count: mice that agree with each other are excluded by a wrong gyro too.
-    """
-    counting, judges = NOBODY, trusted(m)
-    if number(judges) < 2:
-        judges = m.sound
+def _variance_by_scales(state: Record, m: Record, mice: Records) -> float:
+    """Variance of the share by which the mice in use turn too much, by the uncertainty of their scales."""
+    centre, count = 0j, number(m.used)
     for i in range(m.count):
-        if judges >> i & 1 and mice[i].silent_s == 0.0:
-            counting |= 1 << i
-            mouse = mice[i]
-            mouse.sum = scaled(1.0 / m.step, mouse.moved)
-            mouse.weight = m.step * m.step / (ROUNDING * mouse.metres_per_count**2)
-    if number(counting) < 2 or counting != judges:
-        return False
-    return bool(fit(m, mice, counting, 0.0, 0j, 0.0, 0.0) > reading.NEAREST_M**2)
+        if m.used >> i & 1:
+            centre += scaled(1.0 / count, mice[i].arm)
+    total = spread = 0.0
+    for i in range(m.count):
+        if m.used >> i & 1:
+            own = square(mice[i].arm - centre)
+            spread += own
+            for k in range(m.count):
+                if m.used >> k & 1:
+                    other = square(mice[k].arm - centre)
+                    total += own * other * state.covariance[MICE + OF_MOUSE * i + SCALE, MICE + OF_MOUSE * k + SCALE]
+    return max(total, 0.0) / max(spread * spread, 1e-12)
+
+
+@inner
+def _off_of_turn(state: Record) -> float:
+    """Share by which the mice turn more than the gyro in the current turn; 0 while it is too short."""
+    if state.recent_square < _ONE_TURN:
+        return 0.0
+    off: float = state.recent_product / state.recent_square - 1.0
+    return off
+
+
+@inner
+def _add_to_turn(state: Record, by_gyro: float, by_mice: float, dt: float) -> None:
+    """Add a step to the current turn: rates of both (rad/s). Another direction, or going straight, ends it."""
+    if abs(by_gyro) < _TURN_END_RAD_S or by_gyro * state.turn_rate < 0.0:
+        off = _off_of_turn(state)
+        if off != 0.0:
+            state.off_of_turn, state.off_of_turn_before = off, state.off_of_turn
+        state.recent_square = state.recent_product = 0.0
+    state.turn_rate = by_gyro
+    state.recent_square += by_gyro * by_gyro * dt
+    state.recent_product += by_gyro * by_mice * dt
+
+
+@inner
+def _correct_way(state: Record, off: float) -> None:
+    """The mice count by the share `off` too much; probably since the start when this is the first floor found."""
+    x, y = state.at.x, state.at.y
+    if state.floors == 0:
+        state.at.x -= off * x
+        state.at.y -= off * y
+    state.covariance[X, X] += (off * x) ** 2
+    state.covariance[Y, Y] += (off * y) ** 2
+    state.covariance[X, Y] += off * off * x * y
+    state.covariance[Y, X] = state.covariance[X, Y]
 
 
 @inner
@@ -160,39 +212,6 @@ def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, floa
     placed = max(moved2, 0.0) / (count * max(arm2, 1e-6))
     by_scale = max(scale2 - scale * scale / count, 0.0) / pairs + placed
     return by_scale, max(angle2 - angle * angle / count, 0.0) / pairs + placed
-
-
-@inner
-def _watch_gyro(state: Record, m: Record, mice: Records) -> None:
-    """Repair the heading after a dead gyro, by the mice."""
-    if state.at_rest or m.missed > 0.0 or not m.step > 0.0 or m.disagree_s > 0.0:
-        return
-    if not _turn_of_mice(m, mice):
-        return
-    _watch_dead_gyro(state, m)
-
-
-@inner
-def _watch_dead_gyro(state: Record, m: Record) -> None:
-    """Add up what the mice turn beyond a gyro that repeats one value, and turn the heading by it once it is dead."""
-    if m.same_rates == 0:
-        state.dead_turn = 0.0
-    elif math.isfinite(m.rate):
-        state.dead_turn += (m.fit_turn - (m.rate - state.at.bias)) * m.step
-    elif state.dead_turn != 0.0:
-        _turn_heading(state, state.dead_turn)
-        state.dead_turn = 0.0
-        state.jumps += 1
-
-
-@inner
-def _turn_heading(state: Record, turn: float) -> None:
-    """Correct the heading by what a wrong gyro has turned it (rad), and widen the pose by what is not known of it."""
-    state.at.heading += turn
-    state.covariance[HEADING, HEADING] += (_REPAIR_SHARE * turn) ** 2
-    way2 = (state.at.vx**2 + state.at.vy**2) * turn * turn
-    state.covariance[X, X] += way2
-    state.covariance[Y, Y] += way2
 
 
 @inner
@@ -268,7 +287,7 @@ def _correct(
         return False
     before = complex(state.at.vx, state.at.vy)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, limit):
+    if not update(state, limit if is_patient else math.inf, 0.0 if is_doubtful(state) or state.is_off else limit):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -346,7 +365,7 @@ def _step(
     for i in range(m.count):
         is_silent = is_silent and (not judges >> i & 1 or mice[i].silent_s > 0.0)
     _restart_spoilt(state, m.excluded & ~before)
-    watch_rest(state, is_silent, m.rate, dt)
+    watch_rest(state, is_silent, m.rate, dt, sample.time)
     is_good = half == 0.0 or _advance(state, tangent, points, half)
     _move_on(state, q, dt)
     _collect(state, m, rig, sample, p)
@@ -355,10 +374,11 @@ def _step(
     if not is_good:
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
+        agree(state)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
-    _watch_floor(state, m, q)
-    _watch_gyro(state, m, mice)
+    _watch_floor(state, m, mice, q)
+    watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)
 
 
@@ -388,9 +408,10 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     if not state.at_rest and math.isfinite(m.interval):
         lag += 0.5 * m.interval
     by_scale, by_angle = _common_errors(state, m, mice)
-    out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2))
-    out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2))
-    out.heading_std = _std(state, HEADING, since, 0.0)
+    other = state.doubt.position - complex(at.x, at.y)
+    out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2 + other.real**2))
+    out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2))
+    out.heading_std = _std(state, HEADING, since, state.doubt.heading - at.heading)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
 

@@ -12,6 +12,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.mice.state import Record
+from linkpose.filters.planar.gyro import explains, take_other_pose
 from linkpose.filters.planar.measure import update
 from linkpose.filters.planar.state import BIAS, HEADING, QUEUE
 
@@ -21,49 +22,60 @@ _REST_S = 0.3
 # A rate that a silent robot's gyro shows for so long (s), constant within its noise, is a new bias: nobody turns a
 # lifted robot so steadily. Doubled: a bias that has jumped is found later.
 _NEW_BIAS_S = 2.0
-_LARGEST_RAD_S = 0.12  # a larger rate is a turn (7 °/s)
+_LARGEST_RAD_S = 0.35  # a larger rate is a turn: the data sheet's bias is within ±20 °/s
 _UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
+_DRIFTED_Z = 5.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
 _GUARD_Z = 5.0  # standard normal quantile of the guards
 # The gyro's noise may be three times the assumed one: the data sheet gives 0.05 °/s, real sensors reach 0.13 °/s.
 _NOISE_MARGIN = 9.0
 
 
 @inner
-def watch_rest(state: Record, is_silent: bool, rate: float, step: float) -> None:
+def watch_rest(state: Record, is_silent: bool, rate: float, step: float, time_s: float) -> None:
     """Take one reading into account: `is_silent` when no mouse counted, `rate` (rad/s) the gyro's, NaN without one."""
     state.since_rest_s += step
     if not is_silent:
         _end_rest(state)
         return
+    if state.at_rest and math.isfinite(rate) and _contradicts(state, rate):
+        _end_rest(state)
     state.rest_s += step
-    if state.at_rest:
-        state.since_rest_s = 0.0
     if math.isfinite(rate):
         state.block_s += step
         state.block_sum += rate
         state.block_squares += rate * rate
         state.block_count += 1
-        if state.block_s >= _BLOCK_S - 1e-9 and not _finish_block(state):
+        if state.block_s >= _BLOCK_S - 1e-9 and not _finish_block(state, time_s):
             _end_rest(state)
             return
     state.at_rest = state.rest_s >= _REST_S - 1e-9 and (state.queued > 0 or not math.isfinite(rate))
 
 
 @inner
+def _contradicts(state: Record, rate: float) -> bool:
+    """Whether one rate (rad/s) shows that the robot turns."""
+    limit2 = state.covariance[BIAS, BIAS] + _NOISE_MARGIN * state.gyro_variance
+    return bool((rate - state.at.bias) ** 2 > _GUARD_Z**2 * limit2)
+
+
+@inner
 def _end_rest(state: Record) -> None:
+    """The robot has begun to turn within the current block, in which the filter took it to stand still."""
+    if state.at_rest and state.block_count > 0:
+        state.at.heading += (state.block_sum / state.block_count - state.at.bias) * state.block_s
     state.rest_s = state.block_s = state.block_sum = state.block_squares = 0.0
     state.block_count = state.queued = 0
     state.at_rest = False
 
 
 @inner
-def _finish_block(state: Record) -> bool:
+def _finish_block(state: Record, time_s: float) -> bool:
     """Append the current block to the queue; False where the gyro contradicts a rest."""
     count = state.block_count
     mean = state.block_sum / count
     noise = _NOISE_MARGIN * state.gyro_variance / count
     limit = _GUARD_Z * math.sqrt(state.covariance[BIAS, BIAS] + noise)
-    if abs(mean - state.at.bias) > limit and not _is_new_bias(state, mean, noise):
+    if abs(mean - state.at.bias) > limit and not _is_new_bias(state, mean, noise, time_s):
         return False
     if state.queued:
         last = state.queue[state.queued - 1]
@@ -81,7 +93,7 @@ def _finish_block(state: Record) -> bool:
 
 
 @inner
-def _is_new_bias(state: Record, mean: float, noise: float) -> bool:
+def _is_new_bias(state: Record, mean: float, noise: float, time_s: float) -> bool:
     """Whether the rate that contradicts a rest has stayed the same for long: the bias has jumped."""
     is_same = abs(mean - state.strange) <= _GUARD_Z * math.sqrt(2.0 * noise)
     is_same = is_same and abs(mean - state.at.bias) < _LARGEST_RAD_S
@@ -92,13 +104,23 @@ def _is_new_bias(state: Record, mean: float, noise: float) -> bool:
         return False
     jump = mean - state.at.bias
     state.covariance[BIAS, BIAS] += jump * jump
-    # The robot has turned with the new bias since the rest began; nobody knows since when before.
-    state.at.heading -= jump * state.rest_s
+    if explains(state, jump):  # the pose by the mice has not turned with the new bias
+        take_other_pose(state)
+    else:
+        state.at.heading -= jump * state.rest_s
+    _widen_heading(state, jump)
+    state.strange_s = 0.0
+    state.jumps += 1
+    state.jump, state.jump_time = jump, time_s
+    return True
+
+
+@inner
+def _widen_heading(state: Record, jump: float) -> None:
+    """The bias has changed by `jump` (rad/s) at an unknown time since the last rest."""
     since = min(state.since_rest_s, _UNSEEN_S)
     state.covariance[HEADING, HEADING] += (jump * since) ** 2
-    state.strange_s = state.since_rest_s = 0.0
-    state.jumps += 1
-    return True
+    state.since_rest_s = 0.0
 
 
 @inner
@@ -109,11 +131,20 @@ def _use_oldest(state: Record) -> None:
     state.gyro_samples = min(known + more, 1000.0)
     state.gyro_variance = (known * state.gyro_variance + block.squares) / (known + more)
     state.rows = 1
-    state.residual[0] = block.mean - state.at.bias
-    state.innovation[0, 0] = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
+    off = state.residual[0] = block.mean - state.at.bias
+    variance = state.covariance[BIAS, BIAS] + state.gyro_variance / block.count
+    if off * off > _DRIFTED_Z**2 * variance:  # the bias has drifted by more than assumed
+        state.covariance[BIAS, BIAS] += off * off
+        if explains(state, off):
+            take_other_pose(state)
+            state.since_rest_s = _BLOCK_S
+        _widen_heading(state, off)
+        variance += off * off
+    state.innovation[0, 0] = variance
     for k in range(state.size):
         state.cross[0, k] = state.covariance[BIAS, k]
     update(state, math.inf, math.inf)
+    state.since_rest_s = 0.0
     for k in range(1, QUEUE):
         to, block = state.queue[k - 1], state.queue[k]
         to.mean, to.count, to.squares = block.mean, block.count, block.squares

@@ -46,6 +46,45 @@ POINT = np.dtype(
 _SEEN = np.dtype([("velocity", "c16"), ("variance", "f8")])  # by a mouse, in b as the rig places it (m/s, (m/s)²)
 _REST_BLOCK = np.dtype([("mean", "f8"), ("count", "i8"), ("squares", "f8")])  # of the gyro's rate (rad/s)
 
+# Gyro and mice that turn by different amounts: sums since the last agreement, see `gyro`.
+_DOUBT = np.dtype(
+    [
+        ("start", "c16"),  # position then, in n (m)
+        ("position", "c16"),  # by the mice alone since then, in n (m)
+        ("heading", "f8"),  # rad
+        ("age", "f8"),  # time since then (s)
+        ("calm", "i8"),  # blocks in a row in which gyro and mice agreed
+        ("judges", "i8"),  # bit mask of the mice that are compared with the gyro
+        # The current block.
+        ("block_s", "f8"),
+        ("block_gyro", "f8"),  # turn by the gyro, less its bias (rad)
+        ("block_mice", "f8"),  # turn by the mice (rad)
+        ("block_way", "f8"),  # ahead, by the mice (m)
+        ("block_moved_s", "f8"),  # time in which the mice counted (s)
+        ("block_variance", "f8"),  # of the difference of both turns, by noise that accumulates (rad²)
+        ("block_rounding", "f8"),  # and by whole counts (rad²)
+        # Cumulative sums of the difference over its σ, for either sign.
+        ("up", "f8"),
+        ("down", "f8"),
+        # Terms of the fits to the blocks since then.
+        ("blocks", "i8"),
+        ("span", "f8"),  # s
+        ("jump_square", "f8"),
+        ("jump_product", "f8"),
+        ("jump_cost", "f8"),
+        ("turn_square", "f8"),
+        ("turn_way", "f8"),
+        ("way_square", "f8"),
+        ("turn_off", "f8"),
+        ("way_off", "f8"),
+        ("off_square", "f8"),
+        # Change of the turn by the mice with the scale and the angle of each (rad).
+        ("by_scale", "f8", (MOST,)),
+        ("by_angle", "f8", (MOST,)),
+    ],
+    align=True,
+)
+
 _FIELDS = [
     ("size", "i8"),  # of the state with the rig's mice
     ("mean", *_VECTOR),
@@ -66,7 +105,18 @@ _FIELDS = [
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
     ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
-    ("jumps", "i8"),  # how often the gyro's bias has jumped or the gyro died
+    ("recent_square", "f8"),  # the first two over the current turn only
+    ("recent_product", "f8"),
+    ("turn_rate", "f8"),  # of the gyro, less its bias, in the last step (rad/s)
+    ("off_of_turn", "f8"),  # share by which the mice turned more than the gyro in the last turn
+    ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
+    ("off_of_turn_before", "f8"),  # and in the one before
+    ("doubt", _DOUBT),
+    ("jumps", "i8"),  # how often the gyro's bias has jumped
+    ("jump", "f8"),  # the last jump (rad/s)
+    ("jump_time", "f8"),  # and when it was found (s)
+    ("deaths", "i8"),  # how often the gyro repeated one value until it was given up
+    ("death_time", "f8"),  # when it was found last (s)
     ("floors", "i8"),  # how often the floor has changed
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)

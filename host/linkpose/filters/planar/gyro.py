@@ -1,0 +1,352 @@
+"""The gyro against the mice: a jump of its bias under way, or a dead gyro.
+
+Two or more mice show the turn without the gyro. Where they turn by another amount, either the gyro's bias has jumped,
+or all mice slip, are lifted, or are on another floor. Both hypotheses run until the data decide: the filter follows the
+gyro, and a second pose follows the mice alone from the last agreement on. Until the decision, the distance between the
+two poses is part of the stated standard deviation.
+
+A jump adds the same rate whatever the robot does. Mice that slip, or saturate, or have another scale or angle than
+assumed, err in proportion to the turn or to the way. The residuals of both models, fitted to blocks of 0.2 s since the
+last agreement, decide as soon as the motion of the robot has changed.
+
+Source of the change detection: E. S. Page, "Continuous inspection schemes", Biometrika 41 (1954).
+"""
+
+from __future__ import annotations
+
+import math
+
+from linkpose.compiling import inner
+from linkpose.filters.mice import reading
+from linkpose.filters.mice.faults import number, trusted
+from linkpose.filters.mice.least_squares import ROUNDING, fit, squared_speed
+from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
+from linkpose.filters.mice.state import NOBODY, Record, Records
+from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, SCALE, VX, VY, WZ, X, Y
+
+_BLOCK_S = 0.2  # one comparison (s). Doubled: a jump is found 0.2 s later, and half as large.
+# Cumulative sums of the difference over its σ, less this much per block; beyond the second number, the models are
+# compared. Twice the first: jumps below 0.3 °/s pass. Twice the second: a jump is found some blocks later.
+_SUM_DRIFT, _SUM_LIMIT, _SUM_MOST = 0.75, 5.0, 15.0
+# Gyro and mice may differ by this share of the turn (1σ): scale of the gyro, positions of the mice. Doubled: a jump is
+# found on straights only.
+_SHARE = 0.03
+# A jump: this many σ; a fit that is better than the other one by this much (−2 log of the ratio of likelihoods), with
+# χ² per block below the third number; no larger than the fourth (rad/s, the data sheet's ±20 °/s). Doubled: later.
+_JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
+_SUM_CALIBRATED = 2.0  # beyond it, the mice are not calibrated. Doubled: a jump spoils the calibration
+_FEWEST_BLOCKS = 4
+# Mice that agree again (|z| below the second number) in so many blocks, in which a jump would show by so many σ, end
+# the doubt. Doubled: σ stays large for longer after a lift.
+_CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
+# Blocks after which hypotheses that both fit badly are dropped (10 s): neither a jump nor a slip.
+_PATIENCE_BLOCKS = 50
+# Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
+# both 1σ. Doubled: no visible change, as long as both are possible.
+_LOST_STD, _VEERING_STD = 0.25, 0.1
+_SILENT_S = 0.05  # a mouse without a count for so long does not move (s)
+_JUMP_SHARE = 0.03  # of a jump of the bias: its σ beyond that of the fit
+_REPAIR_SHARE = 0.3  # of a correction of the heading or the position: its σ
+
+
+@inner
+def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
+    """Compare gyro and mice over the last step; correct bias and pose after a jump, the heading after a dead gyro."""
+    if not m.step > 0.0:
+        return
+    motion = _motion_by_mice(state, m, mice, p)
+    if motion < 0 or m.missed > 0.0:
+        _advance_other(state, complex(state.at.vx, state.at.vy), state.at.wz, m.step + m.missed)
+        return
+    _watch_dead_gyro(state, m, motion)
+    turn_rate = m.fit_turn if motion else 0.0
+    _advance_other(state, m.fit if motion else 0j, turn_rate, m.step)
+    if math.isfinite(m.mean_rate):
+        _add_step(state, m, mice, turn_rate, motion)
+
+
+@inner
+def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
+    """Velocity and turn rate of the last step by the mice alone into `m.fit…`: 1; 0 where they rest; −1 without one.
+
+    Where fewer than two mice are trusted, all count: a wrong gyro makes the fault tests exclude sound mice.
+    """
+    counting, judges = NOBODY, trusted(m)
+    if number(judges) < 2:
+        judges = m.sound
+    if number(judges) < 2:
+        return -1
+    if judges != state.doubt.judges:  # a fault has been found or is over: compare anew
+        state.doubt.judges = judges
+        _forget(state.doubt)
+    for i in range(m.count):
+        if judges >> i & 1 and mice[i].silent_s < _SILENT_S:
+            counting |= 1 << i
+    if counting == NOBODY:
+        return 0
+    if counting != judges:
+        return -1
+    velocity, turn_rate = complex(state.at.vx, state.at.vy), state.at.wz
+    for i in range(m.count):
+        if counting >> i & 1:
+            mouse = mice[i]
+            mouse.sum = scaled(1.0 / m.step, mouse.moved)
+            speed2 = squared_speed(mouse, velocity, turn_rate)
+            mouse.weight = 1.0 / reading.variance(mouse, m.step, speed2, p.scatter, p.noise_m_s)
+    if not fit(m, mice, counting, 0.0, 0j, 0.0, 0.0) > reading.NEAREST_M**2:
+        return -1
+    _add_gradient(state, m, mice, counting)
+    return 1
+
+
+@inner
+def _rounding_share(m: Record, mice: Records) -> float:
+    """Share of the variance of the turn over a step that comes from whole counts: it does not accumulate."""
+    for i in range(m.count):
+        if m.sound >> i & 1:
+            per_step = mice[i].metres_per_count / m.step
+            share: float = ROUNDING * per_step * per_step * mice[i].weight
+            return min(1.0, share)
+    return 1.0
+
+
+@inner
+def _add_gradient(state: Record, m: Record, mice: Records, counting: int) -> None:
+    """∂(turn by the mice) / ∂(ε_i, α_i), summed over the doubt: ε̂, α̂ turn s_i into s_i (1 + ε_i + j α_i)."""
+    weights, centre = 0.0, 0j
+    for i in range(m.count):
+        if counting >> i & 1:
+            weights += mice[i].weight
+            centre += scaled(mice[i].weight, mice[i].arm)
+    centre = scaled(1.0 / weights, centre)
+    for i in range(m.count):
+        if counting >> i & 1:
+            mouse = mice[i]
+            lever = scaled(m.fit_turn_variance * mouse.weight * m.step, mouse.arm - centre)
+            state.doubt.by_scale[i] += dot(lever, mouse.sum)
+            state.doubt.by_angle[i] += dot(lever, complex(-mouse.sum.imag, mouse.sum.real))
+
+
+@inner
+def _variance_of_calibration(state: Record) -> float:
+    """Variance (rad²) of the turn by the mice since the doubt began, by the uncertainty of their calibration."""
+    doubt, p, total = state.doubt, state.covariance, 0.0
+    for i in range((state.size - MICE) // OF_MOUSE):
+        a = MICE + OF_MOUSE * i
+        for k in range((state.size - MICE) // OF_MOUSE):
+            b = MICE + OF_MOUSE * k
+            total += doubt.by_scale[i] * p[a + SCALE, b + SCALE] * doubt.by_scale[k]
+            total += doubt.by_angle[i] * p[a + ANGLE, b + ANGLE] * doubt.by_angle[k]
+            total += 2.0 * doubt.by_scale[i] * p[a + SCALE, b + ANGLE] * doubt.by_angle[k]
+    return total
+
+
+@inner
+def _advance_other(state: Record, velocity: complex, turn_rate: float, dt: float) -> None:
+    """Carry the pose by the mice alone on by `dt` (s)."""
+    doubt, turn = state.doubt, turn_rate * dt
+    doubt.position += scaled(dt, turned(turned(unit(doubt.heading), turned_mean(turn)), velocity))
+    doubt.heading += turn
+
+
+@inner
+def _add_step(state: Record, m: Record, mice: Records, turn_rate: float, motion: int) -> None:
+    """Add a step to the current block, and a whole block to the sums since the last agreement."""
+    doubt = state.doubt
+    doubt.block_s += m.step
+    doubt.block_gyro += (m.mean_rate - state.at.bias) * m.step
+    doubt.block_mice += turn_rate * m.step
+    if motion:
+        doubt.block_way += m.fit.real * m.step
+        doubt.block_moved_s += m.step
+    variance = m.step * m.step * m.fit_turn_variance
+    rounding = variance * _rounding_share(m, mice) if motion else 0.0
+    if rounding > doubt.block_rounding:
+        doubt.block_rounding = rounding
+    doubt.block_variance += m.step * m.step * state.gyro_variance / max(m.rates, 1)
+    if motion:
+        doubt.block_variance += variance - rounding
+    if doubt.block_s >= _BLOCK_S - 1e-9:
+        _finish_block(state, m)
+        doubt.block_s = doubt.block_gyro = doubt.block_mice = doubt.block_way = doubt.block_variance = 0.0
+        doubt.block_rounding = doubt.block_moved_s = 0.0
+
+
+@inner
+def _finish_block(state: Record, m: Record) -> None:
+    doubt, span = state.doubt, state.doubt.block_s
+    off, share = doubt.block_gyro - doubt.block_mice, _SHARE * doubt.block_mice
+    variance = doubt.block_variance + doubt.block_rounding + share * share
+    _add_block(state, off, variance, span)
+    total = variance + _variance_of_calibration(state) * (span / doubt.span) ** 2
+    total += state.covariance[BIAS, BIAS] * span * span
+    z = off / math.sqrt(total)
+    doubt.up = min(max(0.0, doubt.up + z - _SUM_DRIFT), _SUM_MOST)
+    doubt.down = min(max(0.0, doubt.down - z - _SUM_DRIFT), _SUM_MOST)
+    if _is_over(state, z, math.sqrt(total)) or (doubt.up == 0.0 and doubt.down == 0.0):
+        agree(state)
+    elif max(doubt.up, doubt.down) > _SUM_LIMIT:
+        _decide(state, m)
+
+
+@inner
+def _is_over(state: Record, z: float, std: float) -> bool:
+    """Whether moving mice have agreed for some blocks in which a jump that explains the headings would have shown."""
+    doubt = state.doubt
+    turned_by, span = state.at.heading - doubt.heading, doubt.block_s
+    would_show = abs(turned_by) * span > _SHOWS_Z * std * doubt.age and doubt.block_moved_s > 0.5 * span
+    doubt.calm = doubt.calm + 1 if would_show and abs(z) < _CALM_Z else 0
+    return bool(doubt.calm >= _CALM_BLOCKS)
+
+
+@inner
+def _add_block(state: Record, off: float, variance: float, span: float) -> None:
+    """Add the terms of both fits: off = J span (a jump), off = c turn + e way (errors of the mice)."""
+    doubt, turn = state.doubt, state.doubt.block_gyro
+    doubt.age += span
+    doubt.span += span
+    doubt.blocks += 1
+    if doubt.blocks == 1 or doubt.block_moved_s < 0.5 * span:  # a change within a block, or a lift, fits neither
+        return
+    weight = 1.0 / variance
+    doubt.jump_square += weight * span * span
+    doubt.jump_product += weight * span * off
+    doubt.jump_cost += weight * off * off
+    way = doubt.block_way
+    doubt.turn_square += weight * turn * turn
+    doubt.turn_way += weight * turn * way
+    doubt.way_square += weight * way * way
+    doubt.turn_off += weight * turn * off
+    doubt.way_off += weight * way * off
+    doubt.off_square += weight * off * off
+
+
+@inner
+def is_doubtful(state: Record) -> bool:
+    """Whether gyro and mice differ, and neither hypothesis has been accepted: nothing is calibrated meanwhile."""
+    return bool(max(state.doubt.up, state.doubt.down) > _SUM_CALIBRATED)
+
+
+@inner
+def _decide(state: Record, m: Record) -> None:
+    """Accept the hypothesis that fits decisively better; keep both while none does."""
+    doubt = state.doubt
+    if doubt.blocks < _FEWEST_BLOCKS or doubt.jump_square == 0.0:
+        return
+    jump = doubt.jump_product / doubt.jump_square
+    by_jump = doubt.jump_cost - jump * doubt.jump_product
+    by_mice = _cost_of_mice(doubt)
+    variance = 1.0 / doubt.jump_square + _variance_of_calibration(state) / (doubt.span * doubt.span)
+    is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * doubt.blocks
+    if is_jump and abs(jump) < _MOST_RAD_S and jump * jump > _JUMP_Z**2 * (variance + state.covariance[BIAS, BIAS]):
+        _accept_jump(state, m, jump, variance)
+    elif by_jump - by_mice > _BETTER or (
+        doubt.blocks > _PATIENCE_BLOCKS and min(by_jump, by_mice) > _MOST_CHI2 * doubt.blocks
+    ):
+        lost = doubt.turn_off / (doubt.turn_square + 1.0 / _LOST_STD**2)
+        _widen_way(state, min(abs(lost), 1.0))
+        agree(state)
+
+
+@inner
+def _cost_of_mice(doubt: Record) -> float:
+    """χ² of the best fit of off = c turn + e way."""
+    a, b, d = doubt.turn_square + 1.0 / _LOST_STD**2, doubt.turn_way, doubt.way_square + 1.0 / _VEERING_STD**2
+    x, y = doubt.turn_off, doubt.way_off
+    cost: float = doubt.off_square - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return cost
+
+
+@inner
+def _widen_way(state: Record, lost: float) -> None:
+    """The mice have lost a share of the way since the doubt began."""
+    way = complex(state.at.x, state.at.y) - state.doubt.start
+    state.covariance[X, X] += (lost * way.real) ** 2
+    state.covariance[Y, Y] += (lost * way.imag) ** 2
+    state.covariance[X, Y] += lost * lost * way.real * way.imag
+    state.covariance[Y, X] = state.covariance[X, Y]
+
+
+@inner
+def agree(state: Record) -> None:
+    """End the doubt: both poses are the same again."""
+    doubt = state.doubt
+    doubt.position, doubt.heading = complex(state.at.x, state.at.y), state.at.heading
+    doubt.start = doubt.position
+    doubt.up = doubt.down = doubt.age = 0.0
+    doubt.calm = 0
+    _forget(doubt)
+
+
+@inner
+def _forget(doubt: Record) -> None:
+    """Forget the blocks so far."""
+    doubt.span = 0.0
+    doubt.jump_square = doubt.jump_product = doubt.jump_cost = 0.0
+    doubt.turn_square = doubt.turn_way = doubt.way_square = 0.0
+    doubt.turn_off = doubt.way_off = doubt.off_square = 0.0
+    doubt.blocks = 0
+    for i in range(len(doubt.by_scale)):
+        doubt.by_scale[i] = doubt.by_angle[i] = 0.0
+
+
+@inner
+def explains(state: Record, jump: float) -> bool:
+    """Whether a bias that is wrong by `jump` (rad/s) since the doubt began explains the headings' difference."""
+    turned_by, expected = state.at.heading - state.doubt.heading, jump * state.doubt.age
+    return is_doubtful(state) and abs(turned_by - expected) < 0.5 * abs(expected)
+
+
+@inner
+def take_other_pose(state: Record) -> None:
+    """Replace the pose by that of the mice alone."""
+    doubt, at, p = state.doubt, state.at, state.covariance
+    back2 = square(doubt.position - complex(at.x, at.y))
+    p[X, X] += _REPAIR_SHARE**2 * back2
+    p[Y, Y] += _REPAIR_SHARE**2 * back2
+    at.x, at.y, at.heading = doubt.position.real, doubt.position.imag, doubt.heading
+    agree(state)
+
+
+@inner
+def _accept_jump(state: Record, m: Record, jump: float, variance: float) -> None:
+    """The bias is another one since the doubt began: take the pose by the mice, and their velocity."""
+    p, span = state.covariance, state.doubt.span
+    p[HEADING, HEADING] += variance * span * span + (jump * _BLOCK_S) ** 2
+    take_other_pose(state)
+    state.at.bias += jump
+    for at_index in (VX, VY, WZ, BIAS):
+        for k in range(state.size):
+            p[at_index, k] = p[k, at_index] = 0.0
+        p[at_index, at_index] = state.fresh[at_index, at_index]
+    p[BIAS, BIAS] = variance + (_JUMP_SHARE * jump) ** 2
+    m.excluded = NOBODY
+    state.since_rest_s = state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.jumps += 1
+    state.jump, state.jump_time = jump, m.time
+
+
+@inner
+def _watch_dead_gyro(state: Record, m: Record, motion: int) -> None:
+    """Add up what the mice turn beyond a gyro that repeats one value, and turn the heading by it once it is dead."""
+    if motion == 0 or m.disagree_s > 0.0:
+        return
+    if m.same_rates == 0:
+        state.dead_turn = 0.0
+    elif math.isfinite(m.rate):
+        state.dead_turn += (m.fit_turn - (m.rate - state.at.bias)) * m.step
+    elif state.dead_turn != 0.0:
+        _turn_heading(state, state.dead_turn)
+        state.dead_turn = 0.0
+        state.deaths += 1
+        state.death_time = m.time
+
+
+@inner
+def _turn_heading(state: Record, turn: float) -> None:
+    """Correct the heading by what a wrong gyro has turned it (rad), and widen the pose by what is not known of it."""
+    state.at.heading += turn
+    state.covariance[HEADING, HEADING] += (_REPAIR_SHARE * turn) ** 2
+    way2 = (state.at.vx**2 + state.at.vy**2) * turn * turn
+    state.covariance[X, X] += way2
+    state.covariance[Y, Y] += way2
