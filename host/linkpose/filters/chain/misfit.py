@@ -19,8 +19,8 @@ _MOST_BIAS_M_S2 = 5.0
 # Mean square of the joint's lasting innovations, in multiples of its value for a right σ: 6 at most in [D] and [O]; a
 # gyro that repeats one value makes it 23, a sensor mounted anew 11 to 20.
 _MOST_LASTING = 10.0
-# Factor of the acceleration's noise that the innovations demand: 3 at most in [D] and [O], up to 100 for a sensor mounted
-# anew.
+# Factor of the acceleration's noise that the innovations demand: 3 at most in [D] and [O], up to 100 for a sensor that
+# was mounted anew.
 _MOST_WIDENING = 15.0
 _FORGET_S = 5.0  # of misfit before mounting and biases are forgotten; knocks are shorter
 # Share of the misfit's time that as much time with a fit takes off. At 1, a sensor mounted anew that fits now and then
