@@ -22,9 +22,10 @@ _PATIENCE_S = 0.5
 # A change of velocity that only the mice show stays unconfirmed for at most so long (s), until mice and gyro agree on a
 # turn of so much (rad, within a share and a rate in rad/s), or until the velocity jumps back. The stated ± of the
 # position grows by the distance to the position without this change. Doubling the time doubles the ± after a collision
-# on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and this much (m/s, eight
-# times the rounding of three mice): small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
-_JUMP_M_S2, _JUMP_M_S = 6.0, 0.04
+# on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and so many σ of the
+# velocity: small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
+_JUMP_M_S2, _JUMP_Z = 3.0, 6.0
+_SATURATED_SHARE = 0.5  # of the speed that saturated mice show: by so much they may count too little (1σ)
 _SPREAD_S = 0.05  # a jump spreads over two or three readings
 _UNCONFIRMED_S, _CONFIRMING_RAD, _AGREED_SHARE, _AGREED_RAD_S = 10.0, 0.2, 0.1, 0.05
 # Within one step a velocity changes by about this (m/s², rad/s²): the velocity is the mean over the step, the estimate
@@ -103,7 +104,7 @@ def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) 
 @inner
 def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
-    if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
+    if state.at_rest or m.missed > 0.0 or m.is_saturated or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
     keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
     if abs(m.turn_rate - turn) > _FLOOR_MOST * abs(turn) + _FLOOR_Z * m.turn_std:
@@ -286,8 +287,9 @@ def _correct(
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
+    learns = not (is_doubtful(state) or state.is_off or m.is_saturated)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, 0.0 if is_doubtful(state) or state.is_off else limit):
+    if not update(state, limit if is_patient else math.inf, limit if learns else 0.0):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -300,7 +302,8 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
 
     `before` is the filter's velocity before this reading.
     """
-    shown, last, limit = m.velocity, state.shown, _JUMP_M_S + _JUMP_M_S2 * dt
+    shown, last = m.velocity, state.shown
+    limit = _JUMP_Z * math.sqrt(m.x_std**2 + m.y_std**2) + _JUMP_M_S2 * dt
     state.shown = shown
     is_jump = square(shown - last) > limit * limit
     if state.unconfirmed_s > 0.0:
@@ -327,11 +330,27 @@ def _add_unconfirmed_way(state: Record, m: Record, dt: float) -> None:
             state.unconfirmed_s = 0.0
             return
     way = scaled(dt, turned(unit(state.at.heading), state.held - complex(state.at.vx, state.at.vy)))
+    _add_systematic(state, way, state.unconfirmed_m)
+    state.unconfirmed_m += math.sqrt(square(way))
+
+
+@inner
+def _add_saturated_way(state: Record, m: Record, dt: float) -> None:
+    """Add the variance of a way of which saturated mice show a lower bound only."""
+    if not m.is_saturated:
+        return
+    way = scaled(_SATURATED_SHARE * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+    _add_systematic(state, way, state.saturated_m)
+    state.saturated_m += math.sqrt(square(way))
+
+
+@inner
+def _add_systematic(state: Record, way: complex, before_m: float) -> None:
+    """Add the variance of an error of position that grows by `way` (m) in this step, and was `before_m` before."""
     length = math.sqrt(square(way))
     if not length > 0.0:
         return
-    grown = length * (2.0 * state.unconfirmed_m + length) / (length * length)
-    state.unconfirmed_m += length
+    grown = length * (2.0 * before_m + length) / (length * length)
     state.covariance[X, X] += grown * way.real * way.real
     state.covariance[Y, Y] += grown * way.imag * way.imag
     state.covariance[X, Y] += grown * way.real * way.imag
@@ -377,6 +396,7 @@ def _step(
         agree(state)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
+    _add_saturated_way(state, m, dt)
     _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)

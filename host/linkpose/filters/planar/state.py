@@ -131,6 +131,7 @@ _FIELDS = [
     ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
     ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
     ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
+    ("saturated_m", "f8"),  # way that saturated mice may have missed (m)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
