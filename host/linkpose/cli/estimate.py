@@ -388,6 +388,11 @@ def _outcome(estimator: Estimator) -> dict[str, Any]:
         outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
     if estimator.excluded.samples:
         outcome["excluded_mice"] = estimator.excluded.samples
+        outcome["excluded_mice_since_s"] = {name: round(at, 3) for name, at in estimator.excluded.first_s.items()}
+    jumps = estimator.gyro_jumps
+    if jumps:
+        last = {"last_rad_s": round(jumps.last_rad_s, 5), "found_s": round(jumps.last_time_s, 3)}
+        outcome["gyro_jumps"] = {"count": jumps.times} | last
     if estimator.mice_scale:
         outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in estimator.mice_scale)
     if estimator.magnetic_field:
@@ -413,8 +418,33 @@ def _report_field(estimator: Estimator, console: Console) -> None:
     )
 
 
+_SHORTEST_S = 0.2  # of exclusions that are reported: a late packet excludes a mouse for a sample
+
+
+def _report_excluded(estimator: Estimator, console: Console) -> None:
+    """Which mice were left out, since when, and for how long."""
+    excluded = estimator.excluded
+    long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
+    for name in long:
+        still = "; it is still left out" if name in excluded.now else ""
+        console.report(
+            f"mouse {name.removeprefix('mouse')} was left out for {excluded.total_s[name]:.1f} s, first at "
+            f"{excluded.first_s[name]:.1f} s{still}: it contradicted the other sensors. Check that it is on the floor, "
+            "and its place and angle in the rig file"
+        )
+
+
 def _report_mice(estimator: Estimator, console: Console) -> None:
-    """The common scale of the mice where it differs from the rig file."""
+    """Excluded mice, jumps of the gyro, and the common scale of the mice where it differs from the rig file."""
+    _report_excluded(estimator, console)
+    jumps = estimator.gyro_jumps
+    if jumps:
+        times = "" if jumps.times == 1 else f" {jumps.times} times, last"
+        console.report(
+            f"the gyro's bias has jumped{times} by {math.degrees(jumps.last_rad_s):+.1f} °/s, found at "
+            f"{jumps.last_time_s:.1f} s: the mice contradicted the gyro, and the heading was corrected by the mice. "
+            "Check the mounting and the supply of the sensor"
+        )
     if estimator.mice_scale:
         factor, std = estimator.mice_scale
         change = "more" if factor > 1 else "fewer"

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from linkpose.filters import GyroJumps
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
 from linkpose.filters.mice.reading import BIAS_STD
@@ -40,7 +41,7 @@ from linkpose.filters.planar.state import fresh_state as fresh_planar_state
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-__all__ = ["FoundMouse", "GyroJumps", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
+__all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
@@ -57,15 +58,6 @@ class FoundMouse:
     x_m: float
     y_m: float
     position_std_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class GyroJumps:
-    """Jumps of the gyro's bias that the mice or a rest have shown: how many, and the last one."""
-
-    count: int
-    last_rad_s: float
-    last_time_s: float
 
 
 class _PlanarFilter:
