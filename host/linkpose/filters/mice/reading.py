@@ -27,7 +27,7 @@ BIAS_STD, BIAS_FLOOR, _BIAS_MEMORY_S, _BIAS_RATE_HZ = 0.35, 0.01, 10.0, 10.0
 _DEAD_S, _DEAD_RATES = 0.4, 40
 # A mouse that gives the same counts for so many readings is stuck, if another one has been silent for so long (s), or
 # has changed its counts by so much in about the same time. Doubled: it spoils the path for twice as long.
-_STUCK_REPEATS, _STUCK_SILENT_S, _STUCK_CHANGE = 50, 0.3, 12.0
+_STUCK_REPEATS, _STUCK_SILENT_S, _STUCK_CHANGE, _VARYING_REPEATS = 50, 0.3, 12.0, 10
 _CHANGE_KEPT = 0.98  # of the changes, from reading to reading
 
 
@@ -106,7 +106,8 @@ def _exclude_stuck(state: Record, mice: Records) -> None:
             continue
         for k in range(state.count):
             other = mice[k]
-            is_apart = other.silent_s >= _STUCK_SILENT_S or other.change > _STUCK_CHANGE
+            varies = other.change > _STUCK_CHANGE and other.repeats < _VARYING_REPEATS
+            is_apart = other.silent_s >= _STUCK_SILENT_S or varies
             if k != i and state.sound >> k & 1 and is_apart:
                 state.excluded |= 1 << i
                 state.sound &= ~(1 << i)

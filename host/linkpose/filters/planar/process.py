@@ -9,7 +9,7 @@ from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
 from linkpose.filters.mice.least_squares import squared_speed
-from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
+from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.gyro import agree, is_doubtful, watch_gyro
@@ -109,6 +109,9 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
     if abs(m.turn_rate - turn) > _FLOOR_MOST * abs(turn) + _FLOOR_Z * m.turn_std:
         return
+    if m.excluded:
+        return
+    _add_turn_of_each(state, m, mice, turn, keep)
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
@@ -124,7 +127,7 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     latest, before = _off_of_turn(state), state.off_of_turn
     if latest == 0.0:
         latest, before = before, state.off_of_turn_before
-    if not (latest / off > 0.5 and before / off > 0.5):
+    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m) > 0.5 * abs(off):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
@@ -133,8 +136,33 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     _correct_way(state, off)
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    for i in range(len(state.product_of_each)):
+        state.product_of_each[i] = 0.0
     state.is_off = False
     state.floors += 1
+
+
+@inner
+def _add_turn_of_each(state: Record, m: Record, mice: Records, by_gyro: float, keep: float) -> None:
+    """Add the turn that each mouse shows about the centre of all, times the gyro's."""
+    arm, moved = 0j, 0j
+    for i in range(m.count):
+        arm += scaled(1.0 / m.count, mice[i].arm)
+        moved += scaled(1.0 / m.count, mice[i].moved)
+    for i in range(m.count):
+        lever = mice[i].arm - arm
+        turn = dot(lever, mice[i].moved - moved) / max(square(lever), 1e-12)
+        state.product_of_each[i] = keep * state.product_of_each[i] + by_gyro * turn
+
+
+@inner
+def _spread_of_turns(state: Record, m: Record) -> float:
+    """Spread of the shares of the gyro's turn that the mice show: on another floor all show the same."""
+    least, most = math.inf, -math.inf
+    for i in range(m.count):
+        share = state.product_of_each[i] / state.turn_square
+        least, most = min(least, share), max(most, share)
+    return most - least
 
 
 @inner
