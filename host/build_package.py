@@ -99,9 +99,15 @@ class BuildWheel(bdist_wheel):  # type: ignore[misc]
 
 
 def _groups() -> list[tuple[str, ...]]:
-    """GROUPS, or those of their names that LINKPOSE_MACHINE_CODE lists."""
+    """GROUPS, or those of their names that LINKPOSE_MACHINE_CODE lists. Raises SystemExit for another name."""
     chosen = os.environ.get("LINKPOSE_MACHINE_CODE", "")
-    return [tuple(name for name in group if not chosen or name in chosen.split(",")) for group in GROUPS]
+    if chosen in ("", "no"):
+        return [] if chosen else list(GROUPS)
+    names = [name.strip() for name in chosen.split(",")]
+    known = [name for group in GROUPS for name in group]
+    if unknown := [name for name in names if name not in known]:
+        sys.exit(f"LINKPOSE_MACHINE_CODE names {unknown[0]!r}; set it to `no` or to some of {','.join(known)}")
+    return [tuple(name for name in group if name in names) for group in GROUPS]
 
 
 def _has_machine_code() -> bool:

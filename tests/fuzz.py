@@ -2,7 +2,8 @@
 
     python tests/fuzz.py [--inputs N] [--seed S] [NAME ...]
 
-Without NAME, every reader and every command gets N inputs (default 100 000; a fiftieth for commands). An input fails
+Without NAME, every reader and every command gets N inputs (default 100 000; a fiftieth for commands), and each file
+argument of each command gets all nasty files of hostile.py ("arguments"). An input fails
 when it raises anything but a LinkposeError, takes more than 10 s, or needs more than 1 GB. Failing inputs are kept in
 fuzz-failures/, and the status is 1.
 """
@@ -27,6 +28,7 @@ from unittest import mock
 sys.path[:0] = [str(Path(__file__).parent / "host"), str(Path(__file__).parents[1] / "host")]
 
 from fuzzing import Target, commands, mutate, read_mutated, targets  # noqa: E402
+from hostile import INPUTS, KINDS, OUTPUTS, PLACES, valid_files, words  # noqa: E402
 
 from linkpose.evaluation import markers  # noqa: E402
 
@@ -54,7 +56,38 @@ def main() -> int:
         for name, (target, inputs) in readers.items():
             if not chosen.names or name in chosen.names:
                 failures += _run(name, target, inputs, chosen.seed)
+        if not chosen.names or "arguments" in chosen.names:
+            failures += _arguments(Path(folder))
     return 1 if failures else 0
+
+
+def _arguments(folder: Path) -> int:
+    """All nasty inputs and outputs of hostile.py, each in a process of its own, as a user runs it."""
+    (valid := folder / "valid").mkdir()
+    files, failures, slowest = valid_files(valid), 0, 0.0
+    pairs = [(command, kind, make) for command in INPUTS.values() for kind, make in KINDS.items()]
+    pairs += [(command, kind, make) for command in OUTPUTS.values() for kind, make in PLACES.items()]
+    for number, (command, kind, make) in enumerate(pairs):
+        (own := folder / f"arguments-{number}").mkdir()
+        make(at := own / "a.csv")
+        started = time.monotonic()
+        call = [sys.executable, "-m", "linkpose", *words(command, files, at)]
+        try:
+            done = subprocess.run(
+                call, capture_output=True, text=True, timeout=3 * LONGEST_S, errors="replace", stdin=subprocess.DEVNULL
+            )
+            bad = done.returncode not in (0, 1, 2) or any(
+                word in done.stderr for word in ("Traceback", "please report")
+            )
+            shown = done.stderr[-300:]
+        except subprocess.TimeoutExpired:
+            bad, shown = True, "no end"
+        slowest = max(slowest, time.monotonic() - started)
+        if bad:
+            failures += 1
+            print(f"arguments: {command} with {kind}: {shown}", flush=True)
+    print(f"{'arguments':22} {len(pairs)} inputs, {failures} failures, slowest {slowest:.2f} s", flush=True)
+    return failures
 
 
 def _run(name: str, target: Target, inputs: int, seed: int) -> int:

@@ -124,6 +124,11 @@ class Board:
         self._recorder = self._exit.enter_context(Recorder(self.session, Path(path), self.rig, force, plain))
 
     @property
+    def recording(self) -> Path | None:
+        """The recording, under another name than at the start if another program took the file away; None: none."""
+        return self._recorder.path
+
+    @property
     def started_s(self) -> float:
         """The host's time (time.perf_counter, s) of the first sample; 0 before it."""
         return self.session.timeline.start_s

@@ -7,7 +7,7 @@
 
 Numba checks only the file of a cached function. The machine code also contains what that function calls in other files,
 so an edit or an upgrade there would go unnoticed. In both places, the folder is therefore named after a fingerprint of
-all sources, numba's version and the processor: other sources or another processor use another folder.
+all sources, numba's and LLVM's versions and the processor: other sources or another processor use another folder.
 
 Machine code and its pickled index run with the user's rights. The cache is read only if the user owns it and nobody
 else can write it. The installation's machine code is read only if everybody who can write it can also write this file.
@@ -34,7 +34,9 @@ from typing import Any, TypeVar, cast
 # Numba tries several types for each operation and formats an error for each that does not fit. Colours took 4 % of the
 # time to compile. Numba reads this when it is imported.
 os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
+import llvmlite
 import numba
+import numpy as np
 from numba.core.caching import (
     CompileResultCacheImpl,
     FunctionCache,
@@ -96,9 +98,10 @@ def installed_folder(package: Path = _PACKAGE) -> Path | None:
 
 
 def _folder_name(package: Path) -> str:
-    """Named after all that machine code depends on: numba, the processor and the sources."""
+    """Named after all that machine code depends on: numba and its libraries, the processor and the sources."""
+    versions = numba.__version__, llvmlite.__version__, np.__version__.split(".")[0]
     processor = cpu_target.target_context.codegen().magic_tuple()
-    digest = hashlib.blake2b(repr((numba.__version__, processor)).encode(), digest_size=10)
+    digest = hashlib.blake2b(repr((versions, processor)).encode(), digest_size=10)
     for pattern in _SOURCES:
         for path in sorted(package.glob(pattern)):
             digest.update(f"\0{path.relative_to(package)}\0".encode())

@@ -52,6 +52,13 @@ class FileExists(FileError):
         super().__init__(path, f"{path} exists already")
 
 
+class NamedTwice(FileError):
+    """One file is named for two outputs."""
+
+    def __init__(self, path: object) -> None:
+        super().__init__(path, f"{path} is named for two outputs; name two files")
+
+
 class CannotRead(FileError):
     """The operating system does not give a file's content. `reason` is its own."""
 
@@ -76,6 +83,10 @@ class CannotWrite(FileError):
     def __init__(self, path: object, reason: str | None, what: str = "") -> None:
         super().__init__(path, f"cannot write {what + ' ' if what else ''}{path}: {reason}")
         self.reason = reason
+
+
+class FileChanged(CannotWrite):
+    """Another program removed, replaced, cut or wrote into a file while it was being written. `reason` says which."""
 
 
 class MissingLibrary(LinkposeError):

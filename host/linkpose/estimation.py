@@ -256,6 +256,32 @@ class Estimator:
                 return f.gyro_jumps
         return None
 
+    @property
+    def moved_mice(self) -> tuple[filters.MovedMouse, ...]:
+        """Mice that the first filter that estimates their places shows elsewhere than the rig file states."""
+        for f in self.filters:
+            if isinstance(f, filters.FindsMovedMice):
+                return f.moved_mice
+        return ()
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """Entries of a file's closing line: rejected samples, and what the filters found of J2S, mice and field."""
+        outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in self.filters}}
+        if found := self.found_j2s:
+            outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
+        if self.excluded.samples:
+            outcome["excluded_mice"] = self.excluded.samples
+            outcome["excluded_mice_since_s"] = {name: round(at, 3) for name, at in self.excluded.first_s.items()}
+        if jumps := self.gyro_jumps:
+            last = {"last_rad_s": round(jumps.last_rad_s, 5), "found_s": round(jumps.last_time_s, 3)}
+            outcome["gyro_jumps"] = {"count": jumps.times} | last
+        if self.mice_scale:
+            outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in self.mice_scale)
+        if self.magnetic_field:
+            outcome["mag"] = self.magnetic_field.as_dict()
+        return outcome
+
     def text(self, estimates: Floats) -> bytes:
         """Estimates as lines of CSV."""
         return format_rows(estimates, self._decimals)
@@ -272,6 +298,14 @@ class Estimator:
         ]
 
 
+class LiveRows(NamedTuple):
+    """What a live run shows and writes after a block."""
+
+    complete: Floats  # (N, columns) rows that all filters have processed, in order, each one once
+    newest: Floats  # (columns,) of the last sample, NaN for filters that are not ready; empty after an empty block
+    caught_up: Floats  # (M, columns) all rows so far if a filter has just caught up with them; otherwise M = 0
+
+
 class LiveEstimator:
     """An estimator whose filters may become ready while measurements arrive already.
 
@@ -281,56 +315,68 @@ class LiveEstimator:
 
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
         """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
-        self._filters = estimator.filters
+        self._estimator, self._filters = estimator, estimator.filters
         self._excluded = estimator.excluded
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
         self._blocks: list[Measurements] = []  # not yet processed by all filters
         self._results: list[list[Floats]] = [[] for _ in self._filters]  # of these blocks, filter by filter
 
-    def process(self, block: Measurements) -> tuple[Floats, Floats]:
-        """Takes the next block, which may be empty. Returns the rows that are complete now, and the newest row.
-
-        Complete rows come in order, none is left out; the newest row (columns,) has NaN for filters that are not ready,
-        and is empty before the first sample.
-        """
+    def process(self, block: Measurements) -> LiveRows:
+        """Takes the next block, which may be empty."""
+        if len(block) and not self._blocks and self._are_all_ready():
+            rows = self._estimator.process(block)
+            return LiveRows(rows, rows[-1], rows[:0])
         if len(block):
             self._blocks.append(block)
+        has_caught_up = False
         for f, results in zip(self._filters, self._results, strict=True):
-            if len(results) < len(self._blocks) and self._is_ready(f.name):
-                results.extend(f.process(waiting) for waiting in self._blocks[len(results) :])
-        return self._complete_rows(), self._newest
+            waiting = self._blocks[len(results) :]
+            if waiting and self._is_ready(f.name):
+                has_caught_up |= len(waiting) > 1
+                results.extend(f.process(each) for each in waiting)
+        caught_up = self._rows(0, len(self._blocks) if has_caught_up else 0)
+        complete = self._take_complete()
+        last = self._rows(len(self._blocks) - 1, len(self._blocks)) if self._blocks else complete
+        return LiveRows(complete, last[-1] if len(block) else np.empty(0), caught_up)
+
+    def _are_all_ready(self) -> bool:
+        return self._is_ready(TEXT) and all(self._is_ready(f.name) for f in self._filters)
 
     def finish(self) -> Floats:
         """The rows that were not complete yet. All filters must be ready, or are compiled now."""
         self._is_ready = lambda _: True
-        rows, _ = self.process(Measurements.from_imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3))))
-        return rows
+        return self.process(Measurements.from_imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)))).complete
 
-    def _complete_rows(self) -> Floats:
+    def _take_complete(self) -> Floats:
+        """The rows that all filters have processed; they are kept no longer."""
         count = min((len(results) for results in self._results), default=0)
-        self._newest = self._newest_row()
         if not count or not self._is_ready(TEXT):
-            return np.empty((0, 1 + sum(self._width)))
-        rows = [
-            _side_by_side(block.time_s, [results[i] for results in self._results])
-            for i, block in enumerate(self._blocks[:count])
-        ]
-        for block, estimates in zip(self._blocks, rows, strict=False):
-            self._excluded.count(block, estimates)
+            return self._rows(0, 0)
+        rows, first = self._rows(0, count), 0
+        for block in self._blocks[:count]:
+            self._excluded.count(block, rows[first : first + len(block)])
+            first += len(block)
         del self._blocks[:count]
         for results in self._results:
             del results[:count]
-        return rows[0] if count == 1 else np.concatenate(rows)
+        return rows
 
-    def _newest_row(self) -> Floats:
-        if not self._blocks:
-            return np.empty(0)
-        parts = [self._blocks[-1].time_s[-1:]]
-        for width, results in zip(self._width, self._results, strict=True):
-            caught_up = len(results) == len(self._blocks)
-            parts.append(results[-1][-1] if caught_up else np.full(width, np.nan))
-        return np.concatenate(parts)
+    def _rows(self, start: int, end: int) -> Floats:
+        """Rows (N, columns) of the blocks from `start` to `end`, with NaN for filters that have not processed them."""
+        rows = [
+            _side_by_side(
+                block.time_s,
+                [
+                    results[at] if at < len(results) else np.full((len(block), width), np.nan)
+                    for width, results in zip(self._width, self._results, strict=True)
+                ],
+            )
+            for at, block in enumerate(self._blocks[start:end], start)
+        ]
+        if len(rows) == 1:
+            return rows[0]
+        return np.concatenate(rows) if rows else np.empty((0, 1 + sum(self._width)))
 
 
 class EstimateWriter(CsvFile):

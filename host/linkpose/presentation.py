@@ -34,6 +34,7 @@ _LENGTH_DIGITS = (
     _Digits(0.995, 3, 1e2, 1, "cm"),
     _Digits(math.inf, 1, 1.0, 1, "m"),
 )
+UNKNOWN = "not known"  # in place of a value
 _MOST_DECIMALS = 4  # that a column of lengths aligns
 _MOST_ERROR_DECIMALS = 6
 _ANGLE_DECIMALS = ((0.0095, 3), (0.095, 2), (9.95, 1), (math.inf, 0))  # σ (°) below -> decimals
@@ -87,6 +88,11 @@ class Exclusions:
                 now |= {mouse for mouse in range(1, 9) if int(mask) >> (mouse - 1) & 1}
         self._since_s = {mouse: self._since_s.get(mouse, time_s) for mouse in now}
 
+    @property
+    def names(self) -> set[str]:
+        """The sensors that are left out: mouse1, ..."""
+        return {f"mouse{mouse}" for mouse in self._since_s}
+
     def lines(self) -> list[str]:
         """One line for each mouse that is left out."""
         return [
@@ -94,19 +100,19 @@ class Exclusions:
         ]
 
 
-def fault_lines(health: Health) -> list[str]:
-    """One line for each sensor that does not work, with what to check."""
+def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
+    """One line for each sensor that does not work, with what to check, and for each mouse that is left out."""
     lines = []
     for name, of in health.sensors.items():
         state = of.get("state")
-        if state in ("ok", "absent", None):
+        if state in ("ok", "absent", None) or name in exclusions.names:
             continue
         cure = "check VCC, SDA=A4, SCL=A5" if not name.startswith("mouse") else "check its cable and pull-ups"
         if state in _STATES:
             lines.append(f"{name.upper()} is {state}")
         else:
             lines.append(f"{name.upper()} {state.upper()}: {cure}")
-    return lines
+    return lines + exclusions.lines()
 
 
 def working_sensors(health: Health) -> list[str]:
@@ -116,7 +122,7 @@ def working_sensors(health: Health) -> list[str]:
 
 def signed_angle(value_deg: float, decimals: int = 1) -> str:
     """An angle with its sign: +13.1°."""
-    return f"{value_deg:+.{decimals}f}°".replace("-", "−") if math.isfinite(value_deg) else "not known yet"
+    return minus(f"{value_deg:+.{decimals}f}°") if math.isfinite(value_deg) else UNKNOWN
 
 
 def angle_with_std(value_deg: float, std_deg: float) -> str:
@@ -151,13 +157,13 @@ def pose_text(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
 def length_with_std(value_m: float, std_m: float) -> str:
     """A length and its standard deviation (m), to the same digit: 1.5906 m ±0.4 mm, 1.591 m ±1.2 cm."""
     if not math.isfinite(value_m):
-        return "not known yet"
+        return UNKNOWN
     return length_text(value_m, std_m) + (f" ±{std_text(std_m)}" if math.isfinite(std_m) else "")
 
 
 def length_text(value_m: float, std_m: float) -> str:
     """A length to the last digit of its standard deviation (m); a dash where it is not finite."""
-    return f"{value_m:.{_digits(std_m).of_value}f} m" if math.isfinite(value_m) else "–"
+    return minus(f"{value_m:.{_digits(std_m).of_value}f} m") if math.isfinite(value_m) else "–"
 
 
 def aligned_length(value_m: float, std_m: float) -> str:
@@ -182,6 +188,16 @@ def same_digits(first: float, *others: float) -> list[str]:
     """Errors as texts that end at the same digit, the third one of the first."""
     decimals = max(0, min(_MOST_ERROR_DECIMALS, 2 - math.floor(math.log10(first)))) if first > 0 else 0
     return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
+
+
+def minus(number: str) -> str:
+    """A number with a minus sign, which is as wide as a plus sign, in place of the hyphen."""
+    return number.replace("-", "−")
+
+
+def with_unit(number: str, unit: str) -> str:
+    """A number with its unit; the degree sign stands without a space: 0.4 cm, 0.4°."""
+    return number + ("" if unit == "°" else " ") + unit
 
 
 def counted(number: int, noun: str) -> str:

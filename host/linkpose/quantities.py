@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -189,6 +190,11 @@ def split(column: str) -> Column | None:
 def unit_text(unit: str) -> str:
     """A unit as columns write it, for people: m/s for m_s, ° for deg."""
     return {"deg": "°", "m_s": "m/s", "rad_s": "rad/s", "m_s2": "m/s²"}.get(unit, unit)
+
+
+def words(name: str) -> str:
+    """A quantity's name for people: axial rotation for axial_rotation, height 1 for height1."""
+    return re.sub(r"(?<=[a-z]{2})(?=\d)", " ", name.replace("_", " "))
 
 
 def decimals(column: str) -> int:

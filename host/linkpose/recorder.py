@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from linkpose.device.session import Placement, Session
-from linkpose.errors import InvalidValue, LinkposeError
-from linkpose.recording.csvfile import create
+from linkpose.errors import FileChanged, InvalidValue, LinkposeError
+from linkpose.recording.csvfile import check_unchanged, create
 from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.devices import MOUSE_VALID, slow_mouse_remarks
 from linkpose.sensors.health import HealthMonitor, expected_sensors
-from linkpose.sensors.measurements import Measurements
+from linkpose.sensors.measurements import Block, Measurements
 from linkpose.sensors.rig import Rig
 
 
@@ -40,6 +40,7 @@ class Recorder:
         self.marks: list[float] = []  # instants (s) that the user marked; they go into the closing line
         self._counts_per_m = [mouse.counts_per_m for mouse in rig.mouse]
         self._limits_reported = False
+        self._path = path
         self._writer: RecordingWriter | None = None
         if path is not None:
             clock = {"source": "host", "drift_ppm": session.health().drift_ppm}
@@ -53,13 +54,31 @@ class Recorder:
         """
         block = self._converter.convert_placed([p.sample for p in placements], [p.place for p in placements])
         if self._writer is not None and placements:
-            self._writer.write_block(block)
+            self._write(self._writer, block)
         checked, changes = self.monitor.check(block.measurements)
         for change in changes:
             self._session.notify(str(change))
         self._count_late_mice(placements)
         self._report_speed_limits()
         return checked
+
+    @property
+    def path(self) -> Path | None:
+        """The recording, which has another name than at the start if another program took the file away."""
+        return self._path
+
+    def _write(self, writer: RecordingWriter, block: Block) -> None:
+        """Writes rows, into a new file if another program removed or changed the recording."""
+        try:
+            writer.write_block(block)
+        except FileChanged as change:
+            self._continue_elsewhere(writer, change)
+            writer.write_block(block)
+
+    def _continue_elsewhere(self, writer: RecordingWriter, change: FileChanged) -> None:
+        writer.continue_elsewhere()
+        self._path = writer.path
+        self._session.notify(f"{change}; the recording goes on in {writer.path}")
 
     def _report_speed_limits(self) -> None:
         """Once the board has measured its polls, report mice that the rig's calibration shows to overflow early."""
@@ -95,7 +114,12 @@ class Recorder:
                 more: dict[str, Any] = {"board": board, "sensors": self.monitor.as_dict(), "ended": ended}
                 if self.marks:
                     more["marks"] = [round(time_s, 6) for time_s in sorted(self.marks)]
-                writer.close(closing(timeline, health.corrupt, health.drift_ppm, **more))
+                end = closing(timeline, health.corrupt, health.drift_ppm, **more)
+                try:
+                    writer.close(end)
+                except FileChanged as change:
+                    self._continue_elsewhere(writer, change)
+                    writer.close(end)
 
     def __enter__(self) -> Recorder:
         return self
@@ -103,6 +127,18 @@ class Recorder:
     def __exit__(self, *_: object) -> None:
         with contextlib.suppress(LinkposeError):  # the failure that led here is on its way to the user
             self.close("failure")
+
+
+class _RawCapture(io.FileIO):
+    """An unbuffered file. Raises FileChanged when another program removes or changes it."""
+
+    def __init__(self, descriptor: int, path: Path) -> None:
+        super().__init__(descriptor, "wb")
+        self._path = path
+
+    def write(self, data: Any) -> int:
+        check_unchanged(self.fileno(), self._path)
+        return super().write(data)
 
 
 @contextlib.contextmanager
@@ -114,5 +150,5 @@ def raw_capture(path: Path | None, force: bool = False) -> Iterator[BinaryIO | N
     if path is None:
         yield None
         return
-    with os.fdopen(create(path, force), "wb", buffering=0) as file:
+    with _RawCapture(create(path, force), path) as file:
         yield file

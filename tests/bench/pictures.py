@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 import linkpose as lp
-from linkpose.cli.view import Screen
+from linkpose.cli.screen import Screen
 from linkpose.estimation import Estimates
 from linkpose.page import Page, PageStatus
 from linkpose.presentation import RowReader

@@ -65,7 +65,8 @@ class Browser:
         assert self._process.stderr is not None
         for line in self._process.stderr:
             if "DevTools listening on " in line:
-                return connect(line.split(" on ", 1)[1].strip(), max_size=None)
+                # No pings: a browser on a loaded machine answers late, and PATIENCE_S bounds each wait anyway.
+                return connect(line.split(" on ", 1)[1].strip(), max_size=None, ping_interval=None)
         raise AssertionError("chromium ended without a DevTools address")
 
     def call(self, method: str, **params: Any) -> Any:

@@ -54,6 +54,8 @@ class PtyBoard:
         self._master, self._slave = os.openpty()
         tty.setraw(self._master)
         tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._unsent = b""
         self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
         self.path.symlink_to(os.ttyname(self._slave))
         self._stop.clear()
@@ -78,7 +80,7 @@ class PtyBoard:
 
         self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
         if says_hello:
-            os.write(self._master, encode(simulated.hello(simulated.DEFAULTS)))
+            self._send(encode(simulated.hello(simulated.DEFAULTS)))
 
     def _serve(self) -> None:
         while not self._stop.is_set():
@@ -90,9 +92,13 @@ class PtyBoard:
             now_us = int((time.perf_counter() - self._began) * 1e6)
             streamed = self._board.advance(now_us)
             sent = streamed + self._board.receive(received, now_us)
-            if sent:
-                os.write(self._master, self.spoil(sent))
+            self._send(self.spoil(sent) if sent else b"")
             if streamed:
                 self.streams.set()
-            if self.chatter:
-                os.write(self._master, self.chatter)
+            self._send(self.chatter)
+
+    def _send(self, data: bytes) -> None:
+        """Sends data, or drops them whole while a host that does not read leaves earlier ones unsent."""
+        data = self._unsent or data
+        with contextlib.suppress(BlockingIOError):
+            self._unsent = data[os.write(self._master, data) :] if data else b""

@@ -113,7 +113,7 @@ def test_the_command(tmp_path, field, is_written):
     done = CliRunner().invoke(mag_command.command, [path, "--rig", str(rig), "--json"])
     assert json.loads(done.stdout)["is_plausible"] == is_written == rig.exists()
     if is_written:
-        assert f"next: linkpose calibrate joint SWING.csv --rig {rig}" in done.stderr
+        assert f"next: linkpose record swing.csv\nthen: linkpose calibrate joint swing.csv --rig {rig}" in done.stderr
         shown = CliRunner().invoke(mag_command.command, [path, "--rig", str(rig), "-q"])
         assert "µT, dip 54." in shown.stdout and "% of all attitudes: " in shown.stdout
         assert "next" not in shown.stderr

@@ -170,7 +170,7 @@ def test_the_command_and_a_simulation_of_the_same_sensor(tmp_path):
     assert len(found["gyro_allan"]["tau_s"]) == len(found["gyro_allan"]["deviation_rad_s"][0])
     shown = CliRunner().invoke(noise_command.command, [str(path), "--rig", str(rig)])
     assert "bias instability ≤" in shown.stdout and "too short" in shown.stdout
-    assert f"next: linkpose calibrate imu RESTS.csv --rig {rig}" in shown.stderr
+    assert f"next: linkpose record rests.csv\nthen: linkpose calibrate imu rests.csv --rig {rig}" in shown.stderr
     outputs = ["-o", str(tmp_path / "sim.csv"), "--truth", str(tmp_path / "truth.csv"), "--duration", "2"]
     simulated = CliRunner().invoke(simulate_link.command, [*outputs, "--errors", str(rig)])
     assert simulated.exit_code == 0

@@ -378,7 +378,7 @@ def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
         imu_command.command, [str(rec), "--rig", str(rig_file), "--json"], catch_exceptions=False
     )
     assert json.loads(found.stdout)["attitudes"] == 6
-    assert f"next: linkpose calibrate joint SWING.csv --rig {rig_file}" in found.stderr
+    assert f"next: linkpose record swing.csv\nthen: linkpose calibrate joint swing.csv --rig {rig_file}" in found.stderr
     errors = LinkRun(1, 0, 40.0, errors="datasheet", rests=True).imu_errors
     assert Rig.load(rig_file).imu.gyro_bias_rad_s == pytest.approx(errors.gyro_bias_rad_s, abs=1e-3)
     assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)

@@ -20,7 +20,7 @@ from linkpose.device import ports
 from linkpose.device import session as session_module
 from linkpose.device.session import Session
 from linkpose.errors import BoardError, CannotWrite
-from linkpose.recorder import Recorder
+from linkpose.recorder import Recorder, raw_capture
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.mpu6050 import self_test_deviation
@@ -134,7 +134,6 @@ def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple
     Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
     how long anything takes.
     """
-    from linkpose.recorder import Recorder
     from linkpose.sensors.rig import Rig
 
     messages: list[str] = []
@@ -493,14 +492,52 @@ def test_a_board_that_starts_and_sends_no_sample_is_a_failure(tmp_path):
         assert not any(session.stream(0.1))
 
 
-def test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence(tmp_path):
-    out = tmp_path / "r.csv"
-    refusal = pytest.raises(CannotWrite, match="it was removed while it was being written")
-    with Session("sim://link?speed=20", print) as session, Recorder(session, out, Rig()) as recorder, refusal:
-        for placements in session.stream(20):
+def _replace(path: Path) -> None:
+    """As a second program with --force does."""
+    path.unlink()
+    path.write_text("another program's\n")
+
+
+def _append(path: Path) -> None:
+    with path.open("a") as file:
+        file.write("a line\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason", "keeps", "plain"),
+    [
+        (Path.unlink, "it was removed", True, True),
+        (_replace, "it was removed", True, False),
+        (lambda path: path.write_text(""), "another program changed it", False, False),
+        (_append, "another program changed it", False, True),
+    ],
+    ids=["removed", "replaced", "emptied", "written"],
+)
+def test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file(tmp_path, change, reason, keeps, plain):
+    """With the rows so far, where another program has not changed them."""
+    out, said, before = tmp_path / "r.csv", [], 0
+    (tmp_path / "r-2.csv").write_text("taken\n")
+    with Session("sim://link?speed=0", said.append) as session, Recorder(session, out, Rig(), plain=plain) as recorder:
+        for placements in session.stream(2):
+            if not before and session.timeline.samples - len(placements) > 10:
+                before = session.timeline.samples - len(placements)
+                change(out)
             recorder.convert(placements)
-            if session.timeline.samples > 10:
-                Recorder(session, out, Rig(), force=True).close("duration")  # a second program, with --force
+        recorder.close("duration")
+    assert said == [
+        f"cannot write {out}: {reason} while it was being written; the recording goes on in {recorder.path}"
+    ]
+    assert recorder.path == tmp_path / "r-3.csv"
+    table = read_table(recorder.path, "recording")
+    assert len(table) == (200 if keeps else 200 - before) and table.closing["ended"] == "duration"
+
+
+def test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence(tmp_path):
+    raw = tmp_path / "r.bin"
+    refusal = pytest.raises(CannotWrite, match="it was removed while it was being written")
+    with raw_capture(raw) as file, Session("sim://link?speed=0", print, file) as session, refusal:
+        for _ in session.stream(2):
+            raw.unlink(missing_ok=True)
 
 
 def test_a_recording_is_not_called_a_raw_capture(refused, tmp_path):

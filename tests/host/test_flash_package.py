@@ -200,6 +200,12 @@ def test_a_wheel_for_all_platforms_can_be_built(built: tuple[Path, Path], tmp_pa
     assert not [name for name in zipfile.ZipFile(wheel).namelist() if "_machine_code" in name]
 
 
+def test_an_unknown_filter_to_compile_ends_the_build(built: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as failed:
+        call_backend(built[0], "build_wheel", tmp_path, LINKPOSE_MACHINE_CODE="tilt,barro")
+    assert "names 'barro'; set it to `no`" in failed.value.stderr
+
+
 def test_the_wheel_compiles_every_filter_and_method() -> None:
     sys.path.insert(0, str(ROOT / "host"))
     try:

@@ -14,7 +14,9 @@ from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.likelihood import run_filter
 from linkpose.localization.localizer import estimate_track
 from linkpose.localization.noise import RangeNoise
+from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.settings import Settings
+from linkpose.localization.stream import Stream
 from linkpose.localization.tables import Truth, score_track
 from linkpose.localization.tuning import LEAST_TURN_RAD_S, TUNABLE, correlation_time, tune, warm_up
 
@@ -222,3 +224,20 @@ def test_the_command_reports_the_noises_it_found_and_draws_the_path(tmp_path) ->
         command, [str(tmp_path / "log.csv"), "--beacons", str(tmp_path / "beacons.csv"), "--plot", str(picture)]
     )
     assert "exists" in str(again.exception or again.output)
+
+
+def test_a_stream_estimates_errors_that_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From 300 ranges on, their drifts are states: σ of the rows is as large as the errors, unlike without them."""
+    monkeypatch.setattr("linkpose.localization.stream.TUNED_AFTER", (200,))
+    log, truth = drive(2, duration_s=70.0, range_std=0.3, persists_s=5.0)
+    lines = ["time_s,kind,a,b,c\n", *(format_event(event) + "\n" for event in log if isinstance(event, Event))]
+    known = LocalizationOptions(speed_std_m_s=0.02, turn_std_rad_s=0.02, range_growth=0.0, estimate=())
+    shares = []
+    for options in (known, replace(known, drift_std_m=0.0, error_time_s=0.0)):
+        reports: list[str] = []
+        stream = Stream("ekf", options, BEACONS, reports.append)
+        rows = list(stream.rows(lines))
+        assert stream.run is not None and len(rows[-1].state) == len(stream.run.states) == 3
+        track = stream.run.track([row for row in rows if row.time_s > 40.0])
+        shares.append(score_track(track, truth).within_2_sigma or 0.0)
+    assert shares[0] > 0.9 > shares[1] + 0.2

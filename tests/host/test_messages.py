@@ -112,6 +112,12 @@ def to_removed_file(folder: Path, _: pytest.MonkeyPatch) -> None:
         file.write("1\n")
 
 
+def to_changed_file(folder: Path, _: pytest.MonkeyPatch) -> None:
+    with CsvFile(folder / "a.csv", "recording", {}, ["time_s"], force=False) as file:
+        (folder / "a.csv").write_text("")
+        file.write("1\n")
+
+
 def with_long_line(folder: Path, patch: pytest.MonkeyPatch) -> object:
     patch.setattr(chunks, "CHUNK_BYTES", 100)
     return read_table(written(folder / "a.csv", "time_s,a\n0,1\n" + "9" * 500))
@@ -195,6 +201,7 @@ PRODUCERS: list[Producer] = [
     lambda folder, _: read_table(folder / "none.csv"),
     lambda folder, _: create(folder / "no" / "a.csv", False),
     to_removed_file,
+    to_changed_file,
     to_full_disk,
     to_closed_pipe,
     lambda folder, _: plotting.check_output(folder / "a.xyz", False),
@@ -346,8 +353,9 @@ PROMISES = {
         "test_health.py::test_a_sensor_that_freezes_while_recording_is_reported_and_stored",
     ],
     "the disk is full": ["test_recording.py::test_a_full_disk_leaves_whole_rows_and_says_so"],
-    "the file is removed while it is written": [
-        "test_device.py::test_a_recording_that_is_removed_or_replaced_ends_with_a_sentence"
+    "the recording is removed, replaced, emptied or written by another program": [
+        "test_device.py::test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file",
+        "test_device.py::test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence",
     ],
     "the terminal or a pipe behind standard error goes away": [
         "test_streams.py::test_a_message_that_cannot_be_shown_does_not_end_the_recording"

@@ -105,6 +105,7 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
     rows = link_rows()
     rows = np.delete(rows, slice(100, 140), axis=0)  # a pulled cable: 2 s without samples
     rows[-40:-30, 1:] = np.nan
+    rows[:5, 2] = 5.0  # of a filter that has just started
     with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
         page.show(rows, status())
         browser.open(page.url)
@@ -114,6 +115,8 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         browser.wait_for(f"{chart_data('height')}[3].length > 150")
         time, *_, height = browser.evaluate(f"{chart_data('height')}.slice(0, 4).map(e => [...e])")
         missing = [at for at, value in zip(time, height, strict=True) if value is None]
+        band = browser.evaluate(f"[...{chart_data('height')}[2]]")
+        assert max(filter(None, band)) < 2.0
         assert len(missing) == 11 and rows[99, 0] < missing[0] < rows[100, 0]
         page.show(np.empty(0), status(imu="not answering"))
         alarm = "[...document.querySelectorAll('[role=alert]')].find(e => e.innerText.includes('IMU NOT ANSWERING'))"
@@ -124,9 +127,12 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         page.show(np.empty(0), lambda: PageStatus(status()().health, found))
         browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
         browser.open("about:blank")  # and back: the page goes on
+        page.begin_anew(rows + np.array([0.0, 0.1, *[0.0] * 5]))  # a better filter has caught up
         browser.open(page.url)
         browser.wait_for_text("not excited yet")
+        browser.wait_for_text(f"{rows[-1, 1] + 0.1:.3f} m ±2.0 cm")
         browser.wait_for(f"{chart_data('height')}[3].length > 150")
+        assert browser.evaluate(f"{chart_data('height')}[3][5]") == pytest.approx(rows[5, 1] + 0.1)
         browser.screenshot(tmp_path / "page.png")
         leave_without_error(browser)
 
@@ -208,11 +214,13 @@ def test_localize_shows_the_path_that_it_found(browser: Browser, tmp_path: Path)
     beacons.write_text("id,x_m,y_m\nA,3,2\nB,0,-4\n")
     truth.write_text("time_s,x_m,y_m,heading_rad\n0,0,0,0\n5.9,5.9,0,0\n")
     typed = ["localize", log, "--beacons", beacons, "--truth", truth, "--start", "0,0,0", "--view"]
+    typed += ["--plot", tmp_path / "path.html"]
     with command(*typed) as (process, url):
         browser.open(url)
         browser.wait_for_text("place and heading, ekf")
         browser.wait_for_text("5.9 s")
         x_m = float(browser.evaluate("document.body.innerText.match(/x (\\d\\.\\d+) m ±/)[1]"))
+        assert "__VISER_EMBED_DATA__" in (tmp_path / "path.html").read_text()
         assert x_m == pytest.approx(5.9, abs=0.1)
         browser.screenshot(tmp_path / "localize.png")
         leave_without_error(browser)
@@ -260,6 +268,8 @@ def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Pa
     browser.wait_for("!!document.querySelector('canvas') && !!document.querySelector('input')")
     leave_without_error(browser)
     assert linkpose("plot", estimate, "-o", tmp_path / "e.gif").status == 2
+    refused = linkpose("evaluate", estimate, estimate, "--plot", tmp_path / "e.html")
+    assert refused.status == 2 and "`linkpose plot ESTIMATE.csv -o FILE.html` plays" in refused.err
 
 
 def test_what_is_not_excited_yet_is_shown() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from robot_counts import DEG, LEGS, Robot, counts, gyro, measurements, rig, robot
+from robot_counts import DEG, LEGS, TRIANGLE, Robot, counts, gyro, measurements, rig, robot
 
 from linkpose.experiments.planar import PlanarRun, baseline, pose_error
 from linkpose.filters.planar import PlanarEkf
@@ -121,3 +121,16 @@ def test_estimate_reports_the_gyro_s_jump_and_the_mouse_that_is_left_out(linkpos
     closing = json.loads(estimates.read_text().strip().split("\n")[-1].removeprefix("# "))
     assert closing["gyro_jumps"]["last_rad_s"] == pytest.approx(0.06, abs=0.005)
     assert closing["excluded_mice_since_s"]["mouse2"] == pytest.approx(12.0, abs=0.2)
+
+
+def test_a_mouse_elsewhere_than_the_rig_file_states_is_found_by_the_turns():
+    run = robot(4)
+    places = (*TRIANGLE[:1], (-0.08, 0.16), *TRIANGLE[2:])
+    filter_, out, _ = estimated(run, rig(), measurements(run, counts(run, places), gyro(run)))
+    assert pose_error(out[:, :3], run.pose).position_m < 0.05 and share_within(run, out, 3.0)[0] > 0.7
+    assert np.hypot(out[-1, 6], out[-1, 7]) < 0.15
+    (moved,) = filter_.moved_mice
+    assert (
+        moved.mouse == 2 and moved.x_m == pytest.approx(-0.08, abs=0.01) and moved.y_m == pytest.approx(0.16, abs=0.01)
+    )
+    assert PlanarEkf(rig()).moved_mice == ()

@@ -14,8 +14,9 @@ from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
 from linkpose.localization.grid import GridMap
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import lines
-from linkpose.plotting.canvas import COLOURS
+from linkpose.plotting.canvas import COLOURS, legend_above
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -100,8 +101,10 @@ def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
 def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
     labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == ["height over the joint\n(m)", "from best (cm)", "roll (°)"]
-    assert drawn(figure.axes[1])[0] == "joint-inertial (best)"
+    # The best filter's ±2σ has a panel of its own, where the others differ so much that it would look like a line.
+    assert labels == ["height over the joint\n(m)", "from best (cm)", "from best (cm)", "roll (°)"]
+    assert drawn(figure.axes[1]) == ["joint-inertial (best)", "±2σ joint-inertial"]
+    assert drawn(figure.axes[2])[:2] == ["joint-inertial (best)", "joint 0.639 cm rms from it"]
 
 
 def test_gaps_and_unknown_values_are_shaded(tmp_path):
@@ -140,7 +143,7 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert (path.get_xlabel(), path.get_ylabel(), path.get_aspect()) == ("x (m)", "y (m)", 1.0)
     assert drawn(path) == ["truth", "planar-ekf", "±2σ planar-ekf"]
     assert {(e.width, e.height) for e in path.patches if hasattr(e, "width")} == {(0.04, 0.08)}
-    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading, unwrapped\n(°)")
+    assert (speed.get_ylabel(), heading.get_ylabel()) == ("speed (m/s)", "heading (°)")
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
     (bar,) = mice.collections[1].get_paths()  # of mouse 2
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
@@ -161,7 +164,7 @@ def test_a_map_and_beacons_lie_under_the_path(tmp_path):
     t = np.arange(50) / 100
     file = write(tmp_path / "e.csv", {"time_s": t, "ekf_x_m": t, "ekf_y_m": t})
     grid = GridMap(np.eye(4, 8, dtype=np.uint8), np.array([0.5, 1.0, 2.0, np.pi / 2]))
-    scene = plotting.PathBackground(grid, {"A1": (3.0, 4.0, 9.0)})
+    scene = Surroundings(grid, {"A1": (3.0, 4.0, 9.0)})
     figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
     (path,) = figure.axes
     (image,) = path.images
@@ -177,11 +180,13 @@ def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
     t = np.arange(300) / 100
     angle = 30 * np.sin(t)
     estimate = {"time_s": t, "chain_angle_deg": angle + 1, "chain_angle_std_deg": np.ones(300)}
+    estimate |= {f"chain_q{axis}": np.full(300, float(axis == "w")) for axis in "wxyz"} | {"tilt_height_m": t}
     truth = {"time_s": t, "chain_angle_deg": angle}
     paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", truth, "truth"))
-    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    figure, remarks = plotting.plot_tables([read_table(Path(path)) for path in paths])
     assert [axes.get_ylabel() for axes in figure.axes] == ["joint angle (°)", "angle error (°)"]
-    assert drawn(figure.axes[1])[0] == "chain 1 ° rms"
+    assert drawn(figure.axes[1])[0] == "chain 1° rms"
+    assert remarks == ["not drawn beside a chain: tilt (add --filter tilt)"]
 
 
 def test_a_ball_joint_has_a_panel_for_each_angle_with_its_truth(tmp_path):
@@ -233,7 +238,8 @@ def test_long_lines_keep_their_extremes_and_few_points(tmp_path):
 def test_an_evaluation_shows_errors_their_distribution_and_the_table(tmp_path):
     found = evaluate(*link_files(tmp_path))
     figure = plotting.evaluation(found, "e.csv", "t.csv")
-    errors, density, roll, table = figure.axes
+    best, _, errors, density, roll, table = figure.axes
+    assert drawn(best) == [drawn(errors)[0], "±2σ joint-inertial"] and "joint 0.7" in drawn(errors)[1]
     assert errors.get_ylim()[0] < 0.0
     assert errors.get_ylabel() == "height error (cm)" and roll.get_ylabel() == "roll error (°)"
     share = found.scores[0].statistics()["height"].within_2sigma
@@ -299,3 +305,41 @@ def test_reproduce_link_prints_every_method_on_every_test(linkpose, tmp_path):
 def test_reproduce_link_shows_the_papers_tables_beside(linkpose):
     shown = linkpose("reproduce", "link", "--seeds", 1).out
     assert "Table 1" in shown and "Table 2" in shown and "17.34" in shown and "joint A" in shown
+
+
+def test_a_legend_reads_row_by_row_and_single_values_are_dots(tmp_path):
+    axes = plotting.new_figure(4, 4).add_subplot()
+    for name in "abcdefg":
+        lines.draw(axes, np.arange(3.0), np.array([1.0, np.nan, 2.0]), label=name)
+    legend_above(axes, 3, list("abcdefg"))
+    shown = [text.get_text() for text in axes.get_legend().get_texts()]
+    columns = np.array_split(shown, 3)  # as matplotlib fills them
+    assert [column[row] for row in range(3) for column in columns if row < len(column)] == list("abcdefg")
+    assert axes.lines[1].get_xdata().tolist() == [0.0, 2.0] and axes.lines[1].get_marker() == "."
+
+
+def test_a_long_name_is_shortened_and_an_empty_estimate_refused(tmp_path):
+    t = np.arange(100) / 100
+    table = read_table(Path(write(tmp_path / f"{'n' * 150}.csv", {"time_s": t, "tilt_height_m": t})))
+    figure, _ = plotting.plot_tables([table])
+    assert "…" in figure.get_suptitle() and len(figure.get_suptitle()) < 120
+    empty = read_table(Path(write(tmp_path / "empty.csv", {"time_s": t, "tilt_height_m": np.nan * t})))
+    with pytest.raises(LinkposeError, match="its quantities are empty in all rows"):
+        plotting.plot_tables([empty])
+
+
+def test_an_evaluation_draws_what_matters_first(tmp_path):
+    """The position of a robot; a chain without the filters of one of its sensors, which are in the table."""
+    t = np.arange(300) / 100
+    place = {"x_m": t, "y_m": np.sin(t), "heading_rad": 0.1 * np.sin(t)}
+    estimate = {"time_s": t} | {f"mice_{name}": value + 0.01 for name, value in place.items()}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", {"time_s": t} | place, "truth"))
+    figure = plotting.evaluation(evaluate(*(read_table(Path(path)) for path in paths)), "e", "t")
+    assert [axes.get_ylabel() for axes in figure.axes[:2]] == ["position error (m)", "heading error (rad)"]
+    still = {f"q{axis}": np.full(300, float(axis == "w")) for axis in "wxyz"} | {"height_m": np.sin(t)}
+    estimate = {"time_s": t, "tilt_height_m": np.sin(t) + 0.01} | {f"chain_{n}": still[n] for n in still if n[0] == "q"}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", {"time_s": t} | still, "truth"))
+    figure = plotting.evaluation(evaluate(*(read_table(Path(path)) for path in paths)), "e", "t")
+    assert [axes.get_ylabel() for axes in figure.axes] == ["rotation error (°)", ""]
+    cells = [cell.get_text().get_text() for cell in figure.axes[-1].tables[0].get_celld().values()]
+    assert {"tilt", "chain"} <= set(cells)

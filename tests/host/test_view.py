@@ -14,10 +14,12 @@ from terminal import Terminal
 
 import linkpose as lp
 from linkpose import quantities
-from linkpose.cli.curve import Canvas, curve, path_map
+from linkpose.cli.characters import replacement
+from linkpose.cli.curve import Canvas, curve, path_map, time_axis
 from linkpose.cli.keys import Keys, Marker
-from linkpose.cli.view import Extremes, Screen, final_table
+from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
+from linkpose.extremes import Extremes
 from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.simulation.link import LinkRun
@@ -69,21 +71,34 @@ def test_faults_and_exclusions_are_never_cut(width: int) -> None:
     shown = screen.render(health(imu={"state": "silent"}), width, 6).plain
     assert "IMU SILENT" in shown
     assert "mouse 2 LEFT OUT since 5.1 s" in shown
+    mice = {f"mouse{port}": {"state": "left out" if port == 2 else "ok"} for port in (1, 2, 3)}
+    shown = screen.render(health(**mice), width, 20).plain
+    assert all(state in shown for state in ("MOUSE1 ok", "MOUSE2 left out", "MOUSE3 ok")) and "MOUSE2 is" not in shown
 
 
 def test_an_unknown_height_is_said_to_be_unknown() -> None:
     screen = Screen("sim://link", ["joint-inertial"])
     screen.add(0.0, {"joint-inertial": {quantities.HEIGHT: (math.nan, math.nan)}})
-    assert "not known yet" in screen.render(health(), 80, 24).plain
+    assert "not known" in screen.render(health(), 80, 24).plain
 
 
 def test_the_curve_covers_its_values() -> None:
     times = [0.1 * at for at in range(200)]
     lines = curve(times, [math.sin(time) for time in times], 20.0, 78, 5, 0.02)
     assert len(lines) == 5 and {len(line) for line in lines} == {78}
-    assert lines[0].strip().startswith("1.0") and lines[-1].strip().startswith("-1.0")
+    assert [line.split("┤")[0].strip() for line in lines] == ["1.0", "0.5", "0.0", "−0.5", "−1.0"]
     assert all(any(char > "\u2800" for char in line.split("┤")[1]) for line in lines)
+    far = curve([0.0, 1.0], [-1234.5, -1234.5 + 1e-9], 20.0, 30, 5, 0.02)
+    assert [line.split("┤")[0] for line in far] == ["−1234.490", "−1234.495", "−1234.500", "−1234.505", "−1234.510"]
+    assert time_axis(20.0, 4, 24) == "    └ 20 s ago ──── now"
     assert curve([0.0], [math.nan], 20.0, 30, 3, 0.02) == [" " * 30] * 3
+
+
+def test_a_code_page_keeps_signs_columns_and_the_curve() -> None:
+    assert replacement("▸ joint  1.59 m ±0.4 mm  −3.2°") == "> joint  1.59 m +/-0.4 mm  -3.2 deg"
+    canvas = Canvas(8, 1)
+    canvas.line((0, 0), (15, 3))
+    assert replacement(canvas.lines()[0]) == "''----.." and replacement("\u2800\u28ff") == " :"
 
 
 def test_dots_are_where_they_should_be() -> None:
@@ -95,13 +110,15 @@ def test_dots_are_where_they_should_be() -> None:
 
 
 def test_the_path_ends_at_the_robot() -> None:
-    lines = path_map([0.0, 1.0, 1.0], [0.0, 0.0, 1.0], 20, 10)
+    lines, scale = path_map([0.0, 1.0, 1.0], [0.0, 0.0, 1.0], 20, 10)
+    # 1 m is 39 dots of 40 high; a character is two dots wide, and 0.2 m are four of them.
+    assert scale == "├──┤ 0.2 m" and path_map([math.nan], [0.0], 20, 10) == ([" " * 20] * 10, "")
     assert lines[0].rstrip("\u2800").endswith("o")
 
 
 def test_standard_deviations_are_shown_in_fitting_units() -> None:
     assert length_with_std(1.5906, 0.0004) == "1.5906 m ±0.4 mm"
-    assert length_with_std(math.nan, 0.1) == "not known yet"
+    assert length_with_std(math.nan, 0.1) == "not known"
     assert length_with_std(1.5906, math.nan) == "1.591 m"
 
 
@@ -141,10 +158,15 @@ def test_filters_that_become_ready_late_give_the_same_estimates() -> None:
             ready |= {"tilt"}
         if at == 40:
             ready |= {"joint", "text"}
-        complete, newest = late.process(block[at : at + 5])
+        complete, newest, caught_up = late.process(block[at : at + 5])
         rows.append(complete)
         tilt, joint = newest[1 : 1 + 4], newest[5:]
         assert np.isnan(tilt).all() == (at < 20) and np.isnan(joint).all() == (at < 40)
+        # A filter that catches up gives all rows so far once more: the view's curve does not begin at this moment.
+        assert len(caught_up) == (at + 5 if at in (20, 40) else 0)
+        if at == 20:
+            assert np.array_equal(caught_up[:, 1:5], expected[:25, 1:5], equal_nan=True)
+            assert np.isnan(caught_up[:, 5:]).all()
     rows.append(late.finish())
     assert [len(part) for part in rows[:8]] == [0] * 8
     assert np.array_equal(np.concatenate(rows), expected, equal_nan=True)
@@ -271,7 +293,7 @@ def test_a_chain_shows_its_joint_angle_with_its_deviation_and_curve() -> None:
         screen.add(0.1 * at, {"joint-inertial": {quantities.HEIGHT: (0.2, 0.001)}, "chain": values})
     shown = screen.render(health(), 80, 24).plain
     assert "joint angle +26.0° ±0.4°   height 1 0.250 m ±1.0 cm" in shown and "HEIGHT over joint" in shown
-    assert shown.splitlines()[2].strip().startswith("30.0")
+    assert shown.splitlines()[2].strip().startswith("30┤")
     assert "height 1" not in screen.render(health(), 40, 24).plain
 
 
@@ -279,6 +301,6 @@ def test_a_ball_joint_shows_its_three_angles() -> None:
     screen = Screen("sim://chain", ["chain"])
     angles = zip(quantities.BALL_ANGLES, ((42.0, 0.9), (-3.0, 0.8), (math.nan, math.nan)), strict=True)
     screen.add(0.0, {"chain": dict(angles) | {quantities.HEIGHT1: (0.2, 0.001)}})
-    line = "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°   axial rotation not known yet"
+    line = "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°   axial rotation not known"
     assert line in screen.render(health(), 80, 24).plain.splitlines()
     assert "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°" in screen.render(health(), 60, 24).plain.splitlines()

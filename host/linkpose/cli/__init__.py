@@ -102,6 +102,9 @@ def _run() -> int:
         click.echo(f"linkpose: {printable(sentence(error))}", err=True)
         return 2 if isinstance(error, WRONG_USAGE) else 1
     except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None:
+            click.echo(f"linkpose: cannot use {printable(os.fsdecode(error.filename))}: {error.strerror}", err=True)
+            return 1
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
         what = f"{type(error).__name__}: {error}"

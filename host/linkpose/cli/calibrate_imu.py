@@ -41,7 +41,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
             f"{FEWEST_ATTITUDES} needed.",
             err=True,
         )
-    options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
+    calibrate = ("calibrate", "joint", "swing.csv", "--rig", rig_file)
+    options.show_rig_written(rig_file, quiet, "record", "swing.csv", then=calibrate)
 
 
 def _show(found: FoundImuErrors) -> None:

@@ -54,7 +54,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             err=True,
         )
     with_calibration(rig, found).save(rig_file)
-    options.show_rig_written(rig_file, quiet, f"calibrate joint SWING.csv --rig {rig_file}")
+    calibrate = ("calibrate", "joint", "swing.csv", "--rig", rig_file)
+    options.show_rig_written(rig_file, quiet, "record", "swing.csv", then=calibrate)
 
 
 def _show(found: MagCalibration) -> None:

@@ -44,7 +44,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             "--force to write the figures all the same"
         )
     with_calibration(rig, found).save(rig_file)
-    options.show_rig_written(rig_file, quiet, f"calibrate imu RESTS.csv --rig {rig_file}")
+    calibrate = ("calibrate", "imu", "rests.csv", "--rig", rig_file)
+    options.show_rig_written(rig_file, quiet, "record", "rests.csv", then=calibrate)
 
 
 def _show(found: NoiseCalibration) -> None:

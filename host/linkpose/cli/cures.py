@@ -14,6 +14,7 @@ FLASH = "type `linkpose flash`"
 # Error -> what the user types, from the error's facts. The most derived class counts.
 CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.FileExists: lambda e: "name another file or add --force to replace it",
+    errors.FileChanged: lambda e: "start again, and let no other program remove or write the file",
     errors.CannotWrite: lambda e: "name a file in a folder you may write to",
     errors.TooFewRows: lambda e: (
         f"to score the common part alone, add --from {e.common_s[0]:.6g} --to {e.common_s[1]:.6g}"
@@ -23,6 +24,9 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
         "about all axes"
         if "height" in e.quantities
         else "`linkpose info RECORDING` shows which sensors work"
+    ),
+    errors.UnknownPicture: lambda e: (
+        "`linkpose plot ESTIMATE.csv -o FILE.html` plays an estimate in 3-D" if e.path.endswith(".html") else ""
     ),
     errors.PortNotFound: lambda e: _nearest_port(e.port) + "`linkpose ports` lists the ports",
     errors.NotASerialPort: lambda e: "`linkpose ports` lists the ports",
@@ -53,7 +57,7 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
 }
 
 # Errors that are wrong usage: a name on the command line that does not exist.
-WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture)
+WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture, errors.NamedTwice)
 
 
 def _nearest_port(name: str) -> str:

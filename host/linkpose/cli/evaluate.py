@@ -76,13 +76,13 @@ def command(
 
 def _show(found: Evaluation, quiet: bool) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
 
+    from linkpose.cli.rendering import show_table
     from linkpose.presentation import same_digits
-    from linkpose.quantities import unit_text
+    from linkpose.quantities import unit_text, words
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(box=SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("filter", no_wrap=True)
     table.add_column("error of", no_wrap=True)
     for name in ("RMSE", "mean", "worst", "95 %", "NEES", "in ±2σ"):
@@ -96,9 +96,9 @@ def _show(found: Evaluation, quiet: bool) -> None:
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
-            table.add_row(title, f"{name} ({unit})", *figures, *sigma)
+            table.add_row(title, f"{words(name)} ({unit})", *figures, *sigma)
             title = ""
-    Console().print(table)
+    show_table(table)
     if quiet:
         return
     for score in found.scores:
@@ -113,10 +113,12 @@ def _show(found: Evaluation, quiet: bool) -> None:
 
 def _sentences(score: Score) -> list[str]:
     """How many rows were used, and whether σ is right, for each quantity that has one."""
+    from linkpose.quantities import words
+
     rows = f"{score.filter}: {score.rows} of {score.known_rows} rows compared"
     if score.empty_rows:
         rows += f", {score.empty_rows} without an estimate left out"
     if score.yaw_drift_deg_per_min is not None:
         rows += f"; the yaw drifts by {score.yaw_drift_deg_per_min:.2g} °/min"
     verdicts = {name: value.verdict() for name, value in score.statistics().items()}
-    return [f"{rows}.", *(f"  {name}: {verdict}" for name, verdict in verdicts.items() if verdict)]
+    return [f"{rows}.", *(f"  {words(name)}: {verdict}" for name, verdict in verdicts.items() if verdict)]

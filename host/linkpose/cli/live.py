@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
-from linkpose.errors import LinkposeError, printable
+from linkpose.errors import NamedTwice, printable
 from linkpose.presentation import counted
 
 if TYPE_CHECKING:
@@ -181,10 +181,10 @@ def health_line(health: Health) -> str:
 
 
 def refuse_same_file(*outputs: Path | None, source: Path | None = None) -> None:
-    """Raises LinkposeError when two outputs are one file, or one of them is the file that is read."""
+    """Raises NamedTwice when two outputs are one file, UsageError when one of them is the file that is read."""
     named = [path.absolute() for path in outputs if path is not None]
     for path in named:
         if named.count(path) > 1:
-            raise LinkposeError(f"{path} is named for two outputs; name two files")
+            raise NamedTwice(path)
         if source is not None and path == source.absolute():
-            raise LinkposeError(f"{path} is the recording that is read; name another file for the estimates")
+            raise click.UsageError(f"{path} is the recording that is read; name another file for the estimates")

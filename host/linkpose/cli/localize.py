@@ -46,14 +46,12 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in new
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
         if isinstance(value, tuple):
             return value
-        import math
-
         words = str(value).split(",")
         try:
             numbers = tuple(float(word) for word in words)
         except ValueError:
             numbers = ()
-        if len(numbers) != len(self.name.split(",")) or not all(math.isfinite(number) for number in numbers):
+        if len(numbers) != len(self.name.split(",")) or not all(abs(number) <= options.LARGEST for number in numbers):
             self.fail(f"{value!r} is not {self.name}, numbers separated by commas", param, ctx)
         return numbers
 
@@ -231,7 +229,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "picture",
     type=options.FILE,
     metavar="PICTURE",
-    help="Draw the paths with 2σ ellipses over the map or the beacons, and the truth (.png, .pdf, .svg).",
+    help="Draw the paths with 2σ ellipses, map, beacons and truth (.png, .pdf, .svg), or play them (.html).",
 )
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
@@ -279,13 +277,15 @@ def command(
         return
     from linkpose import precompile
     from linkpose.localization.paths import prepare
+    from linkpose.localization.surroundings import Surroundings
     from linkpose.localization.tables import read_truth
 
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
+        from linkpose.page.animation import FORMATS
         from linkpose.plotting import check_output
 
-        check_output(picture, force)
+        check_output(picture, force, FORMATS)
     options.refuse_mixed_output(output, json_lines)
     prepared = prepare(log, map_path, beacons_path, odometry_path, methods, chosen)
     for remark in prepared.remarks:
@@ -301,21 +301,18 @@ def command(
         from linkpose.evaluation.references import read_for_picture
 
         tables.append(read_for_picture(truth_path, "z"))
+    surroundings = Surroundings(prepared.grid, prepared.beacons, paths.tracks[paths.filters[0]].rejected_xy_m)
     if picture is not None:
-        from linkpose import plotting
+        from linkpose.page.animation import save_picture
 
-        scene = plotting.PathBackground(prepared.grid, prepared.beacons, paths.tracks[paths.filters[0]].rejected_xy_m)
-        figure, _ = plotting.plot_tables(tables, [], scene)
-        plotting.save(figure, picture, force)
+        save_picture(picture, tables, [], surroundings, force)
     scores = paths.score(truth) if truth else {}
     for name, track in paths.tracks.items():
         result = scores.get(name)
         text = json.dumps(_summary(name, track, result)) if json_lines else _sentence(name, track, result)
         click.echo(text, err=str(output) == "-")
     if has_page:
-        from linkpose.page.scene import Surroundings
-
-        page.play(tables, [], Surroundings(prepared.grid, prepared.beacons), console)
+        page.play(tables, [], surroundings, console)
 
 
 def _refuse_in_stream(given: dict[str, object]) -> None:

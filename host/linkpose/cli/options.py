@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import os
+import shlex
+import subprocess
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -65,6 +68,10 @@ class SecondsType(click.ParamType):  # type: ignore[type-arg]
         return seconds
 
 
+# Of numbers in options: squares of larger ones, and divisions by smaller ones, leave the range of numbers in a filter.
+LARGEST, SMALLEST = 1e9, 1e-9
+
+
 class FiniteRange(click.FloatRange):
     """A number within bounds. click's own range accepts NaN and infinity, and shows an open end as None."""
 
@@ -76,6 +83,10 @@ class FiniteRange(click.FloatRange):
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):
             self.fail(f"{value!r} is not finite", param, ctx)
+        if abs(number) > LARGEST:
+            self.fail(f"{value!r} is beyond {LARGEST:g}", param, ctx)
+        if self.min_open and self.min == 0 and number < SMALLEST:
+            self.fail(f"{value!r} is nearer to 0 than {SMALLEST:g}", param, ctx)
         return number
 
 
@@ -250,10 +261,19 @@ def quiet(function: Function) -> Function:
     return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
 
 
-def show_next(quiet: bool, following: str) -> None:
-    """What to type next, on stderr; nothing where a file that it names is the standard output."""
-    if not quiet and "-" not in following.split():
-        click.echo(f"next: linkpose {following}", err=True)
+def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
+    """The command to type next, and the one after it, on stderr; nothing where a file is the standard output."""
+    if quiet or "-" in map(str, words):
+        return
+    for when, command in (("next", words), ("then", then)):
+        if command:
+            click.echo(f"{when}: {typed(command)}", err=True)
+
+
+def typed(words: Iterable[object]) -> str:
+    """A command of linkpose as the user types it: a file's name with a space is quoted."""
+    texts = ["linkpose", *map(str, words)]
+    return subprocess.list2cmdline(texts) if os.name == "nt" else shlex.join(texts)
 
 
 def written(path: Path | None) -> str:
@@ -298,11 +318,11 @@ def recordings_and_rig(paths: Sequence[Path], rig_file: Path) -> tuple[list[Reco
     return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
 
 
-def show_rig_written(rig_file: Path, quiet: bool, following: str) -> None:
-    """The end of a calibration, on stderr: the rig file that was written, and what to type next."""
+def show_rig_written(rig_file: Path, quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
+    """The end of a calibration, on stderr: the rig file that was written, and what to type next, as `show_next`."""
     if not quiet:
         click.echo(f"written to {rig_file}", err=True)
-    show_next(quiet, following)
+    show_next(quiet, *words, then=then)
 
 
 def load_recordings(paths: Sequence[Path]) -> list[Recording]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import click
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
     from linkpose.device.session import Health
-    from linkpose.estimation import Estimator
+    from linkpose.estimation import Estimator, LiveRows
+    from linkpose.localization.surroundings import Surroundings
     from linkpose.page import Page
     from linkpose.page.history import Replay
-    from linkpose.page.scene import Surroundings
     from linkpose.precompile import Precompilation
     from linkpose.recording.table import Table
-    from linkpose.sensors.measurements import Floats, Measurements
+    from linkpose.sensors.measurements import Measurements
     from linkpose.sensors.rig import Rig
 
 
@@ -73,10 +73,9 @@ class PageOptions:
         """
         from linkpose.cli.live import ending_well
         from linkpose.page.history import Replay
-        from linkpose.page.tables import corners_of, rig_of, rows_of
+        from linkpose.page.tables import rig_of, rows_of
 
         columns, values = rows_of(tables, wanted)
-        surroundings = replace(surroundings, places=corners_of(columns, values))
         title = "  ".join(table.path.name for table in tables)
         opened = self.open(
             columns,
@@ -114,24 +113,25 @@ class PageOptions:
             following = LiveEstimator(estimator, compiling.is_ready)
 
             def show(block: Measurements) -> None:
-                _, newest = following.process(block)
-                show_newest(page, newest if len(block) else newest[:0], lambda: board.health, estimator, compiling)
+                show_newest(page, following.process(block), lambda: board.health, estimator, compiling)
 
             yield show
 
 
 def show_newest(
     page: Page | None,
-    newest: Floats,
+    rows: LiveRows,
     health: Callable[[], Health],
     estimator: Estimator,
     compiling: Precompilation,
 ) -> None:
-    """Shows the newest row of a live run, which may be empty. Raises KeyboardInterrupt once "stop" was pressed."""
+    """Shows the newest row of a live run, or all rows anew. Raises KeyboardInterrupt once "stop" was pressed."""
     from linkpose.page.status import PageStatus
 
     if page is not None:
-        page.show(newest, lambda: PageStatus(health(), estimator.found_j2s, compiling.progress))
+        if len(rows.caught_up):
+            page.begin_anew(rows.caught_up)
+        page.show(rows.newest, lambda: PageStatus(health(), estimator.found_j2s, compiling.progress))
         page.raise_if_stopped()
 
 

@@ -81,8 +81,9 @@ def command(
             show(block)
 
         live.run_board(connected, duration, handle)
+        path = connected.recording or path
         live.show_summary(console, connected.health, json_lines, options.written(path))
-        options.show_next(quiet, f"estimate {path} -o estimate.csv")
+        options.show_next(quiet, "estimate", path, "-o", "estimate.csv")
         connected.check_usable()
 
 

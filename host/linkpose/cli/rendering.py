@@ -13,8 +13,12 @@ import click
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from rich.table import Table
 
     from linkpose.experiments.variants import ClaimVerdict
+
+
+_TABLE_WIDTH = 160  # characters; tables take as many as they need
 
 
 def progress(label: str, quiet: bool = False) -> Callable[[Iterable[Any]], Iterable[Any]]:
@@ -28,6 +32,15 @@ def _with_bar(label: str, is_shown: bool, items: Iterable[Any]) -> Iterator[Any]
             yield from bar
     else:
         yield from items
+
+
+def show_table(table: Table) -> None:
+    """Prints a table. It is never cut: a narrow terminal wraps its lines, and a file or a pipe gets whole ones."""
+    from rich.console import Console
+
+    console = Console()
+    console.width = max(console.width, _TABLE_WIDTH)
+    console.print(table)
 
 
 def as_table(rows: Sequence[dict[str, object]]) -> str:

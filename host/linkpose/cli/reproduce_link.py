@@ -40,9 +40,9 @@ def command(seeds: int, errors: str, plot_path: Path | None, force: bool, json_l
 
 
 def _show(entries: list[Entry], seeds: int, errors: str) -> None:
-    from rich.console import Console
     from rich.table import Table
 
+    from linkpose.cli.rendering import show_table
     from linkpose.experiments.link import PAPER_ROLL_PITCH_DEG, title
 
     heights = Table("test", "method", title=f"Table 1: height RMSE (cm), {seeds} seeds, errors: {errors}")
@@ -66,8 +66,7 @@ def _show(entries: list[Entry], seeds: int, errors: str) -> None:
         if "position" in entry.rmse and entry.yaw_drift_deg_per_min is not None:
             ours = [f"{entry.rmse[name].mean():.3f}" for name in ("position", "yaw")]
             places.add_row(str(entry.test), method, *ours, f"{entry.yaw_drift_deg_per_min.mean():.3f}")
-    console = Console()
-    console.print(heights)
-    console.print(attitudes)
+    show_table(heights)
+    show_table(attitudes)
     if places.row_count:
-        console.print(places)
+        show_table(places)

@@ -43,8 +43,9 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, q
 
 
 def _show(rows: list[Redundancy], seeds: int) -> None:
-    from rich.console import Console
     from rich.table import Table
+
+    from linkpose.cli.rendering import show_table
 
     table = Table("", "mice", title=f"Noise of the estimated velocity compared with one mouse, {seeds} seeds")
     for name in ("one mouse σ", "together σ", "ratio", "theory"):
@@ -53,7 +54,7 @@ def _show(rows: list[Redundancy], seeds: int) -> None:
         unit = "rad/s" if row.quantity == "wz" else "m/s"
         values = (f"{row.single_std:.5f} {unit}", f"{row.fused_std:.5f} {unit}", f"{row.ratio:.3f}")
         table.add_row(row.quantity, str(row.mice), *values, f"{row.theory_ratio:.3f}")
-    Console().print(table)
+    show_table(table)
     best = [1 - row.ratio for row in rows if row.mice == 3]
     click.echo(
         f"Three mice reduce the error by {100 * sum(best) / len(best):.0f} %. The paper reads about 30 % from its "

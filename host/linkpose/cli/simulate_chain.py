@@ -57,5 +57,5 @@ def command(
     level, noise_of = ("calibrated", errors) if isinstance(errors, Rig) else (errors, None)
     run = ChainRun(joint, seed, duration, rate, level, noise_of=noise_of, first_joint=first_joint)
     write_chain(run, output, truth, rig_file, force)
-    with_rig = f" --rig {rig_file}" if rig_file else ""
-    options.show_next(quiet, f"estimate {output} --filter chain{with_rig} -o estimate.csv")
+    with_rig = ("--rig", rig_file) if rig_file else ()
+    options.show_next(quiet, "estimate", output, "--filter", "chain", *with_rig, "-o", "estimate.csv")

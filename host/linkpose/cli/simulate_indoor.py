@@ -52,4 +52,4 @@ def command(
     errors = IndoorErrors(range_m=range_std, range_growth=range_growth, outlier_fraction=outliers)
     run = simulate_indoor(seed, errors, duration)
     write_indoor(run, seed, output, truth, map_file, force)
-    options.show_next(quiet, f"localize {output} --map {map_file} --truth {truth}")
+    options.show_next(quiet, "localize", output, "--map", map_file, "--truth", truth)

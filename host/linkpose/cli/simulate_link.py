@@ -63,5 +63,5 @@ def command(
         noise_of=noise_of,
     )  # fmt: skip
     write_link(run, output, truth, force)
-    following = f"calibrate imu {output} --rig rig.toml" if rests else f"estimate {output} -o estimate.csv"
-    options.show_next(quiet, following)
+    calibrate, estimate = ("calibrate", "imu", output, "--rig", "rig.toml"), ("estimate", output, "-o", "estimate.csv")
+    options.show_next(quiet, *(calibrate if rests else estimate))

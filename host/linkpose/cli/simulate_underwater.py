@@ -83,4 +83,4 @@ def command(
         click.echo(
             json.dumps(values) if json_lines else f"{row.check:<20} asked {row.asked:<8g} measured {row.measured:.5g}"
         )
-    options.show_next(quiet, f"localize {output} --beacons {beacons} --truth {truth}")
+    options.show_next(quiet, "localize", output, "--beacons", beacons, "--truth", truth)

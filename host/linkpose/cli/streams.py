@@ -14,6 +14,7 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
+from linkpose.cli import characters
 from linkpose.errors import LinkposeError
 
 
@@ -93,9 +94,10 @@ class _Closed:
 def safe_streams() -> Iterator[None]:
     """Within this context, stdout and stderr fail as this module describes."""
     before = sys.stdout, sys.stderr
-    for stream in before:  # a code page without σ or ±, as on Windows: a character is replaced, nothing fails
+    characters.register()
+    for stream in before:  # a code page without σ or −, as on Windows: a character is replaced, nothing fails
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
+            stream.reconfigure(errors=characters.ERRORS)
     nowhere = open(os.devnull, "w", encoding="utf-8") if sys.stderr is None else None  # noqa: SIM115, PTH123
     sys.stdout = cast(TextIO, _Closed() if sys.stdout is None else _Results(sys.stdout))
     sys.stderr = cast(TextIO, _Messages(nowhere or before[1]))

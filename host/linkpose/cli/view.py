@@ -1,55 +1,24 @@
-"""The live view on a terminal: the best estimate with its σ, its curve over the last seconds, and the other filters.
-
-`Screen` renders text of a given size and needs no terminal; `View` puts it on one.
-"""
+"""The live view on a terminal. `linkpose.cli.screen` renders what it shows."""
 
 from __future__ import annotations
 
 import math
-import textwrap
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import click
 
-from linkpose import quantities
-from linkpose.cli.curve import curve, path_map
+from linkpose.cli.screen import Screen
 from linkpose.device.session import Health
-from linkpose.presentation import (
-    Exclusions,
-    Row,
-    RowReader,
-    aligned_length,
-    best_filter,
-    fault_lines,
-    joint_angle,
-    joint_texts,
-    length_with_std,
-    pose_text,
-    signed_angle,
-    std_text,
-)
-from linkpose.quantities import Quantity
-from linkpose.sensors.measurements import Floats
+from linkpose.presentation import RowReader
 
 if TYPE_CHECKING:
     from rich.live import Live
-    from rich.text import Text
+
+    from linkpose.estimation import LiveRows
 
 REDRAW_INTERVAL_S = 0.1
-CURVE_S = 20.0  # of the past that the curve shows
-CURVE_ROWS, MAP_ROWS = 5, 8
-POINT_INTERVAL_S = 0.05  # between two points of a curve: a column of dots is wider
-PATH_POINTS = 4000  # of the map; older ones are thinned out
-WIDEST = 78
-BLOCKS = 250  # of estimates whose extremes are found at once
-LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
-LEAST_ANGLE_DEG = 5.0  # ditto, of a joint angle
-_FAULTS, _HEADLINE = 10, 8  # priorities of sections
-
-Points = deque[tuple[float, float]]  # time (s) and value
 
 
 class View:
@@ -57,7 +26,7 @@ class View:
 
     def __init__(self, columns: Sequence[str], is_shown: bool, title: str, keys: str = "") -> None:
         """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys."""
-        self._rows = RowReader(columns)
+        self._rows, self._width = RowReader(columns), len(columns)
         self._screen = Screen(title, self._rows.filters, keys)
         self._live: Live | None = None
         self._size: tuple[int, int] = (0, 0)
@@ -101,18 +70,20 @@ class View:
         """Shows the next filter: the best one, then each of the others."""
         self._screen.next_filter()
 
-    def show(self, estimates: Floats, health: Callable[[], Health], status: str = "") -> None:
-        """Adds the newest row of estimates (columns,), and redraws a few times a second.
+    def add(self, rows: LiveRows) -> None:
+        """Adds the newest row of estimates, or begins anew with all rows so far where a filter has caught up."""
+        if not self._is_wanted:
+            return
+        if len(rows.caught_up):
+            self._screen.forget()
+        for row in rows.caught_up if len(rows.caught_up) else rows.newest.reshape(-1, self._width):
+            self._screen.add(float(row[0]), self._rows.read(row.tolist()))
+
+    def redraw(self, health: Callable[[], Health], status: str = "") -> None:
+        """Redraws a few times a second, also while no estimates arrive.
 
         `status` is a line on what is not ready yet, such as filters that are being compiled.
         """
-        if not self._is_wanted:
-            return
-        self._screen.add(float(estimates[0]), self._rows.read(estimates.tolist()))
-        self.redraw(health, status)
-
-    def redraw(self, health: Callable[[], Health], status: str = "") -> None:
-        """Redraws when it is time to, also while no estimates arrive."""
         now = time.perf_counter()
         if self._live is None or now - self._drawn_at < REDRAW_INTERVAL_S:
             return
@@ -139,270 +110,3 @@ class View:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-class Screen:
-    """The content of the view, as text of a given size."""
-
-    def __init__(self, title: str, filters: Sequence[str], keys: str = "") -> None:
-        self._title, self._filters, self._keys = title, list(filters), keys
-        self._time_s = 0.0
-        self._row: Row = {}
-        self._chosen: str | None = None  # None: the best filter
-        # By filter: the curve of one filter shows no jump where another one was the best before.
-        self._heights: dict[str, Points] = {}
-        self._has_height = False  # ever; without J2S, a link's filters have a height without a value
-        self._angles: dict[str, Points] = {}  # of a chain's joint
-        self._paths: dict[str, list[tuple[float, float]]] = {}
-        self._exclusions = Exclusions()
-
-    def next_filter(self) -> None:
-        """Chooses the next filter to show: the best one, then each of the others."""
-        choices = [None, *self._filters]
-        self._chosen = choices[(choices.index(self._chosen) + 1) % len(choices)]
-
-    def add(self, time_s: float, row: Row) -> None:
-        """Adds a row of estimates."""
-        self._time_s, self._row = time_s, row
-        for name, values in row.items():
-            if quantities.HEIGHT in values:
-                height_m = values[quantities.HEIGHT][0]
-                self._has_height |= math.isfinite(height_m)
-                _add_point(self._heights, name, time_s, height_m)
-            if (angle := joint_angle(values)) is not None:
-                _add_point(self._angles, name, time_s, angle[0])
-            if quantities.HEADING in values and quantities.X in values and quantities.Y in values:
-                self._add_place(name, values[quantities.X][0], values[quantities.Y][0])
-        self._exclusions.follow(time_s, row)
-
-    def _add_place(self, name: str, x_m: float, y_m: float) -> None:
-        path = self._paths.setdefault(name, [])
-        path.append((x_m, y_m))
-        if len(path) > PATH_POINTS:
-            del path[::2]
-
-    def _shown(self, quantity: Quantity) -> str | None:
-        """The filter whose value of this quantity is shown: the chosen one if it has it, otherwise the best one."""
-        if self._chosen is not None and quantity in self._row.get(self._chosen, {}):
-            return self._chosen
-        return best_filter(self._row, self._filters, quantity)
-
-    def render(self, health: Health, width: int, height: int, status: str = "") -> Text:
-        """The screen in at most `width` × `height` characters. Faults and exclusions are never cut."""
-        from rich.text import Text
-
-        width = min(width, WIDEST)
-        text = Text(no_wrap=True, overflow="crop")
-        for line, style in self._fit(self._sections(health, width, status), height - 1):
-            text.append(line[:width] + "\n", style=style)
-        text.rstrip()
-        return text
-
-    def line(self, health: Health) -> str:
-        """Time, faults and headlines, as far as they fit one line."""
-        sections = self._sections(health, WIDEST, "")
-        parts = [lines[0][0] for wanted in (_FAULTS, _HEADLINE) for priority, lines in sections if priority == wanted]
-        return "   ".join([f"{self._time_s:.1f} s", *parts])[:WIDEST]
-
-    @staticmethod
-    def _fit(sections: list[tuple[int, list[tuple[str, str]]]], height: int) -> list[tuple[str, str]]:
-        """The lines of the sections; those of the lowest priority go first when there are too many."""
-        kept = list(sections)
-        while sum(len(lines) for _, lines in kept) > height and len(kept) > 1:
-            kept.remove(min(kept, key=lambda section: section[0]))
-        return [line for _, lines in kept for line in lines]
-
-    def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
-        """(priority, [(line, style), …]) from top to bottom."""
-        faults = [(part, "bold red") for line in fault_lines(health) for part in textwrap.wrap(line, width)]
-        faults += [(part, "bold red") for line in self._exclusions.lines() for part in textwrap.wrap(line, width)]
-        sections = [(9, [(self._head(health, width), "bold")]), (_FAULTS, faults)]
-        chain = next((name for name in self._filters if joint_angle(self._row.get(name, {})) is not None), None)
-        link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
-        if chain is not None:
-            sections += self._chain_sections(chain, width)
-        if link is not None and (self._has_height or robot is None):
-            sections += self._link_sections(link, width)
-        if robot is not None:
-            sections += self._robot_sections(robot, width)
-        sections += [(9, [(status, "yellow")] if status else []), (1, [(self._keys, "dim")] if self._keys else [])]
-        return [section for section in sections if section[1]]
-
-    def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        points = self._heights.get(name, ())
-        table = (5, self._height_table(name, width))
-        return [
-            (_HEADLINE, [(self._headline(name, width), "")]),
-            (6, _curve_lines(points, width, LEAST_HEIGHT_M)),
-            table,
-        ]
-
-    def _robot_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        path = self._paths.get(name, ())
-        lines = path_map([x for x, _ in path], [y for _, y in path], min(width, 60), MAP_ROWS)
-        head = (_HEADLINE, [(line, "") for line in _packed(pose_text(self._row[name]), width)])
-        return [head, (6, [(line, "cyan") for line in lines]), (4, self._pose_table(name))]
-
-    def _chain_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
-        """The joint's angles, both heights (narrow screens drop the last ones), and the curve of the first angle."""
-        values = self._row[name]
-        parts = joint_texts(values)
-        for number, quantity in enumerate((quantities.HEIGHT1, quantities.HEIGHT2), 1):
-            if quantity in values:
-                parts.append(f"height {number} {length_with_std(*values[quantity])}")
-        while len(parts) > 1 and len("   ".join(parts)) > width:
-            parts.pop()
-        lines = _curve_lines(self._angles.get(name, ()), width, LEAST_ANGLE_DEG)
-        return [(_HEADLINE, [("   ".join(parts), "")]), (7, lines)]
-
-    def _head(self, health: Health, width: int) -> str:
-        """Title, time, rate, losses and the state of the sensors; narrow screens drop the title, then rate and time."""
-        sensors = " ".join(
-            f"{name.upper()} {of['state']}" for name, of in health.sensors.items() if of.get("state") != "absent"
-        )
-        lost = f"{health.lost} lost"
-        parts = [f"linkpose  {self._title}", f"{self._time_s:.1f} s", f"{health.rate_hz:.0f} Hz", lost, sensors]
-        for slow in (parts[0], parts[2], parts[1]):  # the slowest to change goes first
-            if len("  ".join(filter(None, parts))) > width:
-                parts.remove(slow)
-        return "  ".join(filter(None, parts))
-
-    def _headline(self, name: str, width: int) -> str:
-        """Height, roll, pitch and yaw; narrow screens drop the last ones."""
-        values = self._row[name]
-        parts = [f"HEIGHT over joint   {length_with_std(*values[quantities.HEIGHT])}"]
-        for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
-            if quantity in values:
-                parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
-        while len(parts) > 1 and len("   ".join(parts)) > width:
-            parts.pop()
-        if len(parts[0]) > width:
-            parts[0] = f"HEIGHT {length_with_std(*values[quantities.HEIGHT])}"
-        return "   ".join(parts)
-
-    def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
-        """One line per filter: height, σ, difference from the best; narrow screens drop the difference first."""
-        reference = self._row[best][quantities.HEIGHT][0]
-        head = f"  {'filter':<16} {'height':>10} {'σ':>9}   difference from best"
-        lines = [(head if width >= 60 else head[:40], "dim")]
-        for name in self._filters:
-            if quantities.HEIGHT not in self._row.get(name, {}):
-                continue
-            value, std = self._row[name][quantities.HEIGHT]
-            line = f"{'▸' if name == best else ' '} {name:<16} {aligned_length(value, std):>10} {std_text(std):>9}"
-            if name != best and width >= 60 and math.isfinite(value - reference):
-                line += f"   {_signed_length(value - reference)}"
-            lines.append((line, "bold" if name == best else ""))
-        return lines
-
-    def _pose_table(self, shown: str) -> list[tuple[str, str]]:
-        rows = [(name, self._row[name]) for name in self._filters if quantities.HEADING in self._row.get(name, {})]
-        if len(rows) < 2:
-            return []
-        lines = [(f"  {'filter':<16} {'x':>10} {'y':>10} {'heading':>9}", "dim")]
-        for name, values in rows:
-            x, y = (aligned_length(*values[q]) for q in (quantities.X, quantities.Y))
-            heading = values[quantities.HEADING][0]
-            angle = f"{math.degrees(heading):+.1f}°" if math.isfinite(heading) else "–"
-            line = f"{x:>10} {y:>10} {angle:>9}"
-            lines.append((f"{'▸' if name == shown else ' '} {name:<16} {line}", "bold" if name == shown else ""))
-        return lines
-
-
-def _packed(parts: Iterable[str], width: int) -> list[str]:
-    """Texts side by side, on as many lines of this width as they need."""
-    lines: list[str] = []
-    for part in parts:
-        if lines and len(f"{lines[-1]}   {part}") <= width:
-            lines[-1] += f"   {part}"
-        else:
-            lines.append(part)
-    return lines
-
-
-def _add_point(curves: dict[str, Points], name: str, time_s: float, value: float) -> None:
-    """Adds a point to a filter's curve, unless it is close to the one before."""
-    points = curves.setdefault(name, deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1))
-    # A stamp lies a little before or after its tick: some slack keeps the points evenly spaced.
-    if not points or time_s - points[-1][0] >= 0.9 * POINT_INTERVAL_S:
-        points.append((time_s, value))
-
-
-def _curve_lines(points: Iterable[tuple[float, float]], width: int, least: float) -> list[tuple[str, str]]:
-    """The curve of the last seconds; its axis covers at least `least`."""
-    times, values = [time for time, _ in points], [value for _, value in points]
-    return [(line, "cyan") for line in curve(times, values, CURVE_S, width, CURVE_ROWS, least)]
-
-
-def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -> list[str]:
-    """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m.
-
-    The last column is left out where they would be wider than `width` characters.
-    """
-    rows = [("filter", "lowest", "highest", "rms σ")]
-    for name, (low, high, std) in summary.items():
-        rows.append((name, aligned_length(low, std), aligned_length(high, std), std_text(std)))
-    lines = [f"  {name:<16} {low:>10} {high:>10}" for name, low, high, _ in rows]
-    if len(lines[0]) + 10 <= width:
-        lines = [f"{line} {row[3]:>9}" for line, row in zip(lines, rows, strict=True)]
-    return lines if summary else []
-
-
-class Extremes:
-    """Lowest and highest height and the RMS of σ of each filter, over all blocks."""
-
-    def __init__(self, columns: Sequence[str]) -> None:
-        at = {column: index for index, column in enumerate(columns)}
-        self._of = {
-            name: (at[found[quantities.HEIGHT]], at.get(quantities.std_column(found[quantities.HEIGHT]) or "", -1))
-            for name, found in quantities.by_filter(columns).items()
-            if quantities.HEIGHT in found
-        }
-        self._low = dict.fromkeys(self._of, math.inf)
-        self._high = dict.fromkeys(self._of, -math.inf)
-        self._squares = dict.fromkeys(self._of, 0.0)
-        self._count = dict.fromkeys(self._of, 0)
-        self._waiting: list[Floats] = []  # blocks not yet in these
-
-    def add(self, estimates: Floats) -> None:
-        """Adds a block of estimates (N, columns)."""
-        self._waiting.append(estimates)
-        if len(self._waiting) >= BLOCKS:
-            self._fold()
-
-    def _fold(self) -> None:
-        """Adds the waiting blocks at once: NumPy takes 0.3 ms for one row as for a thousand."""
-        import numpy as np
-
-        estimates = np.concatenate(self._waiting)
-        self._waiting.clear()
-        for name, (value_at, std_at) in self._of.items():
-            known = np.isfinite(estimates[:, value_at])
-            if not known.any():
-                continue
-            self._low[name] = min(self._low[name], float(estimates[known, value_at].min()))
-            self._high[name] = max(self._high[name], float(estimates[known, value_at].max()))
-            if std_at >= 0:
-                self._squares[name] += float(np.nansum(estimates[known, std_at] ** 2))
-                self._count[name] += int(known.sum())
-
-    def summary(self) -> dict[str, tuple[float, float, float]]:
-        """Filter -> (lowest, highest, RMS of σ), of filters that estimated a height."""
-        if self._waiting:
-            self._fold()
-        return {
-            name: (
-                low,
-                self._high[name],
-                math.sqrt(self._squares[name] / self._count[name]) if self._count[name] else math.nan,
-            )
-            for name, low in self._low.items()
-            if math.isfinite(low)
-        }
-
-
-def _signed_length(metres: float) -> str:
-    size = abs(metres)
-    if size < 0.01:
-        return f"{1e3 * metres:+.1f} mm"
-    return f"{1e2 * metres:+.1f} cm" if size < 1 else f"{metres:+.2f} m"

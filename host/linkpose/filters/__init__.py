@@ -99,6 +99,24 @@ class GyroJumps(NamedTuple):
     last_time_s: float  # when it was found
 
 
+class MovedMouse(NamedTuple):
+    """A mouse (1 for the first) that the turns show at another place than the rig file states."""
+
+    mouse: int
+    x_m: float
+    y_m: float
+    off_m: float  # distance between both places
+
+
+@runtime_checkable
+class FindsMovedMice(Protocol):
+    """Further interface of a filter that estimates the places of the mice."""
+
+    @property
+    def moved_mice(self) -> tuple[MovedMouse, ...]:
+        """Mice whose places differ significantly from the rig file."""
+
+
 @runtime_checkable
 class FindsGyroJumps(Protocol):
     """Further interface of a filter that finds jumps of the gyro's bias."""

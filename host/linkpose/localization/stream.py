@@ -27,7 +27,7 @@ ORIGIN = "standard input"
 # Longer delays the first pose; shorter may miss a slow sensor.
 HEAD_S, HEAD_ROWS = 1.0, 500
 # After so many ranges and bearings the noises are estimated from the rows so far, and in use this much later: a fixed
-# number, so that the same rows give the same poses however fast they come. The estimate takes up to 3 s.
+# number, so that the same rows give the same poses however fast they come. The estimate takes up to 8 s.
 TUNED_AFTER, USED_AFTER = (100, 300, 1200), 1.5
 UNITS_CHECKED_AFTER = (20, 200)  # rows: a median needs some
 

@@ -4,34 +4,62 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from linkpose import plotting
 from linkpose.errors import CannotWrite
+from linkpose.localization.surroundings import Surroundings
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
 from linkpose.page.page import LOOPBACK, free_port, serve
+from linkpose.page.tables import rig_of, rows_of
+from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
-if TYPE_CHECKING:
-    from linkpose.page.scene import Surroundings
-
+ENDING = ".html"
+FORMATS = (*plotting.FORMATS, ENDING)  # of pictures of estimates
 FRAME_INTERVAL_S = 0.05  # motion looks smooth at 20 Hz
 MOST_FRAMES = 2400  # two minutes at 20 Hz, about 1 MB; a longer recording gets fewer frames per second
 
 
-def save_animation(
-    path: Path, columns: Sequence[str], values: Floats, rig: Rig, surroundings: Surroundings | None
-) -> None:
-    """Writes the estimates (N ≥ 1, columns) as an animation in real time; the first column is the time (s).
+def save_picture(
+    path: Path, tables: Sequence[Table], wanted: Sequence[str], surroundings: Surroundings, force: bool
+) -> list[str]:
+    """Draws tables as `plotting.plot_tables` does, or as an animation where the name ends in .html.
 
-    viser records the scene's messages while a server runs on the loopback address. Raises CannotWrite.
+    Returns remarks for the user. Raises FileError, and LinkposeError where there is nothing to draw.
     """
+    if path.suffix.lower() == ENDING:
+        save_animation(path, tables, wanted, surroundings, force)
+        return []
+    figure, remarks = plotting.plot_tables(tables, wanted, surroundings)
+    plotting.save(figure, path, force)
+    return remarks
+
+
+def save_animation(
+    path: Path, tables: Sequence[Table], wanted: Sequence[str], surroundings: Surroundings, force: bool
+) -> None:
+    """Writes the first estimate, with the reference if there is one, as an animation in real time.
+
+    `wanted` names filters; without any, all are shown. Raises FileError, and LinkposeError without an estimate.
+    """
+    plotting.check_output(path, force, FORMATS)
+    columns, values = rows_of(tables, wanted)
+    text = _recorded(columns, values, rig_of(tables), surroundings)
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CannotWrite(path, error.strerror or str(error)) from error
+
+
+def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Surroundings) -> str:
+    """HTML that plays rows (N ≥ 1, columns). viser records the scene while a server runs on the loopback address."""
     server = serve(LOOPBACK, free_port(LOOPBACK), is_named=False)
     try:
-        drawing, replay = Drawing(server, columns, rig, surroundings), Replay(values)
+        drawing, replay = Drawing(server, columns, rig, surroundings, values), Replay(values)
         start, end = replay.span_s
         frames = int(np.clip(round((end - start) / FRAME_INTERVAL_S), 1, MOST_FRAMES)) + 1
         recorded = server.get_scene_serializer()
@@ -43,10 +71,6 @@ def save_animation(
             if name is not None:
                 drawing.draw(newest, row, name, replay)
             recorded.insert_sleep((end - start) / frames)
-        text = recorded.as_html()
+        return recorded.as_html()
     finally:
         server.stop()
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error

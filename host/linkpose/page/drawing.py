@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linkpose import quantities
+from linkpose.localization.surroundings import Surroundings
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
 from linkpose.presentation import Row, RowReader
@@ -19,16 +20,22 @@ from linkpose.sensors.rig import Rig
 if TYPE_CHECKING:
     import viser
 
-    from linkpose.page.scene import Surroundings
-
 
 class Drawing:
     """A scene and the columns of the estimates that it shows."""
 
     def __init__(
-        self, server: viser.ViserServer, columns: Sequence[str], rig: Rig, surroundings: Surroundings | None
+        self,
+        server: viser.ViserServer,
+        columns: Sequence[str],
+        rig: Rig,
+        surroundings: Surroundings,
+        known: Floats | None = None,
     ) -> None:
-        """`columns` are those of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; others are a reference."""
+        """`columns` are those of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; others are a reference.
+
+        `known` (N, columns) are all rows of a file, whose paths the camera shows from the start.
+        """
         self._rows = RowReader(columns)
         self._at = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
@@ -37,7 +44,8 @@ class Drawing:
             for column, at in self._at.items()
             if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
         ]
-        self._scene = scene_of(server, self._of_filter.values(), rig, surroundings)
+        places = self._corners(np.empty((0, len(columns))) if known is None else known)
+        self._scene = scene_of(server, self._of_filter.values(), rig, surroundings, places)
         self._candidates = [(q, name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of]
 
     @property
@@ -60,6 +68,12 @@ class Drawing:
             self._scene.set_j2s(j2s_m)
         path = self._path(name, history) if self._scene.is_path_due else None
         self._scene.draw(row, name, self._reference(newest), path)
+
+    def _corners(self, rows: Floats) -> Floats:
+        """Two opposite corners (2, 2) of the area that the paths in these rows cover; (0, 2) without a path."""
+        paths = [rows[:, [self._at[of[X]], self._at[of[Y]]]] for of in self._of_filter.values() if X in of and Y in of]
+        places = np.vstack([np.empty((0, 2)), *(path[np.isfinite(path).all(axis=1)] for path in paths)])
+        return np.array([places.min(axis=0), places.max(axis=0)]) if len(places) else places
 
     def _reference(self, newest: Floats) -> dict[Quantity, float]:
         return {quantity: float(newest[at]) for quantity, at in self._reference_at}

@@ -68,33 +68,33 @@ class Replay:
 
     def __init__(self, values: Floats) -> None:
         """`values` (N ≥ 1, columns), the first column is the time (s)."""
-        self._values = values
+        self.values = values
         self._end = len(values)
 
     @property
     def span_s(self) -> tuple[float, float]:
         """Time of the first and of the last row."""
-        return float(self._values[0, 0]), float(self._values[-1, 0])
+        return float(self.values[0, 0]), float(self.values[-1, 0])
 
     def seek(self, time_s: float) -> None:
         """Goes to the last row that is not later than `time_s`."""
-        self._end = max(1, int(np.searchsorted(self._values[:, 0], time_s, side="right")))
+        self._end = max(1, int(np.searchsorted(self.values[:, 0], time_s, side="right")))
 
     @property
     def newest(self) -> Floats:
         """The row (columns,) at this place."""
-        row: Floats = self._values[self._end - 1]
+        row: Floats = self.values[self._end - 1]
         return row
 
     def window(self) -> Floats:
         """The rows (N, columns) of the last SPAN_S seconds, thinned out, with the newest as the last."""
-        times = self._values[: self._end, 0]
+        times = self.values[: self._end, 0]
         first = int(np.searchsorted(times, times[-1] - SPAN_S))
-        return _thinned(self._values[first : self._end], round(SPAN_S / POINT_INTERVAL_S))
+        return _thinned(self.values[first : self._end], round(SPAN_S / POINT_INTERVAL_S))
 
     def path(self) -> Floats:
         """Rows (N, columns) along the path up to here, thinned out, with the newest as the last."""
-        return _thinned(self._values[: self._end], PATH_POINTS)
+        return _thinned(self.values[: self._end], PATH_POINTS)
 
 
 def _thinned(rows: Floats, most: int) -> Floats:

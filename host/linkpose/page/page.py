@@ -13,6 +13,7 @@ import numpy as np
 
 from linkpose import quantities
 from linkpose.errors import LinkposeError
+from linkpose.localization.surroundings import Surroundings
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     import viser
 
     from linkpose.estimation import FoundJ2s
-    from linkpose.page.scene import Surroundings
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
@@ -79,7 +79,7 @@ class Page:
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
         self._exclusions = Exclusions()
-        self._queue: deque[Floats] = deque(maxlen=QUEUE_BLOCKS)
+        self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
         self._status, self._blocks = PageStatus(), 0
         self._updates = 0
         self._clients: set[int] = set()
@@ -89,7 +89,7 @@ class Page:
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._follows_mice = any(EXCLUDED in of for of in quantities.by_filter(columns).values())
-        self._build(rig, surroundings)
+        self._build(rig, surroundings or Surroundings())
         self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
         self._thread.start()
 
@@ -99,12 +99,16 @@ class Page:
         `status` is called now and then, in the thread of the caller.
         """
         if estimates.size:
-            self._queue.append(estimates)
+            self._queue.append((estimates, False))
         if self._blocks % STATUS_INTERVAL == 0 or not estimates.size:
             self._status = status()
             self._is_status_changed = True
         self._blocks += 1
         self._is_changed = True
+
+    def begin_anew(self, estimates: Floats) -> None:
+        """Takes estimates (N, columns) in place of all before: a filter has caught up with the samples so far."""
+        self._queue.append((estimates, True))
 
     def raise_if_stopped(self) -> None:
         """Raises KeyboardInterrupt once the user has pressed "stop", which ends a run as Ctrl-C does."""
@@ -124,13 +128,14 @@ class Page:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _build(self, rig: Rig, surroundings: Surroundings | None) -> None:
+    def _build(self, rig: Rig, surroundings: Surroundings) -> None:
         from linkpose.page.panel import Panel
 
         server = self._server
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
-        self._drawing = Drawing(server, self._columns, rig, surroundings)
+        known = self._replay.values if self._replay is not None else None
+        self._drawing = Drawing(server, self._columns, rig, surroundings, known)
         self._panel = Panel(server, self._columns, self._drawing.charted, self._redraw)
         if self._replay is not None:
             self._build_player(self._replay)
@@ -189,7 +194,11 @@ class Page:
         blocks = [self._queue.popleft() for _ in range(len(self._queue))]
         if not blocks or not isinstance(self._history, History):
             return
-        rows = np.vstack(blocks)
+        last_anew = max((at for at, (_, is_anew) in enumerate(blocks) if is_anew), default=None)
+        if last_anew is not None:
+            del blocks[:last_anew]
+            self._history, self._exclusions = History(self._columns), Exclusions()
+        rows = np.vstack([rows for rows, _ in blocks])
         self._history.add(rows)
         if self._follows_mice:
             for row in rows:
@@ -240,9 +249,9 @@ class Page:
             words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")
         if status.line:
             words.append(status.line)
-        faults = fault_lines(health) if health is not None else []
+        faults = fault_lines(health, self._exclusions) if health is not None else self._exclusions.lines()
         working = working_sensors(health) if health is not None else []
-        self._panel.draw_health(self._title, "   ".join(words), working, faults + self._exclusions.lines())
+        self._panel.draw_health(self._title, "   ".join(words), working, faults)
 
 
 def j2s_text(found: FoundJ2s) -> str:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 
+from linkpose.localization.surroundings import Surroundings, map_corners
 from linkpose.page import geometry
 from linkpose.presentation import Row, best_filter
 from linkpose.quantities import (
@@ -34,7 +34,6 @@ from linkpose.sensors.rig import Rig
 if TYPE_CHECKING:
     import viser
 
-    from linkpose.localization.grid import GridMap
     from linkpose.sensors.rig import Rig
 
 Colour = tuple[int, int, int]
@@ -64,42 +63,6 @@ class Scene(Protocol):
     @property
     def is_path_due(self) -> bool:
         """Whether the next `draw` draws a path, if it gets one."""
-
-
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What stands around a robot, in its map's frame."""
-
-    grid: GridMap | None = None
-    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m), perhaps z
-    places: Sequence[Sequence[float]] = ()  # x, y (m) that the camera shows too, such as the corners of a path
-
-    @property
-    def centre_m(self) -> Floats:
-        """Centre (2,) of all that there is; a robot starts at the origin and heads along x."""
-        corners = self._all_corners()
-        return (corners.min(axis=0) + corners.max(axis=0)) / 2 if len(corners) else np.array([1.0, 0.0])
-
-    @property
-    def size_m(self) -> float:
-        """The larger side of all that there is."""
-        corners = self._all_corners()
-        return max(float(np.ptp(corners, axis=0).max()), 1.0) if len(corners) else 4.0
-
-    def _all_corners(self) -> Floats:
-        found = [*(place[:2] for place in self.beacons.values()), *self.places]
-        if self.grid is not None:
-            found += _corners(self.grid).tolist()
-        return np.array(found, dtype=float).reshape(-1, 2)
-
-
-def _corners(grid: GridMap) -> Floats:
-    """The corners (4, 2) of a map."""
-    _, left, low, turn = grid.geometry.tolist()
-    (wide, high), cos, sin = grid.size_m, math.cos(turn), math.sin(turn)
-    flat = np.array([(0.0, 0.0), (wide, 0.0), (0.0, high), (wide, high)])
-    corners: Floats = np.array([left, low]) + flat @ np.array([[cos, sin], [-sin, cos]])
-    return corners
 
 
 class LinkScene:
@@ -170,13 +133,12 @@ class RobotScene:
     charted: ClassVar[tuple[Quantity, ...]] = (X, Y, HEADING)
     shown_by: ClassVar[tuple[Quantity, ...]] = (HEADING,)
 
-    def __init__(self, server: viser.ViserServer, surroundings: Surroundings | None = None) -> None:
+    def __init__(self, server: viser.ViserServer, surroundings: Surroundings, places: Floats) -> None:
         self._scene, self._draws = server.scene, 0
-        around = surroundings or Surroundings()
-        (x, y), size = around.centre_m, around.size_m
+        (x, y), size = _extent(np.vstack([surroundings.corners_m(), places]))
         self._floor_m = max(_FLOOR_M, 0.001 * size)
         _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
-        self._draw_surroundings(around, size)
+        self._draw_surroundings(surroundings, size)
         scale = max(1.0, size / _ROBOT_SHARE)  # a robot of 24 cm would be a dot on a floor of 100 m
         self._robot = self._scene.add_frame(
             "/robot", axes_length=0.25 * scale, axes_radius=0.008 * scale, visible=False
@@ -215,7 +177,7 @@ class RobotScene:
         if around.grid is None:
             return
         turn = float(around.grid.geometry[3])
-        middle = np.mean(_corners(around.grid), axis=0)
+        middle = np.mean(map_corners(around.grid), axis=0)
         image = np.where(around.grid.blocked[:, :, np.newaxis] == 1, 60, 235).astype(np.uint8)
         # viser puts the first row of an image at its lowest y, as the map has it.
         self._scene.add_image(
@@ -328,16 +290,28 @@ class Cone:
 
 
 def scene_of(
-    server: viser.ViserServer, filters: Iterable[Mapping[Quantity, str]], rig: Rig, surroundings: Surroundings | None
+    server: viser.ViserServer,
+    filters: Iterable[Mapping[Quantity, str]],
+    rig: Rig,
+    surroundings: Surroundings,
+    places: Floats,
 ) -> Scene:
-    """The scene for the quantities that the filters estimate."""
+    """The scene for the quantities that the filters estimate. The camera of a robot's also shows `places` (N, 2), m."""
     estimated = {quantity for of in filters for quantity in of}
     if QW in estimated:
         return ChainScene(server, rig)
     j2s = rig.joint.known_j2s_m
     if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
-        return RobotScene(server, surroundings)
+        return RobotScene(server, surroundings, places)
     return LinkScene(server, None if j2s is None else np.array(j2s))
+
+
+def _extent(points: Floats) -> tuple[Floats, float]:
+    """Centre (2,) and larger side (m) of what points (N, 2) cover; a robot starts at the origin and heads along x."""
+    if not len(points):
+        return np.array([1.0, 0.0]), 4.0
+    low, high = points.min(axis=0), points.max(axis=0)
+    return 0.5 * (low + high), max(float((high - low).max()), 1.0)
 
 
 def _ground(scene: viser.SceneApi, size_m: float, centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:

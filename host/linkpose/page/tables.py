@@ -44,15 +44,6 @@ def rows_of(tables: Sequence[Table], wanted: Sequence[str]) -> tuple[list[str], 
     return columns, np.column_stack(values)
 
 
-def corners_of(columns: Sequence[str], values: Floats) -> list[tuple[float, float]]:
-    """Two opposite corners (x, y) of the area that the paths in these rows cover; empty without a path."""
-    at = {column: place for place, column in enumerate(columns)}
-    paths = [values[:, [at[of[X]], at[of[Y]]]] for of in by_filter(columns).values() if X in of and Y in of]
-    known = [path[np.isfinite(path).all(axis=1)] for path in paths]
-    places = np.vstack([np.empty((0, 2)), *known])
-    return [tuple(places.min(axis=0)), tuple(places.max(axis=0))] if len(places) else []
-
-
 def rig_of(tables: Sequence[Table]) -> Rig:
     """The rig with which the first estimate was made, as far as its file states it; J2S as found at the end."""
     table = _first_estimate(tables)

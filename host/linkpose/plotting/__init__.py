@@ -7,7 +7,6 @@ figure is made.
 from linkpose.plotting.canvas import FORMATS, check_output, new_figure, picture_files, save
 from linkpose.plotting.evaluation import evaluation
 from linkpose.plotting.experiments import paper_figure_2, redundant_mice, variants
-from linkpose.plotting.robots import PathBackground
 from linkpose.plotting.tables import plot_tables
 from linkpose.plotting.thesis import INDOOR_FIGURES, UNDERWATER_FIGURES, indoor_figures, underwater_figures
 
@@ -15,7 +14,6 @@ __all__ = [
     "FORMATS",
     "INDOOR_FIGURES",
     "UNDERWATER_FIGURES",
-    "PathBackground",
     "check_output",
     "evaluation",
     "indoor_figures",

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import sys
+import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linkpose.errors import CannotWrite, FileExists, UnknownPicture
-from linkpose.recording.csvfile import STDOUT
+from linkpose.recording.csvfile import STDOUT, create, write_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,10 +75,16 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
     order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
     once = {label: handle for handle, label in order}
     if once:
+        labels = _by_rows(list(once), columns)
         axes.legend(
-            once.values(), once.keys(), loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, frameon=False,
-            fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
+            [once[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+            frameon=False, fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
         )  # fmt: skip
+
+
+def _by_rows(labels: list[str], columns: int) -> list[str]:
+    """Labels in the order in which matplotlib, which fills a legend column by column, shows them row by row."""
+    return [label for column in range(columns) for label in labels[column::columns]]
 
 
 def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMATS) -> None:
@@ -120,7 +127,9 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     """
     check_output(path, force)
     if path == STDOUT:
-        figure.savefig(sys.stdout.buffer, dpi=DPI, format="png")
+        figure.savefig(picture := io.BytesIO(), dpi=DPI, format="png")
+        with os.fdopen(create(STDOUT, force), "wb") as stream:
+            write_all(stream.fileno(), STDOUT, picture.getvalue())
         return
     # Two pictures of the same data are the same file.
     metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}

@@ -10,9 +10,10 @@ import numpy as np
 from linkpose import filters
 from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import band, draw, shade
-from linkpose.plotting.panels import bound_view
-from linkpose.presentation import same_digits
-from linkpose.quantities import unit_text
+from linkpose.plotting.panels import bound_view, others_hide_best
+from linkpose.plotting.sources import shortened
+from linkpose.presentation import same_digits, with_unit
+from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -24,74 +25,96 @@ if TYPE_CHECKING:
     from linkpose.evaluation.scoring import Score
 
 _VECTOR_PARTS = {"position": ("x", "y", "z"), "velocity": ("vx", "vy")}
-_TABLE_ROW_INCHES = 0.21
+_ROW_INCHES, _TABLE_ROW_INCHES = 2.1, 0.21
 _BINS = np.linspace(-4, 4, 41)
 
 
 def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
     """One row for each quantity: errors of the filters over time, and how error/σ is distributed; the table below.
 
-    Filters whose height comes from the air pressure are in the table only, unless there are no others.
+    Some filters are in the table only (`_shown`). Where the errors of others hide the best filter's in the first row, a
+    row above it shows the best filter alone.
     """
     shown = _shown(found.scores)
-    names = _quantities(shown)
-    rows = sum(len(score.errors) for score in found.scores)
-    table_inches = 0.5 + _TABLE_ROW_INCHES * (rows + 1)
-    figure = new_figure(11.0, 0.7 + 2.1 * len(names) + table_inches)
+    rows = [(name, shown) for name in _quantities(shown)]
+    if rows and _hides_best(shown, rows[0][0]):
+        rows.insert(0, (rows[0][0], shown[:1]))
+    has_sigma = any(_has_sigma(score, name) for name, scores in rows for score in scores)
+    table_rows = sum(len(score.errors) for score in found.scores)
+    table_inches = 0.5 + _TABLE_ROW_INCHES * (table_rows + 1)
+    figure = new_figure(11.0, 0.7 + _ROW_INCHES * len(rows) + table_inches)
     offset = found.scores[0].time_offset_s
     aligned = f"   ·   clocks aligned by {offset:+.4f} s" if offset else ""
-    figure.suptitle(f"{estimate} against {reference}{aligned}", fontsize=10, x=0.01, ha="left")
-    grid = figure.add_gridspec(
-        len(names) + 1, 2, width_ratios=[2.6, 1], height_ratios=[2.1] * len(names) + [table_inches]
-    )
+    figure.suptitle(f"{shortened(estimate)} against {shortened(reference)}{aligned}", fontsize=10, x=0.01, ha="left")
+    heights = [_ROW_INCHES] * len(rows) + [table_inches]
+    grid = figure.add_gridspec(len(rows) + 1, 2, width_ratios=[2.6, 1], height_ratios=heights)
     first: Axes | None = None
-    for row, name in enumerate(names):
-        has_sigma = any(name in s.errors and s.errors[name].statistics().nees is not None for s in shown)
+    for row, (name, scores) in enumerate(rows):
         axes = figure.add_subplot(grid[row, 0] if has_sigma else grid[row, :], sharex=first)
         first = first or axes
-        _errors(axes, shown, name)
-        if row == len(names) - 1:
+        _errors(axes, scores, name)
+        axes.tick_params(labelbottom=row == len(rows) - 1)
+        if row == len(rows) - 1:
             axes.set_xlabel("time (s)")
-        if has_sigma:
-            _histogram(figure.add_subplot(grid[row, 1]), shown, name)
+        if any(_has_sigma(score, name) for score in scores):
+            _histogram(figure.add_subplot(grid[row, 1]), scores, name)
+    figure.align_ylabels()
     _table(figure.add_subplot(grid[-1, :]), found.scores)
     return figure
 
 
+def _has_sigma(score: Score, name: str) -> bool:
+    return name in score.errors and score.errors[name].statistics().nees is not None
+
+
+def _hides_best(scores: Sequence[Score], name: str) -> bool:
+    errors = [score.errors[name] for score in scores if name in score.errors]
+    return name in scores[0].errors and others_hide_best(errors)
+
+
 def _shown(scores: Sequence[Score]) -> list[Score]:
+    """The filters that are drawn: no barometric ones, and beside a chain no filters of one of its sensors."""
+    if chains := [score for score in scores if ROTATION.name in score.errors]:
+        return chains
     quiet = [s for s in scores if not ((of := filters.capabilities(s.filter)) and of.is_barometric)]
     return quiet or list(scores)
 
 
 def _quantities(scores: Sequence[Score]) -> list[str]:
-    """Names in the order of the first filter that has them, the height first; a vector in place of its components."""
+    """Names in the order of the first filter that has them, a vector in place of its components.
+
+    The height of a link is first, and the position of a robot.
+    """
     names = list(dict.fromkeys(name for score in scores for name in score.errors))
     for vector, parts in _VECTOR_PARTS.items():
         if vector in names:
             names = [name for name in names if name not in parts]
+    if "position" in names and HEIGHT.name not in names:
+        names.insert(0, names.pop(names.index("position")))
     return names
 
 
 def _errors(axes: Axes, scores: Sequence[Score], name: str) -> None:
-    unit, drawn, stds = "", list[Floats](), list[Floats]()
+    unit, drawn, stds, order = "", list[Floats](), list[Floats](), list[str]()
     for score in scores:
         of = score.errors.get(name)
         if of is None:
             continue
         unit = unit_text(of.unit)
-        label = f"{score.filter} {of.statistics().rmse:.3g} {unit} rms"
+        label = f"{score.filter} {with_unit(f'{of.statistics().rmse:.3g}', unit)} rms"
+        order.append(label)
         draw(axes, of.time_s, of.error, label=label, **line_style(score.filter))
         drawn.append(of.error)
         if of.std is not None and not stds:
-            stds.append(of.std)
+            stds.append(np.where(np.isfinite(of.error), of.std, np.nan))
             colour = str(line_style(score.filter)["color"])
-            band(axes, of.time_s, np.zeros(len(of.time_s)), of.std, colour, f"±2σ {score.filter}")
+            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"±2σ {score.filter}")
     first = next(score.errors[name] for score in scores if name in score.errors)
     shade(axes, first.time_s, ~np.isfinite(first.error))
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
-    finish(axes, f"{name} error ({unit})")
-    legend_above(axes, 4)
+    finish(axes, f"{words(name)} error ({unit})")
+    legend_above(axes, 4, order)
 
 
 def _histogram(axes: Axes, scores: Sequence[Score], name: str) -> None:
@@ -136,7 +159,7 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]
-            rows.append([score.filter, f"{name} ({unit})", *figures, *sigma, str(value.rows)])
+            rows.append([score.filter, f"{words(name)} ({unit})", *figures, *sigma, str(value.rows)])
             colours.append(str(line_style(score.filter)["color"]))
     head = ["filter", "quantity", "RMSE", "mean", "worst", "95 %", "NEES", "within ±2σ", "rows"]
     axes.axis("off")

@@ -62,7 +62,13 @@ def decimated(time_s: Floats, *values: Floats) -> tuple[Floats, ...]:
 
 def draw(axes: Axes, time_s: Floats, value: Floats, period: float | None = None, **style: Any) -> None:
     """A line over time, broken at gaps and where an angle wraps."""
-    axes.plot(*decimated(*broken(time_s, value, period=period)), **style)
+    times, values = decimated(*broken(time_s, value, period=period))
+    axes.plot(times, values, **style)
+    known = np.concatenate([[False], np.isfinite(values), [False]])
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]  # no line has one point
+    if alone.any():
+        dots = style | {"label": None, "linestyle": "none"}
+        axes.plot(times[alone], values[alone], marker=".", markersize=4, **dots)
 
 
 def band(axes: Axes, time_s: Floats, middle: Floats, std: Floats, colour: str, label: str | None = None) -> None:

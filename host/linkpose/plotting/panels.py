@@ -10,7 +10,8 @@ import numpy as np
 from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.sources import DrawnTrack, Sources, is_barometric, pairs
-from linkpose.quantities import YAW, Quantity, unit_text
+from linkpose.presentation import with_unit
+from linkpose.quantities import QW, YAW, Quantity, unit_text, words
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
     scored = _scored(sources, name)[:1] if best_only else _scored(sources, name)
     for track, of in scored:
         unit = unit_text(of.unit)
-        text = f"{track.label} {of.statistics().rmse:.3g} {unit} rms"
+        text = f"{track.label} {with_unit(f'{of.statistics().rmse:.3g}', unit)} rms"
         draw(axes, of.time_s, of.error, label=text, **line_style(track.name, track.file))
         drawn.append(of.error)
         if of.std is not None and not order:
@@ -96,7 +97,7 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
     shade_unknown(axes, sources.tracks)
-    finish(axes, f"{name} error ({unit})")
+    finish(axes, f"{words(name)} error ({unit})")
     legend_above(axes, best_first=order)
 
 
@@ -108,23 +109,36 @@ def _scored(sources: Sources, name: str) -> list[tuple[DrawnTrack, Errors]]:
 
 def hides_best(sources: Sources, name: str) -> bool:
     """Whether the errors of other filters are so much larger that the best filter's ±2σ would look like a line."""
-    limits = [error_limit([of.error], [of.std] if of.std is not None else []) for _, of in _scored(sources, name)]
+    return others_hide_best([of for _, of in _scored(sources, name)])
+
+
+def others_hide_best(found: Sequence[Errors]) -> bool:
+    """Whether errors of one quantity, the best filter's first, differ so much in size that they need two panels."""
+    limits = [error_limit([of.error], [of.std] if of.std is not None else []) for of in found]
     return len(limits) > 1 and max(limits) > MOST_RATIO * limits[0] > 0.0
 
 
-def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
+def differences_hide_best(sources: Sources, quantity: Quantity) -> bool:
+    """Whether the other filters differ so much from the best that its ±2σ would look like a line."""
+    drawn = [(track, value) for track, value in pairs(sources.tracks, quantity) if track.file == 0]
+    best, middle = drawn[0]
+    others = error_limit([value - middle for _, value in drawn[1:]], [])
+    return others > MOST_RATIO * error_limit([], [best.std[quantity]] if quantity in best.std else []) > 0.0
+
+
+def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool = False) -> None:
     """Without a reference: differences from the best filter, and its ±2σ, in the unit of errors."""
     drawn = [(track, value) for track, value in pairs(sources.tracks, quantity) if track.file == 0]
     best, middle = drawn[0]
-    scale = quantity.error.scale / quantity.value.scale
+    scale, unit = quantity.error.scale / quantity.value.scale, unit_text(quantity.error.unit)
     order = [f"{best.label} (best)"]
     differences: list[Floats] = []
     draw(axes, best.time_s, 0 * middle, label=order[0], **line_style(best.name))
-    for track, value in drawn[1:]:
+    for track, value in drawn[1:] if not best_only else []:
         difference = scale * (value - middle)
         differences.append(difference)
         rms = float(np.sqrt(np.nanmean(difference**2))) if np.isfinite(difference).any() else np.nan
-        order.append(f"{track.label} {rms:.3g} {unit_text(quantity.error.unit)} rms from it")
+        order.append(f"{track.label} {with_unit(f'{rms:.3g}', unit)} rms from it")
         draw(axes, track.time_s, difference, label=order[-1], **line_style(track.name))
     if quantity in best.std:
         colour = str(line_style(best.name)["color"])
@@ -132,7 +146,7 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity) -> None:
     stds = [scale * best.std[quantity]] if quantity in best.std else []
     bound_view(axes, differences, stds)
     shade_unknown(axes, sources.tracks)
-    finish(axes, f"from best ({unit_text(quantity.error.unit)})")
+    finish(axes, f"from best ({unit})")
     legend_above(axes, best_first=order)
 
 
@@ -157,6 +171,6 @@ def note_hidden(sources: Sources) -> str:
     others = [name for name in sources.hidden if name not in barometric]
     reasons = (
         (barometric, "not drawn, because air pressure noise hides the height"),
-        (others, "not drawn beside a path"),
+        (others, f"not drawn beside a {'chain' if any(track.has(QW) for track in sources.tracks) else 'path'}"),
     )
     return "; ".join(f"{why}: {', '.join(names)} (add --filter {names[0]})" for names, why in reasons if names)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
-from linkpose.plotting.panels import errors, shade_unknown, view_values
+from linkpose.plotting.panels import errors, hides_best, shade_unknown, view_values
 from linkpose.plotting.sources import DrawnTrack, Sources
 from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
 from linkpose.rotations import rotation_vectors
@@ -29,52 +29,49 @@ _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the who
 TimePanel = tuple[float, Callable[["Axes"], None]]
 
 
-@dataclass(frozen=True, slots=True)
-class PathBackground:
-    """What lies under a robot's path, in its map's frame."""
-
-    grid: GridMap | None = None
-    beacons: Mapping[str, Sequence[float]] = field(default_factory=dict)  # id -> x, y (m); further axes are ignored
-    rejected_xy_m: Floats | None = None  # (N, 2) where measurements were rejected
-
-
-def path_panel(sources: Sources, scene: PathBackground | None) -> Callable[[Axes], None] | None:
+def path_panel(sources: Sources, scene: Surroundings | None) -> Callable[[Axes], None] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
     tracks = _with_path(sources)
     wide = is_wide(sources, scene)
-    return (lambda axes: _path(axes, tracks, scene or PathBackground(), wide)) if tracks else None
+    return (lambda axes: _path(axes, tracks, scene or Surroundings(), wide)) if tracks else None
 
 
-def is_wide(sources: Sources, scene: PathBackground | None) -> bool:
-    """Whether a path, without a map, extends so much further along x than along y that a square would be empty."""
-    if scene is not None and scene.grid is not None:
+def is_wide(sources: Sources, scene: Surroundings | None) -> bool:
+    """Whether path, map and beacons extend so much further along x than along y that a square would be empty."""
+    points = [np.column_stack([track.values[X], track.values[Y]]) for track in _with_path(sources)]
+    if scene is not None and points:
+        points.append(scene.corners_m())
+    known = [point[np.isfinite(point).all(axis=1)] for point in points]
+    if not any(map(len, known)):
         return False
-    tracks = _with_path(sources)
-    extents = [[np.ptp(v[np.isfinite(v)]) for v in (track.values[X], track.values[Y])] for track in tracks]
-    return bool(extents) and bool(max(e[0] for e in extents) > _WIDE_RATIO * max(e[1] for e in extents))
+    wide, high = np.ptp(np.vstack(known), axis=0)
+    return bool(wide > _WIDE_RATIO * high)
 
 
 def _with_path(sources: Sources) -> list[DrawnTrack]:
     return [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
 
 
-def time_panels(sources: Sources) -> list[TimePanel]:
+def time_panels(sources: Sources, scene: Surroundings | None = None) -> list[TimePanel]:
     """Error of the position, speed, unwrapped heading and the mice left out, as far as a filter estimates them."""
     found: list[TimePanel] = []
     shown = sources.tracks or sources.all
     if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
-        found.append((1.8, lambda axes: _position_errors(axes, sources)))
+        columns = 6 if is_wide(sources, scene) else 2
+        if hides_best(sources, "position"):
+            found.append((1.4, lambda axes: _position_errors(axes, sources, columns, best_only=True)))
+        found.append((1.8, lambda axes: _position_errors(axes, sources, columns)))
     if any(track.has(VX) for track in shown):
         found.append((1.8, lambda axes: _over_time(axes, sources, _speed, "speed (m/s)")))
     if any(track.has(HEADING) for track in shown):
-        found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading, unwrapped (°)")))
+        found.append((1.8, lambda axes: _over_time(axes, sources, _heading, "heading (°)")))
     for track in sources.tracks:
         if track.has(EXCLUDED) and bool((track.values[EXCLUDED] > 0).any()):
             found.append((0.9, _mice_panel(track)))
     return found
 
 
-def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: PathBackground, wide: bool) -> None:
+def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: bool) -> None:
     _draw_scene(axes, scene)
     for track in reversed(tracks):
         style = line_style(track.name, track.file) if track.name else TRUTH
@@ -91,7 +88,7 @@ def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: PathBackground, wide:
     legend_above(axes, 6 if wide else 3, [track.label for track in tracks])
 
 
-def _draw_scene(axes: Axes, scene: PathBackground) -> None:
+def _draw_scene(axes: Axes, scene: Surroundings) -> None:
     if scene.grid is not None:
         draw_map(axes, scene.grid)
     if scene.beacons:
@@ -160,9 +157,9 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
         axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
 
 
-def _position_errors(axes: Axes, sources: Sources) -> None:
+def _position_errors(axes: Axes, sources: Sources, columns: int, best_only: bool = False) -> None:
     """Distances from the true position, and the best filter's 2σ of x and y together."""
-    errors(axes, sources, "position")
+    errors(axes, sources, "position", best_only)
     best = next((track for track in sources.tracks if X in track.std and Y in track.std), None)
     if best is not None:
         std = np.hypot(best.std[X], best.std[Y])
@@ -171,7 +168,7 @@ def _position_errors(axes: Axes, sources: Sources) -> None:
         known = std[np.isfinite(std)]
         top = axes.get_ylim()[1]
         axes.set_ylim(0.0, max(top, 2.2 * float(np.quantile(known, 0.9))) if len(known) else top)
-        legend_above(axes, 3)
+    legend_above(axes, columns)
 
 
 def _speed(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:

@@ -16,10 +16,11 @@ from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
 from linkpose.plotting.lines import gaps, lost_samples
 from linkpose.presentation import counted
-from linkpose.quantities import HEADING, HEIGHT, ROLL, Quantity, by_filter, split, std_column
+from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
+_LONGEST_NAME = 61  # characters; the rest of the title takes as many
 _THINNED = "the picture shows the extremes of each part, and figures beside lines are of the rows shown"
 
 
@@ -69,8 +70,8 @@ def is_reference(table: Table) -> bool:
 def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     """Of estimates and references.
 
-    Without `wanted`, the filters whose height comes from the air pressure are hidden, and beside a robot's path the
-    filters that estimate its tilt alone.
+    Without `wanted`, the filters whose height comes from the air pressure are hidden, beside a robot's path the filters
+    that estimate its tilt alone, and beside a chain the filters of one of its sensors.
 
     Raises LinkposeError where a wanted filter is in no file.
     """
@@ -81,8 +82,10 @@ def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     if missing:
         raise LinkposeError(f"no file has the filter {', '.join(missing)}; there are {', '.join(dict.fromkeys(found))}")
     shown = _shown(list(dict.fromkeys(found)), wanted)
-    if not wanted and HEADING in {q for table in estimates for of in by_filter(table.columns).values() for q in of}:
+    if not wanted and any(_has(table, HEADING) for table in estimates):
         shown = [name for name in shown if not all(_is_tilt_alone(table, name) for table in estimates)]
+    if not wanted and any(_has(table, QW) for table in estimates):
+        shown = [name for name in shown if any(_has(table, QW, name) for table in estimates)]
     tracks = [
         _track(table, name, columns, i, len(estimates) > 1)
         for i, table in enumerate(estimates)
@@ -107,6 +110,15 @@ def _shown(found: list[str], wanted: Sequence[str]) -> list[str]:
 def is_barometric(name: str) -> bool:
     """Whether a filter's height comes from the air pressure."""
     return bool((of := filters.capabilities(name)) and of.is_barometric)
+
+
+def _has(table: Table, quantity: Quantity, name: str | None = None) -> bool:
+    """Whether this filter, or any, has a value of a quantity somewhere."""
+    return any(
+        quantity in of and bool(np.isfinite(table.columns[of[quantity]]).any())
+        for each, of in by_filter(table.columns).items()
+        if name in (None, each)
+    )
 
 
 def _is_tilt_alone(table: Table, name: str) -> bool:
@@ -175,7 +187,7 @@ def _describe(table: Table) -> str:
     time_s, whole = table.columns["time_s"], table.whole
     step = whole.interval_s if whole else interval(time_s)
     length = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    words = [table.path.name, _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
+    words = [shortened(table.path.name), _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
     holes = whole.gaps if whole else len(gaps(time_s))
     closing = table.closing or {}
     lost = closing.get("lost")
@@ -183,6 +195,14 @@ def _describe(table: Table) -> str:
         lost = whole.lost if whole else lost_samples(time_s)
     words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {counted(holes, 'gap')}")
     return "   ·   ".join(word for word in words if word)
+
+
+def shortened(name: str) -> str:
+    """A file's name, without its middle if it is so long that the title would not fit the figure."""
+    if len(name) <= _LONGEST_NAME:
+        return name
+    half = (_LONGEST_NAME - 1) // 2
+    return f"{name[:half]}…{name[-half:]}"
 
 
 def _length(seconds: float) -> str:

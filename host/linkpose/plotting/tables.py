@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import panels, readings, robots
 from linkpose.plotting.canvas import new_figure
 from linkpose.plotting.sources import Sources, gather, is_recording, title
@@ -24,6 +25,7 @@ from linkpose.quantities import (
     ROTATION,
     YAW,
     Quantity,
+    split,
 )
 from linkpose.recording.table import Table
 
@@ -62,7 +64,7 @@ class Section:
 
 
 def plot_tables(
-    tables: Sequence[Table], wanted: Sequence[str] = (), scene: robots.PathBackground | None = None
+    tables: Sequence[Table], wanted: Sequence[str] = (), scene: Surroundings | None = None
 ) -> tuple[Figure, list[str]]:
     """Recordings, estimates and references in one figure, and remarks on what it leaves out.
 
@@ -72,9 +74,11 @@ def plot_tables(
     for table in tables:
         table.require("time_s")
     sources = gather([table for table in tables if not is_recording(table)], wanted)
-    sections = [section for section in (_robot(sources, scene), _link(sources), _chain(sources)) if section]
+    sections = [section for section in (_robot(sources, scene), _chain(sources), _link(sources)) if section]
     sections += [section for table in tables if is_recording(table) and (section := _readings(table))]
     if not sections:
+        if any(split(column) for column in tables[0].columns):
+            raise LinkposeError(f"{tables[0].path} holds nothing to draw: its quantities are empty in all rows")
         raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
     figure = new_figure(_WIDTH_INCHES, 0.8 + _INCHES * sum(section.height for section in sections))
     figure.suptitle(title(tables), fontsize=10, x=0.01, ha="left")
@@ -110,6 +114,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
         axes.set_xlabel("time (s)")
+        part.align_ylabels()
 
 
 def _link(sources: Sources) -> Section | None:
@@ -124,6 +129,8 @@ def _link(sources: Sources) -> Section | None:
                 found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height")))
         elif _estimated(sources, HEIGHT):
+            if panels.differences_hide_best(sources, HEIGHT):
+                found.append(PlotPanel(1.3, lambda axes: panels.from_best(axes, sources, HEIGHT, best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
     for quantity in (ROLL, PITCH, YAW):
         if panels.has(sources, quantity):
@@ -152,10 +159,10 @@ def _chain(sources: Sources) -> Section | None:
     return Section(found) if found else None
 
 
-def _robot(sources: Sources, scene: robots.PathBackground | None) -> Section | None:
+def _robot(sources: Sources, scene: Surroundings | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
     path = robots.path_panel(sources, scene)
-    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources)]
+    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources, scene)]
     return Section(over_time, path, robots.is_wide(sources, scene)) if path or over_time else None
 
 

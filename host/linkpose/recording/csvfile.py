@@ -13,16 +13,19 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import json
 import os
+import stat
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from linkpose.errors import CannotWrite, FileError, FileExists
+from linkpose.errors import CannotWrite, FileChanged, FileError, FileExists
 
 STDOUT = Path("-")  # as an output: the standard output
+_COPIED_BYTES = 1 << 20  # at once
 
 
 def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
@@ -51,25 +54,44 @@ class CsvFile:
         plain: bool = False,
     ) -> None:
         """`plain` writes no comment lines, and the metadata beside the file, or nowhere for STDOUT."""
-        self.path, self._is_plain = path, plain
+        self.path = self._asked = path
+        self._is_plain, self._fd = plain, -1
+        self._start = ",".join(columns) + "\n" if plain else head(kind, metadata, columns)
         self._beside: dict[str, Any] | None = {"kind": kind, "metadata": metadata, "closing": None} if plain else None
         if path == STDOUT:
             self._beside = None
-        elif plain:
-            os.close(create(metadata_path(path), force))
-        self._fd = create(path, force)
-        self._has_name = os.fstat(self._fd).st_nlink > 0  # what is behind /dev/stdout may have none
-        self._write_beside()
-        self.write(",".join(columns) + "\n" if plain else head(kind, metadata, columns))
+        self._open(force)
+        self.write(self._start)
 
     def write(self, text: str | bytes) -> None:
         """Adds whole lines, in UTF-8. The operating system has them at once: killing this process does not lose them.
 
-        Raises CannotWrite when the file was removed or replaced: what is written then is lost with this process.
+        Raises FileChanged, and writes nothing, when another program has changed the file.
         """
-        if self._has_name and os.fstat(self._fd).st_nlink == 0:
-            raise CannotWrite(self.path, "it was removed while it was being written")
+        if self._is_own:
+            check_unchanged(self._fd, self.path)
         write_all(self._fd, self.path, text.encode() if isinstance(text, str) else text)
+
+    def continue_elsewhere(self) -> None:
+        """Goes on in a new file after FileChanged: run-2.csv for run.csv, or the next number that is free.
+
+        The new file begins with the rows so far if the old one was removed, and with the head alone if another program
+        changed its content. Raises CannotWrite and FileError.
+        """
+        has_all_rows = not _is_changed(self._fd)
+        with os.fdopen(self._fd, "rb") as old:
+            self._fd = -1
+            for number in itertools.count(2):
+                self.path = self._asked.with_name(f"{self._asked.stem}-{number}{self._asked.suffix}")
+                with contextlib.suppress(FileExists):
+                    self._open(force=False)
+                    break
+            if has_all_rows:
+                old.seek(0)
+                while part := old.read(_COPIED_BYTES):
+                    write_all(self._fd, self.path, part)
+            else:
+                self.write(self._start)
 
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""
@@ -88,6 +110,15 @@ class CsvFile:
     def __exit__(self, *_: object) -> None:
         if self._fd >= 0:
             self._release()
+
+    def _open(self, force: bool) -> None:
+        """Creates the file, and the one of the metadata beside it."""
+        if self._beside is not None:
+            os.close(create(metadata_path(self.path), force))
+        self._fd = create(self.path, force)
+        # What is behind - or /dev/stdout may have no name, and other programs may write it.
+        self._is_own = os.fstat(self._fd).st_nlink > 0 and self.path != STDOUT
+        self._write_beside()
 
     def _write_beside(self) -> None:
         """Writes the metadata of a plain file."""
@@ -110,7 +141,7 @@ def create(path: Path, force: bool) -> int:
     """
     if path == STDOUT:
         return _standard_output()
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
     try:
         if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
             flags = os.O_WRONLY
@@ -135,9 +166,24 @@ def _standard_output() -> int:
         raise CannotWrite("the standard output", error.strerror) from error
 
 
+def check_unchanged(fd: int, path: Path) -> None:
+    """Raises FileChanged when another program removed the file, or changed its size. A pipe or a device has none."""
+    of = os.fstat(fd)
+    if not stat.S_ISREG(of.st_mode):
+        return
+    if of.st_nlink == 0:
+        raise FileChanged(path, "it was removed while it was being written")
+    if _is_changed(fd):
+        raise FileChanged(path, "another program changed it while it was being written")
+
+
+def _is_changed(fd: int) -> bool:
+    """Whether the file does not end where this program's next byte goes."""
+    return os.fstat(fd).st_size != os.lseek(fd, 0, os.SEEK_CUR)
+
+
 def write_all(fd: int, path: Path, data: bytes) -> None:
     """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
-    name = "the standard output" if path == STDOUT else path
     left = memoryview(data)
     written = 0
     try:
@@ -148,6 +194,7 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
     except OSError as error:
         if written:
             _cut_back(fd, data[:written])
+        name = "the standard output" if path == STDOUT else path
         if error.errno == errno.EPIPE:
             raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
         raise FileError(
@@ -161,4 +208,4 @@ def _cut_back(fd: int, written: bytes) -> None:
     """Removes a partial last line that a full disk left behind."""
     partial = len(written) - (written.rfind(b"\n") + 1)
     with contextlib.suppress(OSError):
-        os.ftruncate(fd, os.fstat(fd).st_size - partial)
+        os.ftruncate(fd, os.lseek(fd, -partial, os.SEEK_END))

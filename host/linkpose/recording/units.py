@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linkpose.recording.consistency import contradiction
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
@@ -27,10 +28,6 @@ _MMHG = (600.0, 800.0)  # at sea level; as hPa, an altitude of 2 to 4 km
 _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
 _MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
-# From this correlation of gravity's rotation with the gyro's on, their scales are compared. From this factor between
-# them on, the gyro's scale is reported: a wrong range is off by 2 or more, and a fast swing is off by less.
-_AGREES = 0.9
-_SCALE_OFF = 1.7
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
 _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
@@ -44,10 +41,11 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
     """
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
     unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
+    time = _time(_median(np.diff(measurements.time_s)), rate_hz)
     found = [
         unit or _gravity(measurements, force_m_s2),
-        _rate(measurements.gyro_rad_s) or _turning(measurements),
-        _time(_median(np.diff(measurements.time_s)), rate_hz),
+        _rate(measurements.gyro_rad_s) or ("" if time else contradiction(measurements)),
+        time,
         _pressure(_median(measurements.pressure_Pa)),
         _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
         _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
@@ -96,35 +94,6 @@ def _gravity(measurements: Measurements, force_m_s2: Floats) -> str:
         f"accel_* is {force:.3g} m/s² while the sensor is still, and gravity is {STANDARD_GRAVITY:.2g}: check the "
         "range (accel_range_g) and the unit, or the sensor is faulty"
     )
-
-
-def _turning(measurements: Measurements) -> str:
-    """A remark if the rotation of gravity in the sensor's axes, da/dt = −ω × a, contradicts the gyro's unit."""
-    step_s = _usual_step(measurements)
-    size = max(1, round(_BLOCK_S / step_s)) if np.isfinite(step_s) else 1
-    if len(measurements) // size < _FEWEST_BLOCKS or step_s * size > 2 * _BLOCK_S:
-        return ""
-    accel, gyro = _averaged(measurements, size)
-    change = np.diff(accel, axis=0)
-    expected = -np.cross(gyro[1:] + gyro[:-1], accel[1:] + accel[:-1]) / 4 * size * step_s
-    known = np.isfinite(change).all(axis=1) & np.isfinite(expected).all(axis=1)
-    both = float(np.sum(change[known] * expected[known]))
-    size_change, size_expected = (float(np.sum(values[known] ** 2)) for values in (change, expected))
-    if not np.any(gyro[np.isfinite(gyro)]):
-        return "gyro_* is 0 in all rows: the gyro gives no reading, or its columns are of another quantity"
-    if not size_change or not size_expected:
-        return ""
-    agreement, factor = both / np.sqrt(size_change * size_expected), both / size_expected
-    if agreement >= 0.5 and 2 / 3 < factor / (np.pi / 180) < 1.5:
-        return f"gyro_* turns gravity {180 / np.pi:.0f} times too far: is it in °/s? multiply it by {np.pi / 180:.7f}"
-    if agreement <= -_AGREES:
-        return "gyro_* turns gravity backwards: its sign is reversed against accel_*"
-    if agreement >= _AGREES and not 1 / _SCALE_OFF < factor < _SCALE_OFF:
-        return (
-            f"gyro_* turns gravity by {1 / factor:.2g} of its rotation: check the range (gyro_range_deg_s) and the "
-            f"unit, or multiply it by {factor:.2g}"
-        )
-    return ""
 
 
 def _averaged(measurements: Measurements, size: int) -> tuple[Floats, Floats]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from linkpose.errors import CannotWrite, FileError, FileExists, LinkposeError
+from linkpose.errors import CannotWrite, FileExists, LinkposeError, NamedTwice
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
 from linkpose.localization.maps import save_map
@@ -36,7 +36,7 @@ def check_outputs(paths: Iterable[Path], force: bool) -> None:
     named = [path if path == STDOUT else path.absolute() for path in paths]
     for path in named:
         if named.count(path) > 1:
-            raise FileError(path, f"{path} is named for two outputs; name two files")
+            raise NamedTwice(path)
         if path == STDOUT:
             continue
         if path.is_dir():

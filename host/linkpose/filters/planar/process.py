@@ -40,6 +40,10 @@ _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 
 # Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
 # (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
 _ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# A mouse is misplaced: after so much turning (rad²/s), by at least this much (m), with this share of the squared
+# differences left, once its scale and angle are known to this σ. Its new place has this share of the change as σ.
+# Doubled: a place is corrected later, or a wrong mouse is corrected.
+_PLACE_TURN, _PLACE_M, _PLACE_LEFT, _PLACE_SCALE, _PLACE_SHARE = 0.3, 0.012, 0.15, 0.008, 0.2
 # While the last turn is off by so many standard deviations, the mice are not calibrated. Doubled: positions of the mice
 # take up the scale of another floor.
 _OFF_Z = 3.0
@@ -118,7 +122,10 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     _add_to_turn(state, turn, m.turn_rate, m.step)
     by_scales = _variance_by_scales(state, m, mice)
     state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
-    if state.turn_square < _FLOOR_TURN or is_doubtful(state):
+    if is_doubtful(state):
+        return
+    _find_misplaced(state, m, mice)
+    if state.turn_square < _FLOOR_TURN:
         return
     off = state.turn_product / state.turn_square - 1.0
     noise = math.sqrt(by_scales + state.turn_variance / state.turn_square**2)
@@ -127,42 +134,91 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     latest, before = _off_of_turn(state), state.off_of_turn
     if latest == 0.0:
         latest, before = before, state.off_of_turn_before
-    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m) > 0.5 * abs(off):
+    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
             state.covariance[a, b] += p.floor_scale**2
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     _correct_way(state, off)
-    state.turn_square = state.turn_product = state.turn_variance = 0.0
-    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
-    for i in range(len(state.product_of_each)):
-        state.product_of_each[i] = 0.0
-    state.is_off = False
+    _restart_turns(state)
     state.floors += 1
 
 
 @inner
 def _add_turn_of_each(state: Record, m: Record, mice: Records, by_gyro: float, keep: float) -> None:
-    """Add the turn that each mouse shows about the centre of all, times the gyro's."""
-    arm, moved = 0j, 0j
+    """Add the motion of each mouse relative to the mean of all, times the turn rate of the gyro."""
+    moved = 0j
     for i in range(m.count):
-        arm += scaled(1.0 / m.count, mice[i].arm)
         moved += scaled(1.0 / m.count, mice[i].moved)
     for i in range(m.count):
-        lever = mice[i].arm - arm
-        turn = dot(lever, mice[i].moved - moved) / max(square(lever), 1e-12)
-        state.product_of_each[i] = keep * state.product_of_each[i] + by_gyro * turn
+        own = scaled(keep, state.lever_of_each[i]) + scaled(by_gyro, mice[i].moved - moved)
+        state.lever_of_each[i] = own
 
 
 @inner
-def _spread_of_turns(state: Record, m: Record) -> float:
+def _off_of_each(state: Record, m: Record, mice: Records, i: int) -> complex:
+    """Lever of a mouse about the centre of all as the turns have shown it, less the assumed one (m, turned by 90°)."""
+    arm = 0j
+    for k in range(m.count):
+        arm += scaled(1.0 / m.count, mice[k].arm)
+    return complex(scaled(1.0 / state.turn_square, state.lever_of_each[i]) - (mice[i].arm - arm))
+
+
+@inner
+def _spread_of_turns(state: Record, m: Record, mice: Records) -> float:
     """Spread of the shares of the gyro's turn that the mice show: on another floor all show the same."""
-    least, most = math.inf, -math.inf
+    least, most, arm = math.inf, -math.inf, 0j
+    for k in range(m.count):
+        arm += scaled(1.0 / m.count, mice[k].arm)
     for i in range(m.count):
-        share = state.product_of_each[i] / state.turn_square
+        lever = mice[i].arm - arm
+        share = dot(lever, _off_of_each(state, m, mice, i)) / max(square(lever), 1e-12)
         least, most = min(least, share), max(most, share)
     return most - least
+
+
+@inner
+def _find_misplaced(state: Record, m: Record, mice: Records) -> None:
+    """Correct the place of the one mouse that is elsewhere than the rig states, as the turns show it."""
+    if m.count < 3 or state.turn_square < _PLACE_TURN:
+        return
+    worst, far2, total2 = 0, 0.0, 0.0
+    for i in range(m.count):
+        off2 = square(_off_of_each(state, m, mice, i))
+        total2 += off2
+        if off2 > far2:
+            worst, far2 = i, off2
+    own = 1.0 - 1.0 / m.count
+    off = scaled(1.0 / own, _off_of_each(state, m, mice, worst))
+    left2 = 0.0
+    for i in range(m.count):
+        expected = scaled(own if i == worst else own - 1.0, off)
+        left2 += square(_off_of_each(state, m, mice, i) - expected)
+    at = MICE + OF_MOUSE * worst
+    p, known = state.covariance, _PLACE_SCALE * _PLACE_SCALE
+    is_known = p[at + SCALE, at + SCALE] < known and p[at + ANGLE, at + ANGLE] < known
+    if not is_known or square(off) < _PLACE_M * _PLACE_M or left2 > _PLACE_LEFT * total2:
+        return
+    mouse = state.at.mice[worst]
+    _restart(state, at + POSITION, at + OF_MOUSE, 1.0)
+    mouse.dx += off.imag
+    mouse.dy -= off.real
+    for k in range(2):
+        p[at + POSITION + k, at + POSITION + k] = _PLACE_SHARE * _PLACE_SHARE * square(off)
+    _restart_turns(state)
+    m.excluded &= ~(1 << worst)
+    state.moved |= 1 << worst
+
+
+@inner
+def _restart_turns(state: Record) -> None:
+    """Begin to compare the turns of gyro and mice anew."""
+    state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    for i in range(len(state.lever_of_each)):
+        state.lever_of_each[i] = 0j
+    state.is_off = False
 
 
 @inner
@@ -225,13 +281,14 @@ def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, floa
 
     The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
     apart, the mean is as uncertain as that of so many draws. Positions beyond three standard deviations of the rig's
-    are taken for wrong ones, which show as scale and angle too.
+    are taken for wrong ones, which show as scale and angle too, unless the turns have shown where the mouse is.
     """
     count = m.count
     scale = angle = scale2 = angle2 = moved2 = arm2 = 0.0
     for i in range(count):
         mouse = state.at.mice[i]
-        moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
+        if not state.moved >> i & 1:
+            moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
         arm2 += square(mice[i].arm)
         scale += mouse.scale
         angle += mouse.angle

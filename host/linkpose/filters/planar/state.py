@@ -104,7 +104,8 @@ _FIELDS = [
     # Common scale of the mice against the gyro: sums over the last turns.
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
-    ("product_of_each", "f8", (MOST,)),  # the same by each mouse about the centre of all
+    ("lever_of_each", "c16", (MOST,)),  # ∫ ω s dt of each mouse's motion s relative to the mean (m rad/s)
+    ("moved", "i8"),  # bit mask of the mice whose places the turns have corrected
     ("turn_variance", "f8"),  # variance of turn_product (rad⁴/s²)
     ("recent_square", "f8"),  # the first two over the current turn only
     ("recent_product", "f8"),

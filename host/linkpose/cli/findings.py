@@ -1,0 +1,126 @@
+"""What `estimate` reports besides the estimates: the filters that run, J2S, the mice and the magnetic field."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from linkpose.cli.cures import sentence
+from linkpose.errors import LinkposeError, MissingJ2S
+
+if TYPE_CHECKING:
+    from linkpose.cli.live import Console
+    from linkpose.estimation import Estimator
+    from linkpose.sensors.rig import Joint
+
+WORST_STD_M = 0.03  # (m, 1σ in the worst direction) from which on the heights are rough: 2 % of a link of 1.65 m
+
+
+def report_running(estimator: Estimator, joint: Joint | None, console: Console) -> None:
+    """Reports which filters run; `joint` is what --j2s asks for.
+
+    Raises LinkposeError if J2S is to be estimated and no filter that runs does it.
+    """
+    from linkpose import filters
+    from linkpose.filters import REGISTRY
+
+    if joint is not None and joint.known_j2s_m is None and estimator.found_j2s is None:
+        name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
+        raise LinkposeError(f"--j2s auto is estimated by {name}, which does not run; add --filter {name}")
+    left_out = {name: sentence(reason) for name, reason in estimator.left_out.items()}
+    for reason in dict.fromkeys(left_out.values()):
+        names = ", ".join(name for name, why in left_out.items() if why == reason)
+        console.detail(f"not running: {names}: {reason}")
+    missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
+    is_robot = any(REGISTRY[f.name].is_odometric for f in estimator.filters)  # J2S is nothing to a robot
+    if missing and not is_robot and any(REGISTRY[f.name].sensors for f in estimator.filters):
+        console.report(left_out[missing[0]])
+    others = " (-v: why not others)" if left_out else ""
+    console.report(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")
+
+
+def report_findings(estimator: Estimator, console: Console) -> None:
+    """What the filters found about J2S, the mice and the magnetic field."""
+    _report_j2s(estimator, console)
+    _report_mice(estimator, console)
+    _report_field(estimator, console)
+
+
+def _report_j2s(estimator: Estimator, console: Console) -> None:
+    """J2S where it was estimated, and the axis along which the motion did not excite it."""
+    found = estimator.found_j2s
+    if not found:
+        return
+    axes = (f"{value:.4f} ± {std:.4f}" for value, std in zip(found.mean_m, found.std_m, strict=True))
+    console.report(f"J2S {', '.join(axes)} m")
+    if found.worst_std_m > WORST_STD_M:
+        console.report(
+            f"The motion does not determine J2S along the sensor's {found.worst_axis} axis (1σ is "
+            f"{found.worst_std_m:.2f} m), so the heights are rough. Swing the link longer, in all directions."
+        )
+
+
+_LONG_S = 5.0  # longer than robots slip or are carried
+_SHORTEST_S = 0.2  # of exclusions that are reported: a late packet excludes a mouse for a sample
+
+
+def _report_excluded(estimator: Estimator, console: Console) -> None:
+    """Which mice were left out, since when, and for how long."""
+    excluded = estimator.excluded
+    long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
+    for name in long:
+        still = "; it is still left out" if name in excluded.now else ""
+        console.report(
+            f"mouse {name.removeprefix('mouse')} was left out for {excluded.total_s[name]:.1f} s, first at "
+            f"{excluded.first_s[name]:.1f} s{still}: it contradicted the other sensors. Check that it is on the floor, "
+            "and its place and angle in the rig file"
+        )
+    mice = len(estimator.rig.mouse)
+    if mice and len(long) == mice and min(excluded.total_s.values()) > _LONG_S:
+        console.report(
+            "all mice were left out for long: together they contradict the gyro. If they were on the floor, their "
+            "counts_per_m or angle_deg in the rig file are wrong: type `linkpose calibrate mice`"
+        )
+
+
+def _report_mice(estimator: Estimator, console: Console) -> None:
+    """Excluded mice, jumps of the gyro, and the common scale of the mice where it differs from the rig file."""
+    _report_excluded(estimator, console)
+    jumps = estimator.gyro_jumps
+    if jumps:
+        times = "" if jumps.times == 1 else f" {jumps.times} times, last"
+        console.report(
+            f"the gyro's bias has jumped{times} by {math.degrees(jumps.last_rad_s):+.1f} °/s, found at "
+            f"{jumps.last_time_s:.1f} s: the mice contradicted the gyro, and the heading was corrected by the mice. "
+            "Check the mounting and the supply of the sensor"
+        )
+    for mouse in estimator.moved_mice:
+        console.report(
+            f"mouse {mouse.mouse} is {1e3 * mouse.off_m:.0f} mm from its place in the rig file: the turns show it at "
+            f"x_m = {mouse.x_m:.3f}, y_m = {mouse.y_m:.3f}"
+        )
+    if estimator.mice_scale:
+        factor, std = estimator.mice_scale
+        change = "more" if factor > 1 else "fewer"
+        console.report(
+            f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
+            "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
+        )
+
+
+def _report_field(estimator: Estimator, console: Console) -> None:
+    """How long the magnetometer held the heading, and the largest disturbance."""
+    found = estimator.magnetic_field
+    if found is None:
+        return
+    if not found.references:
+        console.report(
+            "The magnetometer did not hold the heading: the field is not as strong as at its calibration. Move away "
+            "from iron, or calibrate it here: linkpose calibrate mag RECORDING --rig rig.toml"
+        )
+        return
+    console.report(
+        f"The magnetometer held the heading for {found.used_s:.0f} s; for {found.rejected_s:.0f} s the field was "
+        f"disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+        + ("" if found.north_deg is None else f" Magnetic north is at yaw {found.north_deg:.0f}°.")
+    )
