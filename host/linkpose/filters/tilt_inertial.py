@@ -39,7 +39,7 @@ from linkpose.sensors.rig import Rig
 
 # Without a joint, scale and misalignment are hardly observable: the values of a good part are assumed, with the full
 # range of biases at switch-on.
-_ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
+ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
 # Half the χ² of 21 sensor errors: 3.8σ of all of them at once.
 _LARGEST_DISTANCE = 150.0
 # Without a joint, unmodelled errors appear in the bias only: its walk is that of a joint with much play.
@@ -66,13 +66,14 @@ class TiltInertialFilter:
         "tilt_inertial_yaw_std_deg",
     )
 
-    def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
+    def __init__(self, rig: Rig, parameters: InertialParameters | None = None, errors: SensorErrors = ERRORS) -> None:
+        """`errors`: the assumed sensor errors, where the rig declares none."""
         self.parameters = parameters or PARAMETERS
         self._record = record_of(self.parameters)
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
         self._states = fresh_state(
-            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE
+            declared(errors, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE
         )
         self._imu = ImuCalibration.of(rig.imu).packed()
 
