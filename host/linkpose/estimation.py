@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -236,6 +237,11 @@ class Estimator:
         return None
 
     @property
+    def remarks(self) -> list[str]:
+        """What the filters found wrong with the measurements so far."""
+        return [remark for f in self.filters if isinstance(f, filters.HasRemarks) for remark in f.remarks]
+
+    @property
     def mice_scale(self) -> tuple[float, float] | None:
         """Counts per metre of the mice relative to the rig file, and its standard deviation, where they differ.
 
@@ -426,6 +432,7 @@ class Estimates:
     found_j2s: FoundJ2s | None  # J2S where it was to be estimated
     magnetic_field: FieldRecord | None  # where the magnetometer held the yaw
     rig: Rig  # that was in force
+    remarks: tuple[str, ...] = ()  # what is wrong with the measurements
 
     @property
     def time_s(self) -> Floats:
@@ -491,6 +498,9 @@ def estimate(
         smooth: use a smoother, which also uses later measurements, for each filter that has one.
         mag: correct the yaw with the magnetometer. The rig must contain the magnetometer's calibration.
 
+    Warns:
+        UserWarning where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
+
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
         NoMagnetometer, UncalibratedMagnetometer, CannotRun (no filter estimates a yaw).
@@ -509,6 +519,9 @@ def estimate(
     if mag:
         estimator.hold_heading()
     values = estimator.process(measurements)
+    remarks = tuple(estimator.remarks)
+    for remark in remarks:
+        warnings.warn(remark, stacklevel=2)
     return Estimates(
         tuple(estimator.columns),
         values,
@@ -519,6 +532,7 @@ def estimate(
         estimator.found_j2s,
         estimator.magnetic_field,
         in_force,
+        remarks,
     )
 
 

@@ -40,10 +40,12 @@ def report_running(estimator: Estimator, joint: Joint | None, console: Console) 
 
 
 def report_findings(estimator: Estimator, console: Console) -> None:
-    """What the filters found about J2S, the mice and the magnetic field."""
+    """What the filters found about J2S, the mice and the magnetic field, and what is wrong with the measurements."""
     _report_j2s(estimator, console)
     _report_mice(estimator, console)
     _report_field(estimator, console)
+    for remark in estimator.remarks:
+        console.report(remark)
 
 
 def _report_j2s(estimator: Estimator, console: Console) -> None:

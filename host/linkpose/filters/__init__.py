@@ -83,6 +83,15 @@ class Filter(Protocol):
 
 
 @runtime_checkable
+class HasRemarks(Protocol):
+    """Further interface of a filter that checks its readings."""
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is wrong with the readings so far, one sentence with its cure for each fault."""
+
+
+@runtime_checkable
 class FindsMiceScale(Protocol):
     """Further interface of a filter that compares the mice with the gyro."""
 
