@@ -120,7 +120,7 @@ dip_deg = 54.5
 
 
 def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_path: Path) -> None:
-    """Two inertial sensors, a barometer, a magnetometer, three mice at 100 Hz: nothing lost; the field holds the yaw."""
+    """Two inertial sensors, a barometer, a magnetometer, mice at 100 Hz: nothing lost; the field holds the yaw."""
     uno = board(imu2={}, magnetometer="qmc5883l", mice=MICE[:3]).uno
     run = LinkRun(test=1, seed=0, duration_s=None, imu2=True, mag=True)
     feed = RigFeed(uno, run)
