@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -60,20 +62,31 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+_LONGEST_STEP_S = 0.1  # of the time for which a sample stands where others were lost
+
+
 class ExcludedMice:
-    """The mice whose valid counts a filter excluded: samples of each, and the mice excluded at the last sample."""
+    """The mice whose valid counts a filter excluded.
+
+    For each: samples, time of the first one and total time (s), and whether it is excluded at the last sample.
+    """
 
     def __init__(self, estimator_columns: Sequence[str]) -> None:
         self._columns = [
             at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
         ]
         self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
+        self.first_s: dict[str, float] = {}
+        self.total_s: dict[str, float] = {}
         self.now: set[str] = set()
+        self._last_s = math.nan
 
     def count(self, block: Measurements, estimates: Floats) -> None:
         """Count the exclusions in the estimates (N, columns) of a block of N samples."""
         if not self._columns or not len(block):
             return
+        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=self._last_s)), 0.0, _LONGEST_STEP_S)
+        self._last_s = float(block.time_s[-1])
         masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
         self.now = set()
         if not masks.any():
@@ -83,6 +96,8 @@ class ExcludedMice:
         for port in np.flatnonzero(excluded.any(axis=0)).tolist():
             name = f"mouse{port + 1}"
             self.samples[name] = self.samples.get(name, 0) + int(excluded[:, port].sum())
+            self.total_s[name] = self.total_s.get(name, 0.0) + float(step_s[excluded[:, port]].sum())
+            self.first_s.setdefault(name, float(block.time_s[np.argmax(excluded[:, port])]))
             if excluded[-1, port]:
                 self.now.add(name)
 
@@ -222,6 +237,11 @@ class Estimator:
         return None
 
     @property
+    def remarks(self) -> list[str]:
+        """What the filters found wrong with the measurements so far."""
+        return [remark for f in self.filters if isinstance(f, filters.HasRemarks) for remark in f.remarks]
+
+    @property
     def mice_scale(self) -> tuple[float, float] | None:
         """Counts per metre of the mice relative to the rig file, and its standard deviation, where they differ.
 
@@ -235,6 +255,22 @@ class Estimator:
         return None
 
     @property
+    def gyro_jumps(self) -> filters.GyroJumps | None:
+        """Jumps of the gyro's bias that the mice have shown; None where no filter compares them, or without a jump."""
+        for f in self.filters:
+            if isinstance(f, filters.FindsGyroJumps) and f.gyro_jumps.times:
+                return f.gyro_jumps
+        return None
+
+    @property
+    def moved_mice(self) -> tuple[filters.MovedMouse, ...]:
+        """Mice that the first filter that estimates their places shows elsewhere than the rig file states."""
+        for f in self.filters:
+            if isinstance(f, filters.FindsMovedMice):
+                return f.moved_mice
+        return ()
+
+    @property
     def outcome(self) -> dict[str, Any]:
         """Entries of a file's closing line: rejected samples, and what the filters found of J2S, mice and field."""
         outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in self.filters}}
@@ -242,6 +278,10 @@ class Estimator:
             outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
         if self.excluded.samples:
             outcome["excluded_mice"] = self.excluded.samples
+            outcome["excluded_mice_since_s"] = {name: round(at, 3) for name, at in self.excluded.first_s.items()}
+        if jumps := self.gyro_jumps:
+            last = {"last_rad_s": round(jumps.last_rad_s, 5), "found_s": round(jumps.last_time_s, 3)}
+            outcome["gyro_jumps"] = {"count": jumps.times} | last
         if self.mice_scale:
             outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in self.mice_scale)
         if self.magnetic_field:
@@ -281,7 +321,7 @@ class LiveEstimator:
 
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
         """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
-        self._filters = estimator.filters
+        self._estimator, self._filters = estimator, estimator.filters
         self._excluded = estimator.excluded
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
@@ -290,6 +330,9 @@ class LiveEstimator:
 
     def process(self, block: Measurements) -> LiveRows:
         """Takes the next block, which may be empty."""
+        if len(block) and not self._blocks and self._are_all_ready():
+            rows = self._estimator.process(block)
+            return LiveRows(rows, rows[-1], rows[:0])
         if len(block):
             self._blocks.append(block)
         has_caught_up = False
@@ -302,6 +345,9 @@ class LiveEstimator:
         complete = self._take_complete()
         last = self._rows(len(self._blocks) - 1, len(self._blocks)) if self._blocks else complete
         return LiveRows(complete, last[-1] if len(block) else np.empty(0), caught_up)
+
+    def _are_all_ready(self) -> bool:
+        return self._is_ready(TEXT) and all(self._is_ready(f.name) for f in self._filters)
 
     def finish(self) -> Floats:
         """The rows that were not complete yet. All filters must be ready, or are compiled now."""
@@ -386,6 +432,7 @@ class Estimates:
     found_j2s: FoundJ2s | None  # J2S where it was to be estimated
     magnetic_field: FieldRecord | None  # where the magnetometer held the yaw
     rig: Rig  # that was in force
+    remarks: tuple[str, ...] = ()  # what is wrong with the measurements
 
     @property
     def time_s(self) -> Floats:
@@ -451,6 +498,9 @@ def estimate(
         smooth: use a smoother, which also uses later measurements, for each filter that has one.
         mag: correct the yaw with the magnetometer. The rig must contain the magnetometer's calibration.
 
+    Warns:
+        UserWarning where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
+
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
         NoMagnetometer, UncalibratedMagnetometer, CannotRun (no filter estimates a yaw).
@@ -469,6 +519,9 @@ def estimate(
     if mag:
         estimator.hold_heading()
     values = estimator.process(measurements)
+    remarks = tuple(estimator.remarks)
+    for remark in remarks:
+        warnings.warn(remark, stacklevel=2)
     return Estimates(
         tuple(estimator.columns),
         values,
@@ -479,6 +532,7 @@ def estimate(
         estimator.found_j2s,
         estimator.magnetic_field,
         in_force,
+        remarks,
     )
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 
-from linkpose import compiling
+from linkpose import compiling, filters, precompile
+from linkpose.localization.localizer import Method
 
 HOST = Path(__file__).parents[2] / "host"
 
@@ -66,8 +69,8 @@ def test_an_edit_in_another_file_and_a_renamed_class_are_seen(package, tmp_path)
     assert run(HEIGHT, host, **place) == "1.5 1"
     edit(package / "filters" / "_vector.py", "return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]", "return 4.0")
     assert run(HEIGHT, host, **place) == "2.0 0"
-    edit(package / "filters" / "baro.py", "StartState", "Beginning")
-    assert run(HEIGHT.replace("StartState", "Beginning"), host, **place) == "2.0 0"
+    edit(package / "filters" / "baro.py", "BaroParameters", "Parameters")
+    assert run(HEIGHT.replace("BaroParameters", "Parameters"), host, **place) == "2.0 0"
 
 
 def test_the_compiler_itself_and_each_source_of_machine_code_change_the_folder(package, cache, monkeypatch):
@@ -233,6 +236,14 @@ def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, t
     assert list((tmp_path / "mine").rglob("*.nbc"))
 
 
+@pytest.mark.parametrize(
+    "name", [*filters.NAMES, *get_args(Method), precompile.TEXT, precompile.NOISES, precompile.FILES]
+)
+def test_all_that_the_wheel_contains_compiles(name):
+    precompile.compile_here(name)
+    assert compiling.is_compiled(name)
+
+
 PREPARE = """
 from linkpose.precompile import prepare
 lines = []
@@ -254,11 +265,31 @@ def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
     assert "in each run" in run(code, HOST, NUMBA_DISABLE_JIT=1, **nowhere)
 
 
-def test_filters_that_share_parts_compile_in_one_process(tmp_path):
-    """Parts of one that were local to its module once took the place of another's of the same name, and it crashed."""
+@pytest.mark.parametrize("checks", [0, 1])
+def test_filters_that_share_parts_run_in_one_process_in_any_order(checks, tmp_path):
+    """A part that was local to one module once took the place of another module's part, and the process crashed."""
     code = (
         "from linkpose import filters; from linkpose.experiments.planar import drive; run = drive(1, 8.0); "
-        "print(*(f'{filters.create(name, run.rig).process(run.measurements)[-1, 0]:.2f}' "
-        "for name in ('mice', 'planar-ekf')))"
+        "print(*(f'{filters.create(name, run.rig).process(run.measurements)[-1, 0]:.2f}' for name in NAMES))"
     )
-    assert run(code, HOST, NUMBA_CACHE_DIR=tmp_path) == "0.45 1.55"
+    place = {"NUMBA_CACHE_DIR": tmp_path, "NUMBA_BOUNDSCHECK": checks}
+    assert run(code.replace("NAMES", "('mice', 'planar-ekf')"), HOST, **place) == "0.45 1.55"
+    assert run(code.replace("NAMES", "('planar-ekf', 'mice')"), HOST, **place) == "1.55 0.45"
+
+
+def test_machine_code_has_no_symbol_for_what_it_contains_of_other_functions(monkeypatch):
+    monkeypatch.setattr(compiling, "_the_folder", lambda: None)
+    too_long_to_be_copied = "    x = math.sin(x) if x > 0.5 else math.exp(x) / math.sqrt(x * x + 1.0)\n" * 40
+    functions: dict[str, Any] = {"math": math, "__name__": __name__}
+    exec(f"def part(x):\n{too_long_to_be_copied}    return x\n", functions)
+    part = compiling.inner(functions["part"])
+
+    @compiling.compiled
+    def whole(x: float) -> float:
+        return part(x) + part(2.0 * x) + part(3.0 * x)
+
+    assert math.isfinite(whole(0.5))
+    (code,) = whole.inspect_llvm().values()
+    defined = [line for line in code.splitlines() if line.startswith("define ")]
+    assert any("4part" in line for line in defined)
+    assert all(line.startswith("define private ") == ("4part" in line) for line in defined)

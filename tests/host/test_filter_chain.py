@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -245,3 +246,56 @@ def test_a_first_rest_gives_the_gyro_biases_of_the_data_sheet() -> None:
     )  # fmt: skip
     error = _error_deg(lp.estimate(measured, filters=["chain"]), truth)[measured.time_s > 15]
     assert np.sqrt(np.mean(error**2)) < 1.5
+
+
+def _changed(measured: lp.Measurements, **changes: np.ndarray) -> lp.Measurements:
+    """Measurements from arrays, some of them in place of the recorded ones."""
+    arrays = {name: getattr(measured, name) for name in ("accel2_m_s2", "gyro2_rad_s")} | changes
+    return lp.Measurements.from_imu(measured.time_s, measured.accel_m_s2, measured.gyro_rad_s, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "remark"),
+    [
+        ("gyro2_rad_s", lambda rates: np.degrees(rates), "units are m/s² and rad/s"),
+        (
+            "gyro2_rad_s",
+            lambda rates: np.where(np.arange(len(rates))[:, None] < 1000, rates, rates[1000]),
+            "has failed",
+        ),
+        ("accel2_m_s2", lambda forces: forces / STANDARD_GRAVITY, "mean acceleration of sensor 2 is 1"),
+        ("accel2_m_s2", lambda forces: 0 * forces, "mean acceleration of sensor 2 is 0"),
+    ],
+)
+def test_readings_that_no_joint_gives_are_reported_and_have_no_estimate(name: str, change: Any, remark: str) -> None:
+    measured, _, _ = _chain("hinge")
+    broken = _changed(measured, **{name: change(getattr(measured, name))})
+    with pytest.warns(UserWarning, match=remark):
+        estimates = lp.estimate(broken, filters=["chain"], joint="hinge")
+    assert any(remark in sentence for sentence in estimates.remarks)
+    late = measured.time_s > 20
+    assert np.isnan(estimates["chain_qw"][late]).all()
+    assert np.isnan(estimates["chain_angle_deg"][late]).all()
+
+
+def test_a_sensor_that_is_mounted_anew_is_found_again() -> None:
+    run = ChainRun("hinge", 3, 60.0)
+    measured = run.measurements()
+    truth = run.truth_columns(measured.time_s)
+    rotation = _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz")))
+    late, turn = (measured.time_s > 20)[:, None], np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    changes = {
+        name: np.where(late, getattr(measured, name) @ turn.T, getattr(measured, name))
+        for name in ("accel2_m_s2", "gyro2_rad_s")
+    }
+    with pytest.warns(UserWarning, match="do not fit two links"):
+        estimates = lp.estimate(_changed(measured, **changes), filters=["chain"], joint="hinge")
+    error = _error_deg(estimates, np.where(late[:, None], rotation @ turn.T, rotation))
+    end = measured.time_s > 50
+    assert np.sqrt(np.mean(error[end] ** 2)) < 1.0  # NaN, which fails, where it is not known
+    known = np.isfinite(error)
+    assert np.mean(error[known] < 2 * estimates["chain_rotation_std_deg"][known]) > 0.9
+
+
+def test_readings_in_order_give_no_remark() -> None:
+    assert not lp.estimate(_chain("ball")[0], filters=["chain"], joint="ball").remarks

@@ -69,6 +69,28 @@ def test_a_fast_turn_is_no_spike():
     assert np.sqrt(np.mean(error**2)) < 0.7
 
 
+@pytest.mark.parametrize(("rest_s", "least_deg", "most_deg"), [(0.0, 1.0, 6.0), (20.5, 10.0, 20.0)])
+def test_after_a_gap_sigma_is_that_of_the_motion_before_it(rest_s, least_deg, most_deg):
+    """A gap of 1 s after 20 s of motion, or of rest: then nothing is known of the motion, and σ is larger."""
+
+    def rate(t):
+        return np.array([2 * np.sin(3 * t), np.cos(2 * t), 0.0]) * (t >= rest_s)
+
+    def accel(time_s):
+        swing = 0.7 * np.column_stack([np.sin(5 * time_s), np.cos(4 * time_s), np.sin(6 * time_s)])
+        return swing * (time_s >= rest_s)[:, None]
+
+    made = motion(26.0, rate, accel)
+    block = made.block()
+    arrived = (block.time_s < 20.0) | (block.time_s >= 21.0)
+    block = replace(block, **{name: getattr(block, name)[arrived] for name in block.__slots__})
+    found = TiltInertialFilter(Rig()).process(block)
+    error, std = made._replace(tilt=made.tilt[arrived]).tilt_error_deg(found[:, 2:4]), found[:, 4:6]
+    after = block.time_s >= 21.5
+    assert (error < 2 * np.hypot(*std.T))[after].mean() > 0.95
+    assert np.all((std[after][0] > least_deg) & (std[after][0] < most_deg))
+
+
 def test_a_saturated_gyro_widens_sigma():
     """Blows of 15 rad/s in 20 ms, of which a range of 4 rad/s shows the beginning, flagged: σ counts the rest."""
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from pty_board import PtyBoard
 
@@ -252,7 +252,13 @@ def test_saturated_samples_are_counted() -> None:
     assert run(block)[2]["imu"]["saturated"] == 5
 
 
+ONE_BY_ONE, SOME_ALONE = list(range(1, N)), [at for at in range(1, N) if at % 10 < 6]  # cuts
+
+
 @given(st.lists(st.integers(1, N - 1), max_size=12), st.sampled_from([FULL_SCALE_X, np.zeros(6), np.full(6, 1.0)]))
+@example(ONE_BY_ONE, np.full(6, 1.0))
+@example(ONE_BY_ONE, np.full(6, np.nan))
+@example(SOME_ALONE, np.zeros(6))
 def test_blocks_of_any_length_give_the_same(cuts: list[int], imu: object) -> None:
     block = between(100, 300, imu, pressure_Pa=99_000.0)
     whole, changes, report = run(block)
@@ -278,6 +284,8 @@ def test_blocks_of_any_length_give_the_same(cuts: list[int], imu: object) -> Non
         st.tuples(st.integers(0, N - 1), st.integers(6, 70), st.sampled_from([(0,), (1, 2), tuple(range(6))]))
     ),
 )
+@example(seed=1, cuts=ONE_BY_ONE, held=[(50, 60, (0,)), (200, 30, tuple(range(6)))])
+@example(seed=2, cuts=SOME_ALONE, held=[(50, 30, tuple(range(6))), (200, 60, (1,))])
 def test_repeats_are_found_wherever_a_block_ends(
     seed: int, cuts: list[int], held: list[tuple[int, int, tuple[int, ...]]]
 ) -> None:

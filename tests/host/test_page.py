@@ -105,6 +105,7 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
     rows = link_rows()
     rows = np.delete(rows, slice(100, 140), axis=0)  # a pulled cable: 2 s without samples
     rows[-40:-30, 1:] = np.nan
+    rows[:5, 2] = 5.0  # of a filter that has just started
     with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
         page.show(rows, status())
         browser.open(page.url)
@@ -114,6 +115,8 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         browser.wait_for(f"{chart_data('height')}[3].length > 150")
         time, *_, height = browser.evaluate(f"{chart_data('height')}.slice(0, 4).map(e => [...e])")
         missing = [at for at, value in zip(time, height, strict=True) if value is None]
+        band = browser.evaluate(f"[...{chart_data('height')}[2]]")
+        assert max(filter(None, band)) < 2.0
         assert len(missing) == 11 and rows[99, 0] < missing[0] < rows[100, 0]
         page.show(np.empty(0), status(imu="not answering"))
         alarm = "[...document.querySelectorAll('[role=alert]')].find(e => e.innerText.includes('IMU NOT ANSWERING'))"

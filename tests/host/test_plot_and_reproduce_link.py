@@ -326,3 +326,20 @@ def test_a_long_name_is_shortened_and_an_empty_estimate_refused(tmp_path):
     empty = read_table(Path(write(tmp_path / "empty.csv", {"time_s": t, "tilt_height_m": np.nan * t})))
     with pytest.raises(LinkposeError, match="its quantities are empty in all rows"):
         plotting.plot_tables([empty])
+
+
+def test_an_evaluation_draws_what_matters_first(tmp_path):
+    """The position of a robot; a chain without the filters of one of its sensors, which are in the table."""
+    t = np.arange(300) / 100
+    place = {"x_m": t, "y_m": np.sin(t), "heading_rad": 0.1 * np.sin(t)}
+    estimate = {"time_s": t} | {f"mice_{name}": value + 0.01 for name, value in place.items()}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", {"time_s": t} | place, "truth"))
+    figure = plotting.evaluation(evaluate(*(read_table(Path(path)) for path in paths)), "e", "t")
+    assert [axes.get_ylabel() for axes in figure.axes[:2]] == ["position error (m)", "heading error (rad)"]
+    still = {f"q{axis}": np.full(300, float(axis == "w")) for axis in "wxyz"} | {"height_m": np.sin(t)}
+    estimate = {"time_s": t, "tilt_height_m": np.sin(t) + 0.01} | {f"chain_{n}": still[n] for n in still if n[0] == "q"}
+    paths = (write(tmp_path / "e.csv", estimate), write(tmp_path / "t.csv", {"time_s": t} | still, "truth"))
+    figure = plotting.evaluation(evaluate(*(read_table(Path(path)) for path in paths)), "e", "t")
+    assert [axes.get_ylabel() for axes in figure.axes] == ["rotation error (°)", ""]
+    cells = [cell.get_text().get_text() for cell in figure.axes[-1].tables[0].get_celld().values()]
+    assert {"tilt", "chain"} <= set(cells)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -55,6 +56,14 @@ def test_results_that_cannot_be_written_are_one_sentence(
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith(f"linkpose: cannot write the output: {reason}")
     assert "report it" not in done.stderr
+
+
+@pytest.mark.parametrize("shell", [">/dev/full", ">&-"], ids=["full", "closed"])
+def test_a_picture_that_cannot_be_written_is_one_sentence(tmp_path: Path, shell: str) -> None:
+    (tmp_path / "e.csv").write_text("time_s,tilt_height_m\n0,1\n1,2\n")
+    done = run(tmp_path, "plot", "e.csv", "-o", "-", shell=shell)
+    assert done.returncode == 1
+    assert re.match("linkpose: cannot write (to )?the standard output", done.stderr.splitlines()[-1])
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")

@@ -46,14 +46,12 @@ class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in new
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
         if isinstance(value, tuple):
             return value
-        import math
-
         words = str(value).split(",")
         try:
             numbers = tuple(float(word) for word in words)
         except ValueError:
             numbers = ()
-        if len(numbers) != len(self.name.split(",")) or not all(math.isfinite(number) for number in numbers):
+        if len(numbers) != len(self.name.split(",")) or not all(abs(number) <= options.LARGEST for number in numbers):
             self.fail(f"{value!r} is not {self.name}, numbers separated by commas", param, ctx)
         return numbers
 
@@ -230,6 +228,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "--plot",
     "picture",
     type=options.FILE,
+    callback=options.refuse_standard_output,
     metavar="PICTURE",
     help="Draw the paths with 2σ ellipses, map, beacons and truth (.png, .pdf, .svg), or play them (.html).",
 )

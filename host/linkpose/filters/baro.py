@@ -15,14 +15,15 @@ first second, the height at the start is as uncertain as the accelerometer is un
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, ImuSamples, read_accel, read_gyro
+from linkpose.filters._imu import GRAVITY, Floats, ImuCalibration, ImuSamples, read_accel, read_gyro, unpacked
+from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -37,22 +38,23 @@ _SUCTION = 0.3  # share of the dynamic pressure ½ρv² that reaches the sensor'
 _AIR_KG_M3 = 1.2  # kg/m³ at 20 °C
 
 
-class StartState(NamedTuple):
-    """Sums over the first second, and the latest height; changed in place."""
+# Sums over the first second, and the latest height; changed in place.
+_START = fields(
+    time=1,  # of the first sample (s), NaN before it
+    force=3,  # sum of the usable forces (m/s²)
+    unsteady=3,  # sum of their squares (m²/s⁴), their number, variance of the tilt (rad²)
+    pressure=2,  # sum of the usable pressures (Pa), their number
+    height=2,  # last height and its standard deviation (m), NaN before the first pressure
+    rejected=1,  # unusable fresh pressures
+)
 
-    time: Floats  # (1,) of the first sample (s), NaN before it
-    force: Floats  # (3,) sum of the usable forces (m/s²)
-    unsteady: Floats  # (3,) sum of their squares (m²/s⁴), their number, variance of the tilt (rad²)
-    pressure: Floats  # (2,) sum of the usable pressures (Pa), their number
-    height: Floats  # (2,) last height and its standard deviation (m), NaN before the first pressure
-    rejected: NDArray[np.int64]  # (1,) unusable fresh pressures
 
-    @staticmethod
-    def fresh() -> StartState:
-        unsteady = np.array([0.0, 0.0, 1.0])  # without a force the tilt is unknown: 1 rad
-        return StartState(
-            np.full(1, np.nan), np.zeros(3), unsteady, np.zeros(2), np.full(2, np.nan), np.zeros(1, np.int64)
-        )
+def fresh_start() -> Any:
+    """An array of one _START before the first sample."""
+    states = zeros(1, _START)
+    states["time"] = states["height"] = math.nan
+    states["unsteady"] = 0.0, 0.0, 1.0  # without a force the tilt is unknown: 1 rad
+    return states
 
 
 class BaroSamples(NamedTuple):
@@ -60,10 +62,6 @@ class BaroSamples(NamedTuple):
 
     pressure_Pa: Floats  # (N,)
     fresh: NDArray[np.bool_]  # (N,) whether the pressure was measured since the sample before
-
-    @staticmethod
-    def of(block: Measurements) -> BaroSamples:
-        return BaroSamples(block.pressure_Pa, block.baro_fresh)
 
 
 class BaroParameters(NamedTuple):
@@ -78,6 +76,10 @@ class BaroParameters(NamedTuple):
         j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
         return BaroParameters(ImuCalibration.of(rig.imu), j2s, rig.baro.pressure_noise_Pa)
 
+    def packed(self) -> Floats:
+        """(16,) its numbers in order: see `ImuCalibration.packed`."""
+        return np.array([*self.imu.packed(), *self.j2s, self.noise_Pa])
+
 
 class BaroFilter:
     """Method D of [Link] over blocks of samples."""
@@ -86,13 +88,13 @@ class BaroFilter:
     columns = ("baro_height_m", "baro_height_std_m")
 
     def __init__(self, rig: Rig) -> None:
-        self.state = StartState.fresh()
-        self._parameters = BaroParameters.of(rig)
+        self._states = fresh_start()
+        self._parameters = BaroParameters.of(rig).packed()
 
     @property
     def rejected(self) -> int:
         """Number of unusable fresh pressures so far."""
-        return int(self.state.rejected[0])
+        return int(self._states[0].rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m) at each of the N samples: (N, 2), NaN before the first pressure.
@@ -100,8 +102,17 @@ class BaroFilter:
         The standard deviation covers the sensor's noise, the air and a start in motion.
         """
         out = np.empty((len(block), 2))
-        _process(ImuSamples.of(block), BaroSamples.of(block), self._parameters, self.state, out)
+        _process(
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, block.pressure_Pa, block.baro_fresh,
+            self._parameters, self._states, out,
+        )  # fmt: skip
         return out
+
+
+@inner
+def unpacked_baro(a: Floats) -> BaroParameters:
+    """The parameters that `packed` gave."""
+    return BaroParameters(unpacked(a), (a[12], a[13], a[14]), a[15])
 
 
 @inner
@@ -112,7 +123,7 @@ def tilt_variance(force: Vec, squares: float, number: float) -> float:
 
 
 @inner
-def average_start(samples: ImuSamples, baro: BaroSamples, i: int, imu: ImuCalibration, state: StartState) -> bool:
+def average_start(samples: ImuSamples, baro: BaroSamples, i: int, imu: ImuCalibration, state: Any) -> bool:
     """Include a sample of the first second in the means; whether its pressure is fresh and usable."""
     time_s, pressure, fresh = samples.time_s[i], baro.pressure_Pa[i], baro.fresh[i]
     if math.isnan(state.time[0]):
@@ -137,7 +148,7 @@ def average_start(samples: ImuSamples, baro: BaroSamples, i: int, imu: ImuCalibr
 
 
 @inner
-def start_height(state: StartState, j2s: Vec) -> float:
+def start_height(state: Any, j2s: Vec) -> float:
     """Height (m) of the sensor above the joint centre at the start, 0 where the tilt is unknown."""
     force = vec.load(state.force)
     length = math.sqrt(vec.dot(force, force))
@@ -145,7 +156,7 @@ def start_height(state: StartState, j2s: Vec) -> float:
 
 
 @inner
-def start_variance(state: StartState, height: float, j2s: Vec) -> float:
+def start_variance(state: Any, height: float, j2s: Vec) -> float:
     """Variance (m²) of the height at the start, `height` (m)."""
     return float(state.unsteady[2] * max(vec.dot(j2s, j2s) - height * height, 0.0))
 
@@ -164,21 +175,21 @@ def air_variance(since_s: float, samples: ImuSamples, i: int, q: BaroParameters)
 
 
 @inner
-def barometric_height(pressure: float, state: StartState) -> float:
+def barometric_height(pressure: float, state: Any) -> float:
     """Height (m) above the start, from its mean pressure."""
     ratio: float = pressure * state.pressure[1] / state.pressure[0]
     return float(HEIGHT_SCALE_M * (1.0 - ratio**HEIGHT_EXPONENT))
 
 
 @inner
-def metres_per_pascal(state: StartState) -> float:
+def metres_per_pascal(state: Any) -> float:
     """|dh/dp| at the start's mean pressure."""
     return float(HEIGHT_SCALE_M * HEIGHT_EXPONENT * state.pressure[1] / state.pressure[0])
 
 
 @inner
 def measure(
-    samples: ImuSamples, baro: BaroSamples, i: int, q: BaroParameters, state: StartState
+    samples: ImuSamples, baro: BaroSamples, i: int, q: BaroParameters, state: Any
 ) -> tuple[float, float, float]:
     """Height (m) from a fresh pressure, and its variances (m²) from the sensor's noise and from all other causes."""
     first, scale = start_height(state, q.j2s), metres_per_pascal(state)
@@ -188,7 +199,19 @@ def measure(
 
 
 @compiled
-def _process(samples: ImuSamples, baro: BaroSamples, q: BaroParameters, state: StartState, out: Floats) -> None:
+def _process(
+    time_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint32],
+    pressure_Pa: Floats,
+    fresh: NDArray[np.bool_],
+    parameters: Floats,
+    states: Any,
+    out: Floats,
+) -> None:
+    samples, baro, state = ImuSamples(time_s, accel, gyro, flags), BaroSamples(pressure_Pa, fresh), states[0]
+    q = unpacked_baro(parameters)
     for i in range(len(samples.time_s)):
         if average_start(samples, baro, i, q.imu, state):
             height, noise, other = measure(samples, baro, i, q, state)

@@ -16,7 +16,7 @@ and the barometer's errors that are not noise (the air, a start in motion; see `
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,24 +24,26 @@ from numpy.typing import NDArray
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuSamples
+from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.baro import (
     START_S,
     BaroParameters,
     BaroSamples,
-    StartState,
     average_start,
+    fresh_start,
     measure,
     metres_per_pascal,
     start_height,
     start_variance,
+    unpacked_baro,
 )
 from linkpose.filters.tilt import (
     TiltParameters,
-    TiltState,
     advance,
     correct_by_accel,
     describe,
+    fresh_tilt,
     load_state,
     store_state,
 )
@@ -60,18 +62,14 @@ class VerticalParameters(NamedTuple):
     gap_accel_m_s2: float = 5.0  # m/s²: unmeasured acceleration in a gap, that of hand motion
 
 
-class VerticalState(NamedTuple):
-    """Height, velocity, bias and their covariance; changed in place."""
-
-    mean: Floats  # (3,) h (m), v (m/s), b (m/s²)
-    covariance: Floats  # (6,) hh hv hb vv vb bb
-    innovation: Floats  # (3,) mean innovation (m), time over which it has been averaged (s), time of the last one (s)
-    other: Floats  # (1,) variance of the last barometric height from other causes than noise (m²)
-    started: NDArray[np.bool_]  # (1,) whether the first second is over
-
-    @staticmethod
-    def fresh() -> VerticalState:
-        return VerticalState(np.zeros(3), np.zeros(6), np.zeros(3), np.zeros(1), np.zeros(1, np.bool_))
+# Height, velocity, bias and their covariance; changed in place.
+_VERTICAL = fields(
+    mean=3,  # h (m), v (m/s), b (m/s²)
+    covariance=6,  # hh hv hb vv vb bb
+    innovation=3,  # mean innovation (m), time over which it has been averaged (s), time of the last one (s)
+    other=1,  # variance of the last barometric height from other causes than noise (m²)
+    started=1,  # 1 once the first second is over
+)
 
 
 class ImuBaroFilter:
@@ -85,15 +83,13 @@ class ImuBaroFilter:
     ) -> None:
         self.tilt_parameters = tilt or TiltParameters()
         self.vertical_parameters = vertical or VerticalParameters()
-        self._tilt = TiltState.fresh()
-        self._start = StartState.fresh()
-        self._vertical = VerticalState.fresh()
-        self._baro_parameters = BaroParameters.of(rig)
+        self._tilt, self._start, self._vertical = fresh_tilt(), fresh_start(), zeros(1, _VERTICAL)
+        self._baro_parameters = BaroParameters.of(rig).packed()
 
     @property
     def rejected(self) -> int:
         """Number of samples so far with an unusable accelerometer, gyro or time, and of unusable fresh pressures."""
-        return int(self._tilt.rejected[0] + self._start.rejected[0])
+        return int(self._tilt[0].rejected[0] + self._start[0].rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
@@ -102,8 +98,8 @@ class ImuBaroFilter:
         """
         out = np.empty((len(block), 4))
         _process(
-            ImuSamples.of(block), BaroSamples.of(block),
-            self._baro_parameters, self.tilt_parameters, self.vertical_parameters,
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags, block.pressure_Pa, block.baro_fresh,
+            self._baro_parameters, self.tilt_parameters.accel_memory, self.vertical_parameters,
             self._tilt, self._start, self._vertical, out,
         )  # fmt: skip
         return out
@@ -168,17 +164,23 @@ def average_innovation(average: Vec, innovation: float, time_s: float) -> Vec:
 
 @compiled
 def _process(
-    samples: ImuSamples,
-    baro: BaroSamples,
-    rig: BaroParameters,
-    tilt_parameters: TiltParameters,
+    times_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint32],
+    pressure_Pa: Floats,
+    fresh: NDArray[np.bool_],
+    parameters: Floats,
+    accel_memory: float,
     q: VerticalParameters,
-    tilt_state: TiltState,
-    start: StartState,
-    vertical: VerticalState,
+    tilt_states: Any,
+    starts: Any,
+    verticals: Any,
     out: Floats,
 ) -> None:
-    now = load_state(tilt_state)
+    samples, baro = ImuSamples(times_s, accel, gyro, flags), BaroSamples(pressure_Pa, fresh)
+    rig = unpacked_baro(parameters)
+    now, start, vertical = load_state(tilt_states[0]), starts[0], verticals[0]
     mean, covariance = vec.load(vertical.mean), vec.load_sym(vertical.covariance)
     innovation = vec.load(vertical.innovation)
     rejected = 0
@@ -187,17 +189,17 @@ def _process(
         now, has_force, force, has_rate = advance(now, samples, i, rig.imu)
         rejected += not (has_force and has_rate)
         if has_force:
-            now = correct_by_accel(now, force, tilt_parameters.accel_memory, rig.imu)
+            now = correct_by_accel(now, force, accel_memory, rig.imu)
         has_pressure = average_start(samples, baro, i, rig.imu, start)
         known = start.pressure[1] > 0.0
-        if known and not vertical.started[0]:
+        if known and vertical.started[0] == 0.0:
             # During the first second the link is assumed at rest: the height follows from the mean tilt.
             variance = (rig.noise_Pa * metres_per_pascal(start)) ** 2
             mean = (start_height(start, rig.j2s), 0.0, 0.0)
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
             vertical.other[0] = start_variance(start, mean[0], rig.j2s)
             innovation = (0.0, 0.0, time_s)
-            vertical.started[0] = time_s - start.time[0] > START_S
+            vertical.started[0] = 1.0 if time_s - start.time[0] > START_S else 0.0
         elif known:
             if now.time > before:
                 step_s = now.time - before
@@ -214,8 +216,8 @@ def _process(
             out[i, 2] = out[i, 3] = np.nan
         else:
             _, out[i, 2], out[i, 3] = describe(now, rig.imu.delay, rig.j2s)
-    store_state(tilt_state, now, rejected)
-    for j in range(3):
-        vertical.mean[j], vertical.innovation[j] = mean[j], innovation[j]
+    store_state(tilt_states[0], now, rejected)
+    vec.store(vertical.mean, mean)
+    vec.store(vertical.innovation, innovation)
     for j in range(6):
         vertical.covariance[j] = covariance[j]

@@ -23,25 +23,27 @@ Source: [Link], equations (9)-(15).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.errors import MissingJ2S
 from linkpose.filters import _vector as vec
-from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration, ImuSamples
+from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S, Floats, ImuCalibration, ImuSamples, unpacked
+from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.tilt import (
     Registers,
     TiltParameters,
-    TiltState,
     acceleration,
     advance,
     average_accel,
     average_residual,
     correct_by_accel,
     describe,
+    fresh_tilt,
     height_std,
     load_state,
     store_state,
@@ -55,15 +57,12 @@ from linkpose.sensors.rig import Rig
 _UNSETTLED_RAD2 = 2e-6
 
 
-class RateHistory(NamedTuple):
-    """The two samples before the present one, for the derivative of the rate; changed in place."""
-
-    time: Floats  # (2,) s: one and two samples ago, NaN where that sample has no usable rate
-    rate: Floats  # (2, 3) rad/s
-
-    @staticmethod
-    def fresh() -> RateHistory:
-        return RateHistory(np.full(2, np.nan), np.zeros((2, 3)))
+# The two samples before the present one, for the derivative of the rate; changed in place.
+_HISTORY = fields(
+    time=2,  # s: one and two samples ago, NaN where that sample has no usable rate
+    last_rate=3,  # rad/s, one sample ago
+    earlier_rate=3,  # rad/s, two samples ago
+)
 
 
 class JointFilter:
@@ -77,15 +76,15 @@ class JointFilter:
         if rig.joint.j2s_m is None:
             raise MissingJ2S(self.name)
         self.parameters = parameters or TiltParameters()
-        self.state = TiltState.fresh()
-        self._history = RateHistory.fresh()
-        self._imu = ImuCalibration.of(rig.imu)
+        self._states, self._histories = fresh_tilt(), zeros(1, _HISTORY)
+        self._histories["time"] = math.nan
+        self._imu = ImuCalibration.of(rig.imu).packed()
         self._j2s, self._j2s_std = rig.joint.j2s_m, rig.joint.std_of_axes_m
 
     @property
     def rejected(self) -> int:
         """Number of samples so far whose accelerometer, gyro or time was not usable."""
-        return int(self.state.rejected[0])
+        return int(self._states[0].rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
@@ -94,7 +93,10 @@ class JointFilter:
         """
         out = np.empty((len(block), 4))
         joint = (self._j2s, self._j2s_std)
-        _process(ImuSamples.of(block), self._imu, self.parameters, joint, self.state, self._history, out)
+        _process(
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
+            self._imu, self.parameters.accel_memory, joint, self._states, self._histories, out,
+        )  # fmt: skip
         return out
 
 
@@ -157,18 +159,22 @@ def correct_by_joint(now: Registers, force: Vec, c: Vec, w1: Vec, w2: Vec, d: Ve
 
 @compiled
 def _process(
-    samples: ImuSamples,
-    imu: ImuCalibration,
-    parameters: TiltParameters,
+    time_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint32],
+    calibration: Floats,
+    accel_memory: float,
     joint: tuple[Vec, Vec],
-    state: TiltState,
-    history: RateHistory,
+    states: Any,
+    histories: Any,
     out: Floats,
 ) -> None:
-    now = load_state(state)
+    samples, imu = ImuSamples(time_s, accel, gyro, flags), unpacked(calibration)
+    now, history = load_state(states[0]), histories[0]
     d, d_std = joint
     t1, t2 = history.time[0], history.time[1]
-    w1, w2 = vec.load(history.rate[0]), vec.load(history.rate[1])
+    w1, w2 = vec.load(history.last_rate), vec.load(history.earlier_rate)
     rejected = 0
     for i in range(len(samples.time_s)):
         now, has_force, force, has_rate = advance(now, samples, i, imu)
@@ -176,7 +182,7 @@ def _process(
         # A comparison with NaN is False: no derivative across a gap or an unusable reading.
         derivable = has_force and has_rate and now.time - t1 <= LONGEST_STEP_S and t1 - t2 <= LONGEST_STEP_S
         if has_force and not (derivable and vec.trace(now.covariance) > _UNSETTLED_RAD2):
-            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+            now = correct_by_accel(now, force, accel_memory, imu)
         if derivable:
             c = weights(now.time - t1, t1 - t2)
             now = correct_by_joint(now, force, c, w1, w2, d, imu)
@@ -190,7 +196,7 @@ def _process(
         else:
             out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, d)
             out[i, 1] = height_std(now, d, d_std)
-    store_state(state, now, rejected)
+    store_state(states[0], now, rejected)
     history.time[0], history.time[1] = t1, t2
-    for j in range(3):
-        history.rate[0, j], history.rate[1, j] = w1[j], w2[j]
+    vec.store(history.last_rate, w1)
+    vec.store(history.earlier_rate, w2)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration, ImuSamples
+from linkpose.filters._imu import ImuCalibration
 from linkpose.filters._records import record_of
 from linkpose.filters.inertial.hypotheses import CALIBRATED, DATA_SHEET, log_odds, mix
 from linkpose.filters.inertial.process import process
@@ -133,7 +133,7 @@ class JointInertialFilter:
         self._states = [
             fresh_state(declared(errors, rig.imu), rig.joint.j2s_m, rig.joint.j2s_std_m) for errors in _HYPOTHESES
         ]
-        self._imu = ImuCalibration.of(rig.imu)
+        self._imu = ImuCalibration.of(rig.imu).packed()
 
     @property
     def states(self) -> tuple[Any, Any]:
@@ -191,10 +191,10 @@ class JointInertialFilter:
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 14) in the order of `columns`; NaN where unknown so far."""
-        samples = ImuSamples.of(block)
+        readings = block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags
         first, second = np.empty(len(block), ESTIMATE), np.empty(len(block), ESTIMATE)
-        process(samples, self._imu, self._record, self._states[0], first)
-        process(samples, self._imu, self._record, self._states[1], second)
+        process(*readings, self._imu, self._record, self._states[0], first)
+        process(*readings, self._imu, self._record, self._states[1], second)
         mixed = np.empty((len(block), 2 * SIGMA))
         mix(first, second, mixed)
         return mixed.take(_COLUMNS, axis=1)

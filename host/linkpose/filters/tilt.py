@@ -30,7 +30,7 @@ acceleration using inertial sensor measurement during various dynamic conditions
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,9 @@ from linkpose.filters._imu import (
     read_gyro,
     rotation_variance,
     unknown_accel,
+    unpacked,
 )
+from linkpose.filters._records import fields, zeros
 from linkpose.filters._vector import Sym, Vec
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -89,21 +91,23 @@ class TiltParameters(NamedTuple):
     accel_memory: float = 0.1  # c_a of (4): share of the acceleration that remains after one sample; value of [Link]
 
 
-class TiltState(NamedTuple):
-    """The state between two blocks; changed in place."""
+# The state between two blocks; changed in place.
+TILT_STATE = fields(
+    time=2,  # s: time of the last sample, NaN before the first; time since the rate was measured
+    rate=3,  # last usable rate (rad/s)
+    tilt=3,  # Z
+    covariance=6,  # of Z, xx xy xz yy yz zz
+    accel=3,  # a⁺ (m/s²)
+    residual=4,  # mean residual (in g), time over which it has been averaged (s)
+    rejected=1,  # samples whose accelerometer, gyro or time was not usable
+)
 
-    time: Floats  # (2,) s: time of the last sample, NaN before the first; time since the rate was measured
-    rate: Floats  # (3,) last usable rate (rad/s)
-    tilt: Floats  # (3,) Z
-    covariance: Floats  # (6,) of Z, xx xy xz yy yz zz
-    accel: Floats  # (3,) a⁺ (m/s²)
-    residual: Floats  # (4,) mean residual (in g), time over which it has been averaged (s)
-    rejected: NDArray[np.int64]  # (1,) samples whose accelerometer, gyro or time was not usable
 
-    @staticmethod
-    def fresh() -> TiltState:
-        time, upward = np.array([np.nan, 0.0]), np.array([0.0, 0.0, 1.0])
-        return TiltState(time, np.zeros(3), upward, np.zeros(6), np.zeros(3), np.zeros(4), np.zeros(1, np.int64))
+def fresh_tilt() -> Any:
+    """An array of one TILT_STATE before the first sample."""
+    states = zeros(1, TILT_STATE)
+    states["time"], states["tilt"] = (math.nan, 0.0), (0.0, 0.0, 1.0)
+    return states
 
 
 class TiltFilter:
@@ -114,15 +118,15 @@ class TiltFilter:
 
     def __init__(self, rig: Rig, parameters: TiltParameters | None = None) -> None:
         self.parameters = parameters or TiltParameters()
-        self.state = TiltState.fresh()
-        self._imu = ImuCalibration.of(rig.imu)
+        self._states = fresh_tilt()
+        self._imu = ImuCalibration.of(rig.imu).packed()
         self._j2s = rig.joint.known_j2s_m or (math.nan, math.nan, math.nan)
         self._j2s_std = rig.joint.std_of_axes_m
 
     @property
     def rejected(self) -> int:
         """Number of samples so far whose accelerometer, gyro or time was not usable."""
-        return int(self.state.rejected[0])
+        return int(self._states[0].rejected[0])
 
     def process(self, block: Measurements) -> Floats:
         """Height and its standard deviation (m), roll and pitch (°) at each of the N samples: (N, 4).
@@ -130,7 +134,10 @@ class TiltFilter:
         The standard deviation covers the modelled noise and the error estimated from the low-frequency residual.
         """
         out = np.empty((len(block), 4))
-        _process(ImuSamples.of(block), self._imu, self.parameters, self._j2s, self._j2s_std, self.state, out)
+        _process(
+            block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags,
+            self._imu, self.parameters.accel_memory, self._j2s, self._j2s_std, self._states, out,
+        )  # fmt: skip
         return out
 
 
@@ -247,8 +254,8 @@ def describe(now: Registers, delay_s: float, j2s: Vec) -> Vec:
 
 
 @inner
-def load_state(state: TiltState) -> Registers:
-    """The state in registers."""
+def load_state(state: Any) -> Registers:
+    """A record of TILT_STATE in registers."""
     return Registers(
         state.time[0],
         vec.load(state.rate),
@@ -261,8 +268,8 @@ def load_state(state: TiltState) -> Registers:
 
 
 @inner
-def store_state(state: TiltState, now: Registers, rejected: int) -> None:
-    """Store the registers in the state and add to the number of rejected samples."""
+def store_state(state: Any, now: Registers, rejected: int) -> None:
+    """Store the registers in a record of TILT_STATE and add to the number of rejected samples."""
     state.time[0], state.time[1] = now.time, now.held
     for j in range(3):
         state.rate[j] = now.rate[j]
@@ -302,25 +309,29 @@ def advance(now: Registers, samples: ImuSamples, i: int, imu: ImuCalibration) ->
 
 @compiled
 def _process(
-    samples: ImuSamples,
-    imu: ImuCalibration,
-    parameters: TiltParameters,
+    time_s: Floats,
+    accel: Floats,
+    gyro: Floats,
+    flags: NDArray[np.uint32],
+    calibration: Floats,
+    accel_memory: float,
     j2s: Vec,
     j2s_std: Vec,
-    state: TiltState,
+    states: Any,
     out: Floats,
 ) -> None:
-    now = load_state(state)
+    samples, imu = ImuSamples(time_s, accel, gyro, flags), unpacked(calibration)
+    now = load_state(states[0])
     rejected = 0
     for i in range(len(samples.time_s)):
         now, has_force, force, has_rate = advance(now, samples, i, imu)
         rejected += not (has_force and has_rate)
         if has_force:
-            now = correct_by_accel(now, force, parameters.accel_memory, imu)
+            now = correct_by_accel(now, force, accel_memory, imu)
             now = average_accel(now)
         if math.isnan(now.time):
             out[i, 0] = out[i, 1] = out[i, 2] = out[i, 3] = np.nan
         else:
             out[i, 0], out[i, 2], out[i, 3] = describe(now, imu.delay, j2s)
             out[i, 1] = height_std(now, j2s, j2s_std)
-    store_state(state, now, rejected)
+    store_state(states[0], now, rejected)

@@ -11,11 +11,13 @@ The height is Zᵀ J2S, for a known J2S (the vector from the joint centre to the
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from linkpose.filters._imu import ImuCalibration, ImuSamples
+from linkpose.compiling import compiled, inner
+from linkpose.filters._imu import ImuCalibration
 from linkpose.filters._records import record_of
 from linkpose.filters.inertial.process import process
 from linkpose.filters.inertial.state import (
@@ -25,9 +27,9 @@ from linkpose.filters.inertial.state import (
     HEIGHT,
     PITCH,
     ROLL,
-    SIGMA,
     YAW,
     Floats,
+    Record,
     SensorErrors,
     fresh_state,
 )
@@ -37,7 +39,7 @@ from linkpose.sensors.rig import Rig
 
 # Without a joint, scale and misalignment are hardly observable: the values of a good part are assumed, with the full
 # range of biases at switch-on.
-_ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
+ERRORS = SensorErrors(0.17, 0.006, 0.003, 0.02, 0.0015, 0.0005, 200.0)
 # Half the χ² of 21 sensor errors: 3.8σ of all of them at once.
 _LARGEST_DISTANCE = 150.0
 # Without a joint, unmodelled errors appear in the bias only: its walk is that of a joint with much play.
@@ -46,11 +48,7 @@ PARAMETERS = InertialParameters(
 )
 
 
-_WIDTH = ESTIMATE.itemsize // 8
-# Of ESTIMATE's values and σ, in the order of the columns below; their largest value, and their unit.
-_COLUMNS = np.array([HEIGHT, SIGMA + HEIGHT, ROLL, PITCH, SIGMA + ROLL, SIGMA + PITCH, YAW, SIGMA + YAW])
-_MOST = np.where(_COLUMNS > SIGMA, np.pi, np.inf)
-_UNITS = np.where(np.isin(_COLUMNS, [HEIGHT, SIGMA + HEIGHT]), 1.0, 180.0 / np.pi)
+_DEGREES = 180.0 / math.pi
 
 
 class TiltInertialFilter:
@@ -68,15 +66,16 @@ class TiltInertialFilter:
         "tilt_inertial_yaw_std_deg",
     )
 
-    def __init__(self, rig: Rig, parameters: InertialParameters | None = None) -> None:
+    def __init__(self, rig: Rig, parameters: InertialParameters | None = None, errors: SensorErrors = ERRORS) -> None:
+        """`errors`: the assumed sensor errors, where the rig declares none."""
         self.parameters = parameters or PARAMETERS
         self._record = record_of(self.parameters)
         j2s_m = rig.joint.known_j2s_m
         self._has_height = j2s_m is not None
         self._states = fresh_state(
-            declared(_ERRORS, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE
+            declared(errors, rig.imu), j2s_m or (0.0, 0.0, 0.0), rig.joint.j2s_std_m, _LARGEST_DISTANCE
         )
-        self._imu = ImuCalibration.of(rig.imu)
+        self._imu = ImuCalibration.of(rig.imu).packed()
 
     @property
     def state(self) -> Any:
@@ -101,10 +100,25 @@ class TiltInertialFilter:
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 8) in the order of `columns`; NaN where not known yet."""
         estimates = np.empty(len(block), ESTIMATE)
-        process(ImuSamples.of(block), self._imu, self._record, self._states, estimates)
-        table: Floats = estimates.view(np.float64).reshape(len(block), _WIDTH).take(_COLUMNS, axis=1)
-        np.minimum(table, _MOST, out=table)
-        table *= _UNITS
-        if not self._has_height:
-            table[:, :2] = np.nan
-        return table
+        readings = block.time_s, block.accel_m_s2, block.gyro_rad_s, block.flags
+        process(*readings, self._imu, self._record, self._states, estimates)
+        out = np.empty((len(block), len(self.columns)))
+        _fill(estimates, self._has_height, out)
+        return out
+
+
+@compiled
+def _fill(estimates: Record, has_height: bool, out: Floats) -> None:
+    """Estimates (N,) as columns; no σ of an angle exceeds half a turn."""
+    for i in range(len(estimates)):
+        value, std = estimates[i].value, estimates[i].std
+        out[i, 0], out[i, 1] = (value[HEIGHT], std[HEIGHT]) if has_height else (math.nan, math.nan)
+        out[i, 2], out[i, 3] = value[ROLL] * _DEGREES, value[PITCH] * _DEGREES
+        out[i, 4], out[i, 5] = _degrees_of(std[ROLL]), _degrees_of(std[PITCH])
+        out[i, 6], out[i, 7] = value[YAW] * _DEGREES, _degrees_of(std[YAW])
+
+
+@inner
+def _degrees_of(std: float) -> float:
+    """σ in degrees, at most that of half a turn; NaN stays NaN."""
+    return _DEGREES * (math.pi if std > math.pi else std)

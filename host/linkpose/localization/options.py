@@ -27,6 +27,8 @@ MAY_BE_ZERO = (
     "range_growth", "error_time_s", "drift_std_m", "correlation", "motion_correlation", "kappa", "beta", "seed",
 )  # fmt: skip
 MAY_BE_NEGATIVE = ("correlation", "motion_correlation")
+_LARGEST = 1e9  # of a noise or a time: squares of much larger ones leave the range of numbers in a filter
+_SMALLEST_STD = 1e-9  # m, rad: the start's variance remains above the rounding of a covariance's entries
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +157,7 @@ def check_constants(words: Sequence[str]) -> None:
 
 def check_start_std(std: Sequence[float]) -> None:
     """Raises InvalidValue unless it is a standard deviation of the place (m) and one of the heading (rad)."""
-    if len(std) != 2 or not all(0.0 < value < math.inf for value in std):
+    if len(std) != 2 or not all(_SMALLEST_STD < value < math.inf for value in std):
         raise InvalidValue(
             "start_std", f"is {std}; both must be above 0, as a start without uncertainty could not be corrected"
         )
@@ -167,5 +169,7 @@ def _check_number(name: str, value: object) -> None:
         return
     if not math.isfinite(value):
         raise InvalidValue(name, f"is {value}; it must be finite")
+    if name != "seed" and abs(value) > _LARGEST:
+        raise InvalidValue(name, f"is {value}; it must not be beyond {_LARGEST:g}")
     if name not in MAY_BE_NEGATIVE and (value < 0.0 or (value == 0.0 and name not in MAY_BE_ZERO)):
         raise InvalidValue(name, f"is {value}; it must {'not be below' if name in MAY_BE_ZERO else 'be above'} 0")

@@ -30,6 +30,7 @@ BEST = "best"  # the choice that follows the best filter
 _BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
 _CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
 _OTHER_HEIGHT = 105
+_CHART_PADDING = (10, 14, 0, 0)  # pixels above, right, below, left: the outermost labels are not cut
 _OK, _FAULT = "#2b8a3e", "#c92a2a"
 
 
@@ -90,6 +91,7 @@ class Panel:
             axes=(uplot.Axis(size=26), uplot.Axis(size=48)),
             legend=uplot.Legend(show=False),
             height=_CHART_HEIGHT.get(quantity, _OTHER_HEIGHT),
+            padding=_CHART_PADDING,
         )
 
     def draw_charts(self, window: Floats, name: str) -> None:
@@ -120,7 +122,8 @@ class Panel:
         std_at = self._columns.get(quantities.std_column(column) or "")
         std = rows[:, std_at] * scale if std_at is not None else np.zeros(len(rows))
         std = np.where(np.isfinite(std), std, 0.0)
-        data = [value - 2 * std, value + 2 * std, value]
+        low, high = _bounds(value, std)
+        data = [np.clip(value - 2 * std, low, high), np.clip(value + 2 * std, low, high), value]
         if quantity.column in self._columns:
             data.append(rows[:, self._columns[quantity.column]] * scale)
         return (rows[:, 0].copy(), *map(_nullable, data))
@@ -185,6 +188,16 @@ def with_gap_rows(rows: Floats) -> Floats:
     between = np.full((len(at), rows.shape[1]), np.nan)
     between[:, 0] = 0.5 * (rows[at, 0] + rows[at + 1, 0])
     return np.insert(rows, at + 1, between, axis=0)
+
+
+def _bounds(value: Floats, std: Floats) -> tuple[float, float]:
+    """Limits of what a chart shows: ±2σ of a filter that has just started would flatten all motion."""
+    known = np.isfinite(value)
+    if not known.any():
+        return -np.inf, np.inf
+    low, high = float(value[known].min()), float(value[known].max())
+    margin = max(0.3 * (high - low), 3 * float(np.median(std[known])))
+    return low - margin, high + margin
 
 
 def _nullable(values: Floats) -> Nullable:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import sys
+import io
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linkpose.errors import CannotWrite, FileExists, UnknownPicture
-from linkpose.recording.csvfile import STDOUT
+from linkpose.recording.csvfile import STDOUT, create, write_all
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,8 +105,6 @@ def picture_files(place: Path, whole: str, names: Sequence[str], force: bool) ->
     A folder `place` holds them all. A picture file `place` is that of `whole`, and the others lie beside it, after its
     name. Makes the folder. Raises FileError where one of the pictures cannot be written.
     """
-    if place == STDOUT:
-        raise CannotWrite(place, "standard output holds one picture only, not several")
     if place.suffix and not place.is_dir():
         files = {whole: place} | {name: place.with_name(f"{place.stem}-{name}{place.suffix}") for name in names}
     else:
@@ -126,7 +125,9 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     """
     check_output(path, force)
     if path == STDOUT:
-        figure.savefig(sys.stdout.buffer, dpi=DPI, format="png")
+        figure.savefig(picture := io.BytesIO(), dpi=DPI, format="png")
+        with os.fdopen(create(STDOUT, force), "wb") as stream:
+            write_all(stream.fileno(), STDOUT, picture.getvalue())
         return
     # Two pictures of the same data are the same file.
     metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}

@@ -13,7 +13,7 @@ from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, others_hide_best
 from linkpose.plotting.sources import shortened
 from linkpose.presentation import same_digits, with_unit
-from linkpose.quantities import unit_text, words
+from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ _BINS = np.linspace(-4, 4, 41)
 def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
     """One row for each quantity: errors of the filters over time, and how error/σ is distributed; the table below.
 
-    Filters whose height comes from the air pressure are in the table only, unless there are no others. Where the errors
-    of others hide the best filter's ±2σ in the first row, a row above it shows the best filter alone.
+    Some filters are in the table only (`_shown`). Where the errors of others hide the best filter's in the first row, a
+    row above it shows the best filter alone.
     """
     shown = _shown(found.scores)
     rows = [(name, shown) for name in _quantities(shown)]
@@ -73,16 +73,24 @@ def _hides_best(scores: Sequence[Score], name: str) -> bool:
 
 
 def _shown(scores: Sequence[Score]) -> list[Score]:
+    """The filters that are drawn: no barometric ones, and beside a chain no filters of one of its sensors."""
+    if chains := [score for score in scores if ROTATION.name in score.errors]:
+        return chains
     quiet = [s for s in scores if not ((of := filters.capabilities(s.filter)) and of.is_barometric)]
     return quiet or list(scores)
 
 
 def _quantities(scores: Sequence[Score]) -> list[str]:
-    """Names in the order of the first filter that has them, the height first; a vector in place of its components."""
+    """Names in the order of the first filter that has them, a vector in place of its components.
+
+    The height of a link is first, and the position of a robot.
+    """
     names = list(dict.fromkeys(name for score in scores for name in score.errors))
     for vector, parts in _VECTOR_PARTS.items():
         if vector in names:
             names = [name for name in names if name not in parts]
+    if "position" in names and HEIGHT.name not in names:
+        names.insert(0, names.pop(names.index("position")))
     return names
 
 

@@ -68,8 +68,11 @@ def text(block: Block, layout: ColumnLayout) -> str:
     imu2 = [part.accel2_m_s2, part.gyro2_rad_s, part.imu2_temp_degC] * layout.imu2
     mag = [part.mag_uT, part.mag_fresh] * layout.mag
     parts = [*head, part.pressure_Pa, part.baro_temp_degC, part.baro_fresh, *imu2, *mag, mice, part.flags]
-    table = np.concatenate([each if each.ndim == 2 else each[:, None] for each in parts], axis=1)
-    return ((_line(layout) * len(table)) % tuple(table.ravel().tolist())).replace("nan", "")
+    if len(part) == 1:  # live: joining a dozen arrays of length 1 would take longer than formatting the row
+        values = [value for each in parts for value in each.ravel().tolist()]
+    else:
+        values = np.concatenate([each if each.ndim == 2 else each[:, None] for each in parts], axis=1).ravel().tolist()
+    return ((_line(layout) * len(part)) % tuple(values)).replace("nan", "")
 
 
 @lru_cache(maxsize=16)

@@ -184,7 +184,6 @@ def _is_changed(fd: int) -> bool:
 
 def write_all(fd: int, path: Path, data: bytes) -> None:
     """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
-    name = "the standard output" if path == STDOUT else path
     left = memoryview(data)
     written = 0
     try:
@@ -195,6 +194,7 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
     except OSError as error:
         if written:
             _cut_back(fd, data[:written])
+        name = "the standard output" if path == STDOUT else path
         if error.errno == errno.EPIPE:
             raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
         raise FileError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from linkpose.sensors import bmp180, bmp280
@@ -47,21 +48,25 @@ class Barometer(NamedTuple):
             wrong = ~np.isfinite(pressure)
             return np.where(wrong, np.nan, temperature), np.where(wrong, np.nan, pressure)
         words = bmp180.Bmp180Calibration.of(self.words)
-        if len(ut) == 1 and (one := _compensate_one(int(ut[0]), int(up[0]), words, self.oversampling)) is not None:
-            return np.array([one[0] / 10]), np.array([float(one[1])])
         wrong = bmp180.is_impossible(ut, words)
         tenths, pascals = bmp180.compensate(np.where(wrong, words.ac6, ut), up, words, self.oversampling)
         return np.where(wrong, np.nan, tenths / 10), np.where(wrong, np.nan, pascals.astype(np.float64))
 
+    def compensate_one(self, ut: int, up: int) -> tuple[float, float]:
+        """As `compensate`, for one reading, as a live stream has it.
 
-def _compensate_one(ut: int, up: int, words: bmp180.Bmp180Calibration, oversampling: int) -> tuple[int, int] | None:
-    """Temperature (0.1 degC) and pressure (Pa) of one reading, as a live stream has it; None if it is not sound.
+        Python's integers take a tenth of the time that NumPy needs for arrays of length 1. Below 2³¹ Pa no intermediate
+        result exceeds 64 bits, so that arrays give the same numbers.
+        """
+        if self.family == DeviceFamily.BMP180:
+            try:
+                words = bmp180.Bmp180Calibration.of(self.words)
+                tenths, pascals = bmp180.compensate(ut, up, words, self.oversampling)
+            except ZeroDivisionError:
+                return math.nan, math.nan
+            if abs(pascals) < 1 << 31:
+                return tenths / 10, float(pascals)
+        import numpy as np
 
-    Python's integers take a tenth of the time that NumPy needs for arrays of length 1. Below 2³¹ Pa no intermediate
-    result exceeds 64 bits, so that arrays give the same numbers.
-    """
-    try:
-        tenths, pascals = bmp180.compensate(ut, up, words, oversampling)
-    except ZeroDivisionError:
-        return None
-    return (int(tenths), int(pascals)) if abs(pascals) < 1 << 31 else None
+        temperature, pressure = self.compensate(np.array([ut]), np.array([up]))
+        return float(temperature[0]), float(pressure[0])

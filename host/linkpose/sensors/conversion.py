@@ -6,9 +6,10 @@ in a replay of the recording, to the last bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ from linkpose.wire.messages import DeviceFamily, DeviceState, Hello, Sample, Sam
 Integers = NDArray[np.int64]
 
 TIME_DECIMALS = 6
+_TIME_STEPS = 10.0**TIME_DECIMALS
+_NO_READING = (math.nan, math.nan)
 
 IMU_VALID = int(SampleFlags.IMU_VALID)
 BARO_VALID = int(SampleFlags.BARO_VALID)
@@ -31,20 +34,15 @@ MAG_VALID = int(SampleFlags.MAG_VALID)
 GAP_BEFORE = int(SampleFlags.GAP_BEFORE)
 
 COUNT_FIELDS = tuple(name for name in Sample._fields if name != "mice")  # columns of RawSamples.counts
-_IMU = slice(
-    COUNT_FIELDS.index("accel_x"), COUNT_FIELDS.index("gyro_z") + 1
-)  # accel x, y, z, temperature, gyro x, y, z
-_IMU2 = slice(COUNT_FIELDS.index("accel2_x"), COUNT_FIELDS.index("gyro2_z") + 1)
-_MAG = slice(COUNT_FIELDS.index("mag_x"), COUNT_FIELDS.index("mag_z") + 1)
-_MAG_COUNT = COUNT_FIELDS.index("mag_count")
+_FIRST = COUNT_FIELDS.index("accel_x")  # field of the first column of a conversion table, see `_Table`
 _BARO = slice(COUNT_FIELDS.index("baro_ut"), COUNT_FIELDS.index("baro_count") + 1)  # UT, UP, count
+_MAG_COUNT = COUNT_FIELDS.index("mag_count")
+_IMU2_COLUMN = COUNT_FIELDS.index("accel2_x") - _FIRST
+_MAG_COLUMN = COUNT_FIELDS.index("mag_x") - _FIRST
 
-# Rounding steps in one unit of each IMU column. `rint(value * steps) / steps` gives the same bits for any block length.
-_IMU_STEPS = 10.0 ** np.array(
-    [mpu6050.ACCEL_DECIMALS] * 3 + [mpu6050.TEMPERATURE_DECIMALS] + [mpu6050.GYRO_DECIMALS] * 3, dtype=np.float64
-)
-_BARO_STEPS = 10.0 ** np.array([PRESSURE_DECIMALS, TEMPERATURE_DECIMALS], dtype=np.float64)
-_MAG_STEPS = 10.0**magnetometer.MAG_DECIMALS
+_IMU_DECIMALS = (*[mpu6050.ACCEL_DECIMALS] * 3, mpu6050.TEMPERATURE_DECIMALS, *[mpu6050.GYRO_DECIMALS] * 3)
+_PRESSURE_STEPS, _TEMPERATURE_STEPS = 10.0**PRESSURE_DECIMALS, 10.0**TEMPERATURE_DECIMALS
+_BARO_STEPS: Floats = np.array([_PRESSURE_STEPS, _TEMPERATURE_STEPS])
 _MOUSE_BITS = np.array(MOUSE_VALID, dtype=np.int64)
 _PORTS = np.arange(MAX_MICE)
 
@@ -128,6 +126,52 @@ class RawSamples(NamedTuple):
         )
 
 
+class _Table(NamedTuple):
+    """Scales of the fields of SAMPLE from the first acceleration on, up to those of the last sensor of the board.
+
+    One operation converts all of them. Fields of other sensors in between are converted too, and not used.
+    """
+
+    fields: slice  # in COUNT_FIELDS; column k of the table is the k-th of them
+    scale: Floats  # (K,) units per count
+    offset: Floats  # (K,) value at 0 counts
+    steps: Floats  # (K,) rounding steps in one unit: `rint(value * steps) / steps`
+    valid: Integers  # (K,) the bit of `flags` that is set where the reading is valid
+
+    @staticmethod
+    def of(settings: BoardSettings) -> _Table:
+        """The table for these settings."""
+        accel, gyro = mpu6050.accel_scale(settings.accel_range_g), mpu6050.gyro_scale(settings.gyro_range_deg_s)
+        # scale, offset, decimals, valid
+        columns: list[tuple[float, float, int, int]] = [(1.0, 0.0, 0, 0)] * (len(COUNT_FIELDS) - _FIRST)
+        end = 0
+        for at, family, valid in zip((0, _IMU2_COLUMN), settings.imu_families, (IMU_VALID, IMU2_VALID), strict=True):
+            temperature, at_zero = mpu6050.temperature_scale(family)
+            scales, offsets = [accel] * 3 + [temperature] + [gyro] * 3, [0.0] * 3 + [at_zero] + [0.0] * 3
+            if at == 0 or settings.has_imu2:
+                end = at + len(_IMU_DECIMALS)
+                columns[at:end] = zip(scales, offsets, _IMU_DECIMALS, [valid] * len(scales), strict=True)
+        if settings.has_mag:
+            end = _MAG_COLUMN + 3
+            scale = magnetometer.scale(settings.mag_family)
+            columns[_MAG_COLUMN:end] = [(scale, 0.0, magnetometer.MAG_DECIMALS, MAG_VALID)] * 3
+        table = np.array(columns[:end])
+        steps = 10.0 ** table[:, 2]
+        return _Table(slice(_FIRST, _FIRST + end), table[:, 0], table[:, 1], steps, table[:, 3].astype(np.int64))
+
+    def convert(self, counts: Integers, flags: Integers) -> Floats:
+        """Values (N, K), NaN where the reading is invalid."""
+        values: Floats = np.rint((counts[:, self.fields] * self.scale + self.offset) * self.steps) / self.steps
+        np.copyto(values, np.nan, where=flags[:, None] & self.valid == 0)
+        return values
+
+    @property
+    def rows(self) -> list[tuple[float, float, float, int]]:
+        """Scale, offset, steps and valid bit of each column, as Python's numbers."""
+        columns = (self.scale, self.offset, self.steps, self.valid)
+        return list(zip(*(column.tolist() for column in columns), strict=True))
+
+
 class Converter:
     """Converts consecutive blocks of raw samples of one board; the last pressure carries over from block to block."""
 
@@ -135,37 +179,31 @@ class Converter:
         """`mouse_ports`: ports in the result, if these are not those that the board found."""
         self.settings = settings
         self.mouse_ports = settings.mouse_ports if mouse_ports is None else mouse_ports
-        accel, gyro = mpu6050.accel_scale(settings.accel_range_g), mpu6050.gyro_scale(settings.gyro_range_deg_s)
-        self._imu_scales = []
-        for family in settings.imu_families:
-            temperature, at_zero = mpu6050.temperature_scale(family)
-            scale, offset = [accel] * 3 + [temperature] + [gyro] * 3, [0.0] * 3 + [at_zero] + [0.0] * 3
-            self._imu_scales.append((np.array(scale), np.array(offset)))
-        self._mag_scale = magnetometer.scale(settings.mag_family)
+        self._table = _Table.of(settings)
+        self._rows, self._has_imu2, self._has_mag = self._table.rows, settings.has_imu2, settings.has_mag
         self._mag_count: int | None = None  # of the last sample; None where it had no valid reading
         self._has_baro = settings.barometer.is_sound
         self._baro_count: int | None = None  # of the last sample; None where that had no valid reading
-        self._baro = np.full((1, 2), np.nan)  # last pressure (Pa) and temperature (degC)
+        self._baro = _NO_READING  # last pressure (Pa) and temperature (degC)
 
     def convert(self, raw: RawSamples, time_s: Floats, flags: Integers) -> Measurements:
         """The samples at `time_s` (N,), s since the start, in SI units; `flags` (N,) as a recording stores them."""
-        imu = self._convert_imu(0, raw.counts[:, _IMU], flags & IMU_VALID == 0)
+        values = self._table.convert(raw.counts, flags)
+        accel, temperature, gyro = _inertial(values, 0)
         others: dict[str, Any] = {}
-        if self.settings.has_imu2:
-            imu2 = self._convert_imu(1, raw.counts[:, _IMU2], flags & IMU2_VALID == 0)
-            others |= {
-                "accel2_m_s2": np.ascontiguousarray(imu2[:, :3]),
-                "gyro2_rad_s": np.ascontiguousarray(imu2[:, 4:]),
-            }
-            others["imu2_temp_degC"] = np.ascontiguousarray(imu2[:, 3])
-        if self.settings.has_mag:
-            others |= self._convert_mag(raw.counts, flags)
+        if self._has_imu2:
+            accel2, temperature2, gyro2 = _inertial(values, _IMU2_COLUMN)
+            others |= {"accel2_m_s2": accel2, "gyro2_rad_s": gyro2, "imu2_temp_degC": temperature2}
+        if self._has_mag:
+            valid = flags & MAG_VALID != 0
+            fresh, self._mag_count = _new_readings(valid, raw.counts[:, _MAG_COUNT], self._mag_count)
+            others |= {"mag_uT": np.ascontiguousarray(values[:, _MAG_COLUMN : _MAG_COLUMN + 3]), "mag_fresh": fresh}
         baro, fresh = self._convert_baro(raw.counts[:, _BARO], flags)
         return Measurements(
             time_s.round(TIME_DECIMALS),
-            np.ascontiguousarray(imu[:, :3]),
-            np.ascontiguousarray(imu[:, 4:]),
-            np.ascontiguousarray(imu[:, 3]),
+            accel,
+            gyro,
+            temperature,
             np.ascontiguousarray(baro[:, 0]),
             np.ascontiguousarray(baro[:, 1]),
             fresh,
@@ -176,24 +214,64 @@ class Converter:
 
     def convert_placed(self, samples: Sequence[Sample], places: Sequence[Placed]) -> Block:
         """Decoded samples with the places that a timeline assigned to them, in SI units. There may be none."""
+        if len(samples) == 1:
+            return self._convert_one(samples[0], places[0])
         time_s, seq, flags = zip(*places, strict=True) if places else ((), (), ())
         raw = RawSamples.of(samples, self.mouse_ports)
         measurements = self.convert(raw, np.array(time_s, dtype=np.float64), np.array(flags, dtype=np.int64))
         return Block(np.array(seq, dtype=np.int64), measurements)
 
-    def _convert_imu(self, number: int, counts: Integers, invalid: NDArray[np.bool_]) -> Floats:
-        """Accelerations, temperature and rates (N, 7) of inertial sensor 0 or 1."""
-        scale, offset = self._imu_scales[number]
-        imu: Floats = np.rint((counts * scale + offset) * _IMU_STEPS) / _IMU_STEPS
-        np.copyto(imu, np.nan, where=invalid[:, None])
-        return imu
+    def _convert_one(self, sample: Sample, place: Placed) -> Block:
+        """One sample, as a live stream brings it, to the same bits as in a longer block.
 
-    def _convert_mag(self, counts: Integers, flags: Integers) -> dict[str, Any]:
-        """Field (N, 3), µT, each reading repeated until the next, and where a new reading arrived (N,)."""
-        valid = flags & MAG_VALID != 0
-        fresh, self._mag_count = _new_readings(valid, counts[:, _MAG_COUNT], self._mag_count)
-        field = np.rint(counts[:, _MAG] * self._mag_scale * _MAG_STEPS) / _MAG_STEPS
-        return {"mag_uT": np.where(valid[:, None], field, np.nan), "mag_fresh": fresh}
+        Python's numbers take a quarter of the time that NumPy needs for arrays of length 1.
+        """
+        flags, counts = place.flags, cast("tuple[int, ...]", sample[self._table.fields])
+        baro_fresh = self._receive_baro(flags, sample)
+        values = [
+            round((count * scale + offset) * steps, 0) / steps if flags & valid else math.nan
+            for count, (scale, offset, steps, valid) in zip(counts, self._rows, strict=True)
+        ]
+        row = np.array([(*values, _rounded(place.time_s, _TIME_STEPS), *self._baro)])
+        others: dict[str, Any] = {}
+        if self._has_imu2:
+            accel2, temperature2, gyro2 = _inertial(row, _IMU2_COLUMN)
+            others |= {"accel2_m_s2": accel2, "gyro2_rad_s": gyro2, "imu2_temp_degC": temperature2}
+        if self._has_mag:
+            before, self._mag_count = self._mag_count, sample.mag_count if flags & MAG_VALID else None
+            fresh = self._mag_count is not None and self._mag_count != before
+            others |= {"mag_uT": row[:, _MAG_COLUMN : _MAG_COLUMN + 3], "mag_fresh": np.array([fresh])}
+        accel, temperature, gyro = _inertial(row, 0)
+        measurements = Measurements(
+            row[:, -3], accel, gyro, temperature, row[:, -2], row[:, -1], np.array([baro_fresh]),
+            self._mice_of(sample, flags), np.array([flags], dtype=np.uint32), **others,
+        )  # fmt: skip
+        return Block(np.array([place.seq]), measurements)
+
+    def _receive_baro(self, flags: int, sample: Sample) -> bool:
+        """Whether a sample has a new possible reading of the barometer; updates the last one."""
+        if not self._has_baro:
+            return False
+        if not flags & BARO_VALID:
+            self._baro_count, self._baro = None, _NO_READING
+            return False
+        if sample.baro_count == self._baro_count:
+            return False
+        self._baro_count = sample.baro_count
+        temperature, pressure = self.settings.barometer.compensate_one(sample.baro_ut, sample.baro_up)
+        self._baro = _rounded(pressure, _PRESSURE_STEPS), _rounded(temperature, _TEMPERATURE_STEPS)
+        return not math.isnan(pressure)
+
+    def _mice_of(self, sample: Sample, flags: int) -> Floats:
+        """As `_convert_mice`, of one sample."""
+        mice, ports = sample.mice, self.mouse_ports
+        if not ports:
+            return np.empty((1, 0, 2))
+        pairs = [
+            mice[2 * port : 2 * port + 2] if flags & MOUSE_VALID[port] and 2 * port < len(mice) else _NO_READING
+            for port in range(ports)
+        ]
+        return np.array([pairs], dtype=np.float64)
 
     def _convert_baro(self, counts: Integers, flags: Integers) -> tuple[Floats, NDArray[np.bool_]]:
         """Pressure and temperature (N, 2), each reading repeated until the next, and where a new reading arrived (N,).
@@ -205,10 +283,10 @@ class Converter:
             return np.full((size, 2), np.nan), np.zeros(size, np.bool_)
         valid = flags & BARO_VALID != 0
         fresh, self._baro_count = _new_readings(valid, counts[:, 2], self._baro_count)
-        readings = np.concatenate((self._baro, self._compensate(counts[fresh, :2])))
+        readings = np.concatenate(([self._baro], self._compensate(counts[fresh, :2])))
         baro = readings.take(fresh.cumsum(), axis=0)
         np.copyto(baro, np.nan, where=~valid[:, None])
-        self._baro = baro[-1:].copy()
+        self._baro = tuple(baro[-1].tolist())
         return baro, fresh & np.isfinite(baro[:, 0])
 
     def _compensate(self, counts: Integers) -> Floats:
@@ -225,6 +303,17 @@ class Converter:
             return np.empty((len(flags), 0, 2))
         valid = (flags[:, None] & _MOUSE_BITS[:ports] != 0) & (_PORTS[:ports] < raw.mouse_count[:, None])
         return np.where(valid[:, :, None], raw.mice[:, :ports], np.nan)
+
+
+def _rounded(value: float, steps: float) -> float:
+    """The same bits as `np.rint(value * steps) / steps`."""
+    return round(value * steps, 0) / steps
+
+
+def _inertial(values: Floats, first: int) -> tuple[Floats, Floats, Floats]:
+    """Acceleration (N, 3), temperature (N,) and rate (N, 3) of the inertial sensor at column `first` of the table."""
+    accel, temperature, gyro = values[:, first : first + 3], values[:, first + 3], values[:, first + 4 : first + 7]
+    return np.ascontiguousarray(accel), np.ascontiguousarray(temperature), np.ascontiguousarray(gyro)
 
 
 def _new_readings(

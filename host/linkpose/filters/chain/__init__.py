@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.filters._imu import ImuSamples
+from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters._records import record_of
 from linkpose.filters.chain.process import process
 from linkpose.filters.chain.state import (
@@ -41,6 +41,10 @@ _ANGLES = (
     "chain_axial_rotation_deg", "chain_axial_rotation_std_deg",
 )  # fmt: skip
 _HEIGHTS = ("chain_height1_m", "chain_height1_std_m", "chain_height2_m", "chain_height2_std_m")
+
+# Mean specific force over gravity, and its inverse, beyond which the unit or the sensor is wrong: a runner's shank has
+# 1.5. Samples from which on the mean counts, and the share of samples from which on a fault is reported.
+_LEAST_SHARE, _FEWEST, _MANY = 0.4, 100, 0.02
 
 
 class ChainFilter:
@@ -79,6 +83,36 @@ class ChainFilter:
     def restarts(self) -> int:
         """How often a gap made the attitudes start anew."""
         return int(self._bank[0].restarts)
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is wrong with the readings, one sentence with its cure for each fault."""
+        bank, found = self._bank[0], []
+        samples = max(int(bank.samples), 1)
+        for k in range(2):
+            mean = float(bank.force_sum[k]) / samples
+            if samples >= _FEWEST and not _LEAST_SHARE < mean / GRAVITY < 1 / _LEAST_SHARE:
+                found.append(
+                    f"chain: the mean acceleration of sensor {k + 1} is {mean:.3g} m/s², and gravity alone is 9.81 "
+                    "m/s². Check that the sensor works and that its unit is m/s²."
+                )
+        if self.rejected > _MANY * samples:
+            found.append(
+                f"chain: {self.rejected} of {samples} samples could not be used. A sensor was absent, repeated one "
+                "reading, or was saturated. Check its wiring and its range."
+            )
+        if self.restarts > _MANY * samples:
+            found.append(
+                f"chain: the attitudes started again {self.restarts} times after gaps of more than "
+                f"{self.parameters.longest_gap_s:g} s. Check that the times are in seconds."
+            )
+        if bank.misfits:
+            found.append(
+                f"chain: for {100 * int(bank.misfits) / samples:.0f} % of the samples the readings do not fit two "
+                "links with one joint, so their estimates are blank. Check that the units are m/s² and rad/s, that "
+                "both sensors are firm on links that share a joint, and that neither sensor has failed."
+            )
+        return found
 
     @property
     def hypotheses(self) -> int:

@@ -19,6 +19,7 @@ from linkpose.filters.chain.angles import report_angles, set_frame
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
 from linkpose.filters.chain.level import begin_level, follow_level, misalignment_variance
+from linkpose.filters.chain.misfit import follow_misfit, forget, has_to_forget, is_misfit
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
@@ -386,12 +387,15 @@ def process(
         is_usable = flags & _NEEDED == _NEEDED and flags & _CLIPPED == 0
         is_usable = _read(bank, 0, time_s, first.accel[n], first.gyro[n], calibration) and is_usable
         is_usable = _read(bank, 1, time_s, second.accel[n], second.gyro[n], calibration) and is_usable
+        bank.samples += 1
         if not is_usable:
             bank.rejected += 1
             _blank(out)
             continue
         gyro, accel = bank.new_gyro, bank.new_accel
         h = time_s - bank.time
+        if has_to_forget(bank):
+            forget(bank, states, q)
         if not bank.begun or h > q.longest_gap_s:
             bank.restarts += bank.begun
             _begin(bank, states, gyro, accel, q)
@@ -400,21 +404,28 @@ def process(
         elif h > 0.0:
             _step(bank, states, gyro, accel, h, q, noise)
             _remember(bank, time_s, gyro, accel, False)
-        _report(bank, states, out, q)
-        _report_covariance(states[bank.best], out, q)
+        if is_misfit(bank):
+            bank.misfits += 1
+            _blank(out)
+        else:
+            _report(bank, states, out, q)
+            _report_covariance(states[bank.best], out, q)
 
 
 @inner
 def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, calibration: Floats) -> bool:
     """Calibrates the readings of sensor k into the bank. False where they are frozen, missing or impossible."""
     frozen = is_frozen(bank.last_readings[k], time_s, vec.load(accel), vec.load(gyro))
-    is_possible, turns = True, False
+    is_possible, turns, norm = True, False, 0.0
     for i in range(3):
         force = (accel[i] - calibration[k, 0, i]) / calibration[k, 1, i]
         rate = gyro[i] - calibration[k, 2, i]
         bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
+        norm += force * force
         is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
+    if is_possible:
+        bank.force_sum[k] += math.sqrt(norm)
     frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
     return is_possible and not frozen
 
@@ -441,6 +452,7 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
     if due:
         bank.since_update = 0.0
         _select(bank, states, q)
+        follow_misfit(bank, states[bank.best], q.period_s, q)
         if not bank.spread and states[0].heading_share > 0.0:
             _spread(bank, states, 1.0, gyro, q)
 

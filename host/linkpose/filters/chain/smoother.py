@@ -50,6 +50,11 @@ class ChainSmoother:
         """Number of samples in the first pass at which a sensor had no usable reading."""
         return self._ahead.rejected
 
+    @property
+    def remarks(self) -> list[str]:
+        """What is wrong with the readings, as the first pass found it."""
+        return self._ahead.remarks
+
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, len(columns)). The block is a whole recording."""
         self._ahead = ChainFilter(self._rig)

@@ -243,6 +243,12 @@ BANK = np.dtype(
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
         ("best", "i8"),
         ("rejected", "i8"),
+        ("misfit_s", "f8"),  # for how long the readings have not fitted two links with one joint
+        ("misfits", "i8"),  # samples without an estimate because of that
+        ("probation_s", "f8"),  # for which readings have to fit until they give estimates again
+        ("forgotten", "i8"),  # how often the mounting was forgotten
+        ("samples", "i8"),
+        ("force_sum", "f8", 2),  # of the norms of their specific forces (m/s²)
         ("restarts", "i8"),
         # Angles of a ball joint: axes of flexion, abduction and length of link 1 as columns, in sensor 1's axes;
         # whether the rig states the first and the last; the neutral rotation that it states.

@@ -10,6 +10,7 @@ import math
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
@@ -17,14 +18,15 @@ from linkpose.filters._imu import (
     GRAVITY,
     LONGEST_BLIND_S,
     LONGEST_HOLD_S,
+    Floats,
     ImuCalibration,
-    ImuSamples,
     blind_for,
     is_bounded,
     read_accel,
     read_gyro,
     rotation_variance,
     unknown_accel,
+    unpacked,
 )
 from linkpose.filters._vector import Vec
 from linkpose.filters.frozen import is_frozen
@@ -79,6 +81,11 @@ _STEADY_SIGMAS = 5.0  # a force within this of the last may be the same
 # Start in motion: angular acceleration (rad/s²) at rest, and per rad/s of rate (1/s).
 _START_RAD_S2, _SWING_PER_S = 3.0, 5.0
 _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joint (s): a swing of 5 rad/s
+# How much stronger the motion after a gap may be than the one before: factors of the mean square acceleration and of
+# the variance of the velocity. Chosen on BROAD 01 with gaps: with 4 and 1, 89 % of the errors in the 3 s after a gap
+# are within 2σ, with 4 and 2, 98 %. Without the motion before, the errors on BROAD are 20 to 30 % larger.
+_GAP_ACCEL_GROWTH, _GAP_SPEED_GROWTH = 4.0, 2.0
+_LEAST_GAP_ACCEL_M2_S4 = 1.0  # at least: a slow hand, as σ of the tilt 6°
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
 _LOST, _LOST_M2_S2 = 0.5, 0.01
 _ANY_HEADING_RAD2 = math.pi**2  # variance of a heading that is not known
@@ -89,13 +96,17 @@ _LARGEST_ACCEL_BIAS_M_S2, _LARGEST_J2S_M = 5.0, 10.0
 
 @compiled
 def process(
-    samples: ImuSamples, imu: ImuCalibration, parameters: Record, states: Record, out: Record
+    times_s: Floats, accels: Floats, gyros: Floats, all_flags: NDArray[np.uint32],
+    calibration: Floats, parameters: Record, states: Record, out: Record,
 ) -> None:  # fmt: skip
-    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate."""
-    s, q = states[0], parameters[0]
-    for i in range(len(samples.time_s)):
-        time_s, flags = samples.time_s[i], samples.flags[i]
-        accel, gyro = vec.row(samples.accel, i), vec.row(samples.gyro, i)
+    """Advance the state over N samples: `out` (N,) of ESTIMATE, NaN where there is no estimate.
+
+    The first four arguments are the fields of `ImuSamples`; `calibration` (12,) is a packed `ImuCalibration`.
+    """
+    s, q, imu = states[0], parameters[0], unpacked(calibration)
+    for i in range(len(times_s)):
+        time_s, flags = times_s[i], all_flags[i]
+        accel, gyro = vec.row(accels, i), vec.row(gyros, i)
         dead = is_frozen(s.last_readings, time_s, accel, gyro)
         has_force, force = read_accel(accel, flags, imu)
         has_rate, rate = read_gyro(gyro, flags, imu)
@@ -144,7 +155,7 @@ def _begin(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         for j in range(SIZE):
             s.covariance[i, j] = s.start_covariance[i, j]
     _judge_parameters(s)
-    s.rate_noise = s.force_noise = 0.0
+    s.rate_noise = s.force_noise = s.accel_square = 0.0
     s.covariance[PSI, PSI] = heading_variance
     if s.unmoved:
         vec.store(s.tilt, vec.unit(force) if vec.dot(force, force) > 0.0 else (0.0, 0.0, 1.0))
@@ -180,7 +191,11 @@ def _align(s: Record, force: Vec, rate: Vec, imu: ImuCalibration, q: Record) -> 
         align_to_gravity(s, force, accel, vec.cross(rotation, d), speed * reach + 1e-4)
         return
     accel = unknown_accel(force, rate)
-    s.speed_square = max(q.first_speed_m_s**2, s.speed_square, _START_SWING_S**2 * accel)
+    if s.accel_square > 0.0 and not s.unmoved:  # a gap: the motion goes on
+        accel = min(accel, max(_GAP_ACCEL_GROWTH * s.accel_square, _LEAST_GAP_ACCEL_M2_S4))
+        s.speed_square = min(_GAP_SPEED_GROWTH * s.speed_square, q.most_speed_m_s**2)
+    else:
+        s.speed_square = max(q.first_speed_m_s**2, s.speed_square, _START_SWING_S**2 * accel)
     align_to_gravity(s, force, imu.accel_variance + accel, (0.0, 0.0, 0.0), s.speed_square)
     vec.store(s.swing, (0.0, 0.0, 0.0))
     vec.store(s.mean_force, force)

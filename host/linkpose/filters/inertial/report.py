@@ -1,8 +1,9 @@
 """What is reported of a state at the time of a sample: position, angles and their σ.
 
-The covariance changes some 25 times in a second. From one change to the next, σ of the position and the covariance of
-the attitude are held, the latter in n, where the rotation of the sensor does not change it. σ of the angles follow the
-attitude at each sample, since they grow without bound towards the vertical.
+The covariance changes some 25 times in a second. From one change to the next it is held: that of the attitude in n and
+that of J2S in the sensor's axes, which the rotation of the sensor does not change. σ of position and angles follow from
+it and the attitude at each sample. (A sensor one metre from the centre that turns by 40° meanwhile would otherwise have
+σ of another direction.)
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import LONGEST_HOLD_S, ImuCalibration
-from linkpose.filters._vector import Vec
+from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.inertial.propagate import corrected
 from linkpose.filters.inertial.state import BA, HEIGHT, MG, PITCH, PSI, ROLL, YAW, D, Record, X, Y, Z
 from linkpose.filters.inertial.update import sub_covariance
@@ -31,7 +32,8 @@ def report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     _report_values(tilt, north, west, vec.load(s.j2s), row)
     if s.span == 0.0:  # the covariance belongs to this sample
         _follow_covariance(s)
-    _report_stds(s, tilt, north, west, row)
+    _report_position_stds(s, tilt, north, west, row)
+    _report_angle_stds(s, tilt, north, west, row)
     row.distance, row.resolved = s.distance, s.resolved
     bias = sub_covariance(s.covariance, BA)
     across = vec.trace(bias) - vec.quadratic(bias, tilt)
@@ -73,34 +75,66 @@ def _report_values(tilt: Vec, north: Vec, west: Vec, d: Vec, row: Record) -> Non
 
 @inner
 def _follow_covariance(s: Record) -> None:
-    """σ of height, x and y, and the covariance of the attitude error in n.
-
-    The attitude error is the rotation θ = ψ Z − Z × δZ, which turns X by X × θ and Y by Y × θ. Its components in n are
-    Yᵀδz, −XᵀδZ and ψ. The gradient of Xᵀd is d × X, that of Yᵀd is d × Y, and δ(Zᵀd) = dᵀδZ + Zᵀδd.
-    """
-    tilt, north, d = vec.load(s.tilt), vec.load(s.north), vec.load(s.j2s)
-    west, p = vec.cross(tilt, north), s.covariance
-    s.position_std[HEIGHT] = _std(s, d, 0.0, tilt)
-    slope = vec.cross(d, north)
-    s.position_std[X] = _std(s, vec.cross(tilt, slope), vec.dot(slope, tilt), north)
-    slope = vec.cross(d, west)
-    s.position_std[Y] = _std(s, vec.cross(tilt, slope), vec.dot(slope, tilt), west)
-    block, heading, t = sub_covariance(p, Z), vec.load(p[PSI]), s.turn_covariance
-    to_north, to_west = vec.apply(block, north), vec.apply(block, west)
-    t[0], t[1], t[2] = vec.dot(west, to_west), -vec.dot(west, to_north), vec.dot(west, heading)
-    t[3], t[4], t[5] = vec.dot(north, to_north), -vec.dot(north, heading), p[PSI, PSI]
+    """Covariance of the attitude error (XᵀδZ, YᵀδZ, ZᵀδZ, ψ) in n, and with the error of J2S in the sensor's axes."""
+    tilt, north, p = vec.load(s.tilt), vec.load(s.north), s.covariance
+    west = vec.cross(tilt, north)
+    _follow_axis(s, 0, north, north, west, tilt)
+    _follow_axis(s, 1, west, north, west, tilt)
+    _follow_axis(s, 2, tilt, north, west, tilt)
+    s.turn_covariance[3, 3] = p[PSI, PSI]
+    for k in range(3):
+        s.lever_covariance[3, k] = p[PSI, D + k]
 
 
 @inner
-def _report_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
-    """σ of each reported value.
+def _follow_axis(s: Record, i: int, axis: Vec, north: Vec, west: Vec, tilt: Vec) -> None:
+    """Row i of both: of `axis` · δZ."""
+    p, t = s.covariance, s.turn_covariance
+    part = vec.apply(sub_covariance(p, Z), axis)
+    t[i, 0], t[i, 1], t[i, 2] = vec.dot(part, north), vec.dot(part, west), vec.dot(part, tilt)
+    t[i, 3] = t[3, i] = vec.dot(axis, vec.load(p[PSI]))
+    for k in range(3):
+        s.lever_covariance[i, k] = axis[0] * p[Z, D + k] + axis[1] * p[Z + 1, D + k] + axis[2] * p[Z + 2, D + k]
 
-    With h = (X_x, Y_x), the horizontal part of the sensor's x axis in n, and θ in n, the angles change by
-    h·θ / ‖h‖² (roll), (h × θ)_z / ‖h‖ (pitch) and θ_z − Z_x h·θ / ‖h‖² (yaw).
+
+@inner
+def _report_position_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
+    """σ of height, x and y.
+
+    With δZ in n and ψ, and d = (x, y, h) in n, they change by d·δZ + Zᵀδd, −h XᵀδZ − y ψ + Xᵀδd and
+    −h YᵀδZ + x ψ + Yᵀδd.
     """
-    for i in range(ROLL):
-        row.std[i] = s.position_std[i]
-    xx, xy, xz, yy, yz, zz = vec.load_sym(s.turn_covariance)
+    t, height, x, y = s.turn_covariance, row.value[HEIGHT], row.value[X], row.value[Y]
+    lever = sub_covariance(s.covariance, D)
+    to_x, to_y = vec.load(s.lever_covariance[0]), vec.load(s.lever_covariance[1])
+    to_z, to_heading = vec.load(s.lever_covariance[2]), vec.load(s.lever_covariance[3])
+    attitude = vec.quadratic((t[0, 0], t[0, 1], t[0, 2], t[1, 1], t[1, 2], t[2, 2]), (x, y, height))
+    both = vec.axpy(x, to_x, vec.axpy(y, to_y, vec.scale(height, to_z)))
+    row.std[HEIGHT] = _std(attitude, both, lever, tilt)
+    attitude = height * height * t[0, 0] + 2.0 * height * y * t[0, 3] + y * y * t[3, 3]
+    both = vec.axpy(-height, to_x, vec.scale(-y, to_heading))
+    row.std[X] = _std(attitude, both, lever, north)
+    attitude = height * height * t[1, 1] - 2.0 * height * x * t[1, 3] + x * x * t[3, 3]
+    both = vec.axpy(-height, to_y, vec.scale(x, to_heading))
+    row.std[Y] = _std(attitude, both, lever, west)
+
+
+@inner
+def _std(attitude: float, both: Vec, lever: Sym, axis: Vec) -> float:
+    """σ from the variance by the attitude, its covariance with δd, and the covariance of δd along `axis`."""
+    return math.sqrt(max(attitude + 2.0 * vec.dot(both, axis) + vec.quadratic(lever, axis), 0.0))
+
+
+@inner
+def _report_angle_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
+    """σ of roll, pitch and yaw.
+
+    The attitude error is the rotation θ = ψ Z − Z × δZ; in n, it is (YᵀδZ, −XᵀδZ, ψ). With h = (X_x, Y_x), the
+    horizontal part of the sensor's x axis in n, the angles change by h·θ / ‖h‖² (roll), (h × θ)_z / ‖h‖ (pitch) and
+    θ_z − Z_x h·θ / ‖h‖² (yaw).
+    """
+    t = s.turn_covariance
+    xx, xy, xz, yy, yz, zz = t[1, 1], -t[0, 1], t[1, 3], t[0, 0], -t[0, 3], t[3, 3]
     x, y = north[0], west[0]
     level = max(x * x + y * y, _LEAST_LEVEL)
     along = x * x * xx + 2.0 * x * y * xy + y * y * yy
@@ -109,21 +143,3 @@ def _report_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> No
     row.std[ROLL] = math.sqrt(max(along, 0.0)) / level
     row.std[PITCH] = math.sqrt(max(across / level, 0.0))
     row.std[YAW] = math.sqrt(max(zz - 2.0 * lean * (x * xz + y * yz) + lean * lean * along, 0.0))
-
-
-@inner
-def _std(s: Record, across: Vec, along: float, towards: Vec) -> float:
-    """σ of a value with the gradients `across` (of Z), `along` (of ψ) and `towards` (of J2S)."""
-    g, p, variance = s.gradient, s.covariance, 0.0
-    for i in range(3):
-        g[i], g[3 + i] = across[i], towards[i]
-    g[6] = along
-    for i in range(7):
-        if g[i] == 0.0:  # an angle does not depend on J2S
-            continue
-        row = i if i < 3 else i + D - 3  # J2S and ψ are neighbours
-        part = 0.5 * g[i] * p[row, row]
-        for j in range(i):
-            part += g[j] * p[row, j if j < 3 else j + D - 3]
-        variance += 2.0 * g[i] * part
-    return math.sqrt(max(variance, 0.0))

@@ -103,13 +103,12 @@ _FIELDS = np.dtype(
         ("mean_rate", *_VECTOR),  # rad/s
         ("unsteadiness", "f8"),  # mean square change of rate and tilt (rad²/s²)
         # Reported until the covariance changes.
-        ("position_std", *_VECTOR),  # σ of height, x and y (m)
-        ("turn_covariance", "f8", (6,)),  # of the attitude error θ in n, xx xy xz yy yz zz (rad²)
+        ("turn_covariance", "f8", (4, 4)),  # of XᵀδZ, YᵀδZ, ZᵀδZ and ψ (rad²)
+        ("lever_covariance", "f8", (4, 3)),  # of these with the error of J2S (rad m)
         # Scratch.
         ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
         ("jacobian", "f8", (3, SIZE)),
         ("direction", "f8", (SIZE,)),  # the one that cannot be observed
-        ("gradient", "f8", (7,)),  # of a reported value with respect to Z, d and ψ
         ("work", "f8", (7, SIZE)),
         # Counters.
         ("rejected", "i8"),

@@ -1,0 +1,86 @@
+"""Readings that two links with one joint cannot give.
+
+Wrong units, a gyro that repeats one value, a saturated sensor without flags, and a sensor that was mounted anew leave
+the joint's constraint with innovations that last, or with accelerometer biases that no sensor has. The estimates and
+their σ then mean nothing. They are blank until the readings fit again. After some seconds the filter forgets the
+mounting and the biases, so that it recovers from a sensor that was mounted anew. Readings that keep failing to fit
+have to fit for twice as long each time.
+"""
+
+from __future__ import annotations
+
+from linkpose.compiling import inner
+from linkpose.filters.chain.rotation import square
+from linkpose.filters.chain.state import BA, BG, OF_SENSOR, Floats, R, Record
+
+# Accelerometer bias: ten times the data sheet's 0.5 m/s². The largest of the recordings [D] and [O] is 2.2 m/s², in a
+# direction that slow motion does not show; with accelerations in g it is 15 m/s², with rates in °/s 13 m/s².
+_MOST_BIAS_M_S2 = 5.0
+# Mean square of the joint's lasting innovations, in multiples of its value for a right σ: 6 at most in [D] and [O]; a
+# gyro that repeats one value makes it 23, a sensor mounted anew 11 to 20.
+_MOST_LASTING = 10.0
+# Factor of the acceleration's noise that the innovations demand: 3 at most in [D] and [O], up to 100 for a sensor that
+# was mounted anew.
+_MOST_WIDENING = 15.0
+_FORGET_S = 5.0  # of misfit before mounting and biases are forgotten; knocks are shorter
+# Share of the misfit's time that as much time with a fit takes off. At 1, a sensor mounted anew that fits now and then
+# has estimates with a wrong heading.
+_RECOVERY = 0.5
+_PROBATION_S = 10.0  # without estimates after that: a second misfit shows within it
+_MOST_DOUBLINGS = 10
+
+
+@inner
+def follow_misfit(bank: Record, best: Record, h: float, q: Record) -> None:
+    """Measure for how long the readings have not fitted two links with one joint, `h` (s) after the last time."""
+    fits = best.moving_square[0] < _MOST_LASTING * q.level_square and best.widening < _MOST_WIDENING
+    for k in range(2):
+        fits = fits and square(best.accel_bias[k]) < _MOST_BIAS_M_S2**2
+    bank.misfit_s = max(bank.misfit_s - _RECOVERY * h, 0.0) if fits else bank.misfit_s + h
+    if fits:
+        bank.probation_s = max(bank.probation_s - h, 0.0)
+
+
+@inner
+def is_misfit(bank: Record) -> bool:
+    """Whether the estimates mean nothing now."""
+    return bool(bank.misfit_s > 0.0 or bank.probation_s > 0.0)
+
+
+@inner
+def has_to_forget(bank: Record) -> bool:
+    """Whether the readings have not fitted for so long that the mounting may be another one."""
+    return bool(bank.misfit_s > _FORGET_S)
+
+
+@inner
+def forget(bank: Record, states: Record, q: Record) -> None:
+    """All hypotheses as before the first sample, with an unknown mounting; r_0 and its variance stay."""
+    size, base = bank.length, bank.fixed
+    for i in range(states.shape[0]):
+        s = states[i]
+        p = s.covariance
+        for a in range(size):
+            for b in range(size):
+                if base < 0 or a < base or b < base:
+                    p[a, b] = 0.0
+            s.correction[a] = 0.0
+        for k in range(2):
+            o = OF_SENSOR * k
+            for j in range(3):
+                s.gyro_bias[k, j] = s.accel_bias[k, j] = s.lever[k, j] = 0.0
+                p[o + BG + j, o + BG + j] = q.gyro_bias_rad_s**2
+                p[o + BA + j, o + BA + j] = q.accel_bias_m_s2**2
+                p[o + R + j, o + R + j] = q.lever_m**2
+        _clear(s.relative_spread)
+        s.has_axis, s.level, s.span = 0.0, 1.0, 0.0
+    bank.begun, bank.misfit_s = 0, 0.0
+    bank.probation_s = _PROBATION_S * 2.0 ** min(bank.forgotten, _MOST_DOUBLINGS)
+    bank.forgotten += 1
+
+
+@inner
+def _clear(m: Floats) -> None:
+    for i in range(3):
+        for j in range(3):
+            m[i, j] = 0.0
