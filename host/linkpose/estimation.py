@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -61,20 +62,31 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
+_LONGEST_STEP_S = 0.1  # of the time for which a sample stands where others were lost
+
+
 class ExcludedMice:
-    """The mice whose valid counts a filter excluded: samples of each, and the mice excluded at the last sample."""
+    """The mice whose valid counts a filter excluded.
+
+    For each: samples, time of the first one and total time (s), and whether it is excluded at the last sample.
+    """
 
     def __init__(self, estimator_columns: Sequence[str]) -> None:
         self._columns = [
             at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
         ]
         self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
+        self.first_s: dict[str, float] = {}
+        self.total_s: dict[str, float] = {}
         self.now: set[str] = set()
+        self._last_s = math.nan
 
     def count(self, block: Measurements, estimates: Floats) -> None:
         """Count the exclusions in the estimates (N, columns) of a block of N samples."""
         if not self._columns or not len(block):
             return
+        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=self._last_s)), 0.0, _LONGEST_STEP_S)
+        self._last_s = float(block.time_s[-1])
         masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
         self.now = set()
         if not masks.any():
@@ -84,6 +96,8 @@ class ExcludedMice:
         for port in np.flatnonzero(excluded.any(axis=0)).tolist():
             name = f"mouse{port + 1}"
             self.samples[name] = self.samples.get(name, 0) + int(excluded[:, port].sum())
+            self.total_s[name] = self.total_s.get(name, 0.0) + float(step_s[excluded[:, port]].sum())
+            self.first_s.setdefault(name, float(block.time_s[np.argmax(excluded[:, port])]))
             if excluded[-1, port]:
                 self.now.add(name)
 
@@ -241,6 +255,22 @@ class Estimator:
         return None
 
     @property
+    def gyro_jumps(self) -> filters.GyroJumps | None:
+        """Jumps of the gyro's bias that the mice have shown; None where no filter compares them, or without a jump."""
+        for f in self.filters:
+            if isinstance(f, filters.FindsGyroJumps) and f.gyro_jumps.times:
+                return f.gyro_jumps
+        return None
+
+    @property
+    def moved_mice(self) -> tuple[filters.MovedMouse, ...]:
+        """Mice that the first filter that estimates their places shows elsewhere than the rig file states."""
+        for f in self.filters:
+            if isinstance(f, filters.FindsMovedMice):
+                return f.moved_mice
+        return ()
+
+    @property
     def outcome(self) -> dict[str, Any]:
         """Entries of a file's closing line: rejected samples, and what the filters found of J2S, mice and field."""
         outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in self.filters}}
@@ -248,6 +278,10 @@ class Estimator:
             outcome["j2s_m"], outcome["j2s_std_m"] = ([round(v, 6) for v in vector.tolist()] for vector in found[:2])
         if self.excluded.samples:
             outcome["excluded_mice"] = self.excluded.samples
+            outcome["excluded_mice_since_s"] = {name: round(at, 3) for name, at in self.excluded.first_s.items()}
+        if jumps := self.gyro_jumps:
+            last = {"last_rad_s": round(jumps.last_rad_s, 5), "found_s": round(jumps.last_time_s, 3)}
+            outcome["gyro_jumps"] = {"count": jumps.times} | last
         if self.mice_scale:
             outcome["mice_scale"], outcome["mice_scale_std"] = (round(value, 5) for value in self.mice_scale)
         if self.magnetic_field:

@@ -2,7 +2,7 @@
 
     python tests/bench/wire.py [--json]
 
-`stream` feeds SAMPLEs in pieces of 64 bytes, as a serial port gives them; `capture` decodes ten minutes at once. The
+`stream` feeds SAMPLEs in pieces of 64 bytes, as a serial port gives them; `capture` decodes some minutes at once. The
 peer parses RAW_IMU messages (MAVLink 2), the nearest it has in size and kind, in the same pieces. The rows `-3-mice` do
 so with three mice in each SAMPLE, beside the peer's HIGHRES_IMU.
 """
@@ -19,8 +19,9 @@ from linkpose.wire.capture import decode_capture
 from linkpose.wire.frames import StreamDecoder, encode
 
 PIECE = 64
-FRAMES = 20_000
-CAPTURE_FRAMES = 60_000
+FRAMES = 1500  # a few milliseconds: the shortest of many short runs depends little on what else the machine does
+CAPTURE_FRAMES = 20_000
+TIMES = 50
 
 
 def our_stream(count: int, mice: int) -> bytes:
@@ -52,12 +53,12 @@ def in_pieces(feed: Callable[[bytes], object], stream: bytes) -> Callable[[], No
 
 def rows(mice: int, suffix: str) -> Iterator[Row]:
     theirs, ours = peer_stream(FRAMES, mice), our_stream(FRAMES, mice)
-    peer_us = best_of(lambda: in_pieces(common.MAVLink(None).parse_buffer, theirs)(), 3) / FRAMES
-    stream_us = best_of(lambda: in_pieces(StreamDecoder().feed, ours)(), 5) / FRAMES
+    peer_us = best_of(lambda: in_pieces(common.MAVLink(None).parse_buffer, theirs)(), TIMES) / FRAMES
+    stream_us = best_of(lambda: in_pieces(StreamDecoder().feed, ours)(), TIMES) / FRAMES
     yield Row(f"stream{suffix}", stream_us, "pymavlink", peer_us)
     capture = our_stream(CAPTURE_FRAMES, mice)
     decode_capture(capture)
-    capture_us = best_of(lambda: decode_capture(capture), 5) / CAPTURE_FRAMES
+    capture_us = best_of(lambda: decode_capture(capture), TIMES) / CAPTURE_FRAMES
     yield Row(f"capture{suffix}", capture_us, "pymavlink", peer_us)
 
 

@@ -377,7 +377,7 @@ PROMISES = {
 
 
 def test_each_promise_of_the_page_has_its_tests() -> None:
-    text = PAGE.read_text(encoding="utf-8").split("## Messages and cures")[0]
+    text = PAGE.read_text(encoding="utf-8").split("\n## ")[1]
     assert re.findall(r"^\| ([^|]+?) \|", text, re.MULTILINE)[1:] == list(PROMISES)
     for name in (name for tests in PROMISES.values() for name in tests):
         file, function = name.split("::")

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import linkpose
 from linkpose.errors import FileFormatError
+from linkpose.recording.consistency import contradiction
 from linkpose.recording.reader import load_recording
 from linkpose.recording.units import suspicions
 from linkpose.sensors.measurements import Measurements
@@ -65,29 +68,47 @@ def fast_swing() -> dict[str, np.ndarray]:
     return dict(zip(NAMES, columns, strict=False))
 
 
+def fast_remarks(change: Callable[[dict[str, np.ndarray]], object]) -> str:
+    table = fast_swing()
+    change(table)
+    time_s, *values = table.values()
+    accel, gyro = np.split(np.stack(values, axis=1), 2, axis=1)
+    return "\n".join(suspicions(Path("r.csv"), Measurements.from_imu(time_s, accel, gyro)))
+
+
 def exchange(one: str, other: str) -> Callable[[dict[str, np.ndarray]], None]:
     return lambda table: table.update({one: table[other], other: table[one]})
 
 
+def slowly_in_degrees(table: dict[str, np.ndarray]) -> None:
+    """The same swing in ten times the time: its rates in °/s are within the range of rad/s."""
+    scale(10.0, "time")(table)
+    scale(18 / np.pi, "gyro")(table)
+
+
+FAST = [
+    (lambda table: None, None),
+    (scale(180 / np.pi, "gyro"), "is it in °/s?"),
+    (slowly_in_degrees, "gyro_* states 57 times the rotation of gravity: is it in °/s?"),
+    (scale(np.pi / 180, "gyro"), "gyro_* states 0.01745 times the rotation of gravity"),
+    (scale(2.0, "gyro"), "gyro_* states 2 times the rotation of gravity"),
+    (scale(0.5, "gyro"), "gyro_* states 0.5 times the rotation of gravity"),
+    (scale(-1.0, "gyro"), "gyro_* states the reverse"),
+    (scale(0.0, "gyro_y"), "gyro_y is 0 in all rows: the gyro gives no reading there"),
+    (scale(10.0, "time"), "if time_s is wrong, multiply that by 0.1"),
+    (scale(0.001, "time"), "if time_s is wrong, multiply that by 1000"),
+    (exchange("accel_x_m_s2", "accel_y_m_s2"), "do not have the same axes (accel x, y, z fit as y, x, z)"),
+    (exchange("gyro_y_rad_s", "gyro_z_rad_s"), "do not have the same axes (gyro x, y, z fit as x, z, y)"),
+    (scale(-1.0, "gyro_z"), "do not have the same axes (gyro x, y, z fit as x, y, -z)"),
+    (scale(-1.0, "accel_z"), "do not have the same axes (accel x, y, z fit as x, y, -z)"),
+]
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
-    [
-        (lambda table: None, None),
-        (scale(180 / np.pi, "gyro"), "is it in °/s?"),
-        (scale(np.pi / 180, "gyro"), "gyro_* states 0.01745 times the rotation of gravity"),
-        (scale(2.0, "gyro"), "gyro_* states 2 times the rotation of gravity"),
-        (scale(0.5, "gyro"), "gyro_* states 0.5 times the rotation of gravity"),
-        (scale(-1.0, "gyro"), "gyro_* states the reverse"),
-        (scale(0.0, "gyro_y"), "gyro_y is 0 in all rows: the gyro gives no reading there"),
-        (scale(10.0, "time"), "if time_s is wrong, multiply that by 0.1"),
-        (scale(0.001, "time"), "if time_s is wrong, multiply that by 1000"),
-        (exchange("accel_x_m_s2", "accel_y_m_s2"), "do not have the same axes (accel x, y, z fit as y, x, z)"),
-        (exchange("gyro_y_rad_s", "gyro_z_rad_s"), "do not have the same axes (gyro x, y, z fit as x, z, y)"),
-        (scale(-1.0, "gyro_z"), "do not have the same axes (gyro x, y, z fit as x, y, -z)"),
-        (scale(-1.0, "accel_z"), "do not have the same axes (accel x, y, z fit as x, y, -z)"),
-    ],
+    FAST,
     ids=[
-        "right", "°/s", "rad/s twice", "twice", "half", "backwards", "one axis", "time x 10",
+        "right", "°/s", "°/s slowly", "rad/s twice", "twice", "half", "backwards", "one axis", "time x 10",
         "milliseconds", "accel exchanged", "gyro exchanged", "one axis of the gyro", "one axis backwards",
     ],
 )  # fmt: skip
@@ -110,24 +131,27 @@ def test_a_plausible_recording_has_no_remark(tmp_path: Path) -> None:
     assert remarks(tmp_path, lambda table: None) == ""
 
 
+WRONG = [
+    (scale(2.0, "accel"), "accel_* is 19.6 m/s² while the sensor is still"),
+    (scale(0.5, "accel"), "accel_* is 4.9"),
+    (scale(1000.0, "accel"), "is it in mm/s²? multiply it by 0.001"),
+    (scale(0.0, "accel"), "the IMU reads all zeros"),
+    (scale(180 / np.pi, "gyro"), "is it in °/s?"),
+    (scale(2.0, "gyro"), "multiply it by 0.5"),
+    (scale(0.5, "gyro"), "check the range (gyro_range_deg_s) and the unit, and multiply it by 2"),
+    (scale(0.01, "gyro"), "multiply it by 100"),
+    (scale(-1.0, "gyro"), "gyro_* states the reverse of the rotation of gravity"),
+    (scale(0.0, "gyro"), "gyro_* is 0 in all rows"),
+    (scale(10.0, "time"), "multiply time_s by 0.1"),
+    (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
+    (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
+    (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
+]
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
-    [
-        (scale(2.0, "accel"), "accel_* is 19.6 m/s² while the sensor is still"),
-        (scale(0.5, "accel"), "accel_* is 4.9"),
-        (scale(1000.0, "accel"), "is it in mm/s²? multiply it by 0.001"),
-        (scale(0.0, "accel"), "the IMU reads all zeros"),
-        (scale(180 / np.pi, "gyro"), "is it in °/s?"),
-        (scale(2.0, "gyro"), "multiply it by 0.5"),
-        (scale(0.5, "gyro"), "check the range (gyro_range_deg_s) and the unit, and multiply it by 2"),
-        (scale(0.01, "gyro"), "multiply it by 100"),
-        (scale(-1.0, "gyro"), "gyro_* states the reverse of the rotation of gravity"),
-        (scale(0.0, "gyro"), "gyro_* is 0 in all rows"),
-        (scale(10.0, "time"), "multiply time_s by 0.1"),
-        (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
-        (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
-        (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
-    ],
+    WRONG,
     ids=[
         "twice",
         "half",
@@ -173,3 +197,21 @@ def test_one_impossible_pressure_is_left_out(tmp_path: Path, pressure: float) ->
     recording = load_recording(tmp_path / "r.csv")
     assert np.isnan(recording.measurements.pressure_Pa[100])
     assert recording.health["baro"]["invalid"] == {"out of range": 1}
+
+
+@pytest.mark.parametrize("rows", [1, 2, 49, 150, 1200])
+@pytest.mark.parametrize("factor", [1.0, 1e12])
+def test_few_rows_and_huge_values_are_no_contradiction(rows: int, factor: float) -> None:
+    table = {name: factor * values[:rows] for name, values in fast_swing().items()}
+    accel, gyro = np.split(np.stack(list(table.values())[1:], axis=1), 2, axis=1)
+    assert contradiction(Measurements.from_imu(fast_swing()["time_s"][:rows], accel, gyro)) == ""
+
+
+def test_each_remark_of_the_documentation_is_produced(tmp_path: Path) -> None:
+    page = (Path(linkpose.__file__).parents[1] / "docs" / "messages.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^\| `([^`]+)` \|", page.split("\n## Remarks on recordings")[1].split("\n## ")[0], re.MULTILINE)
+    found = "\n".join(remarks(tmp_path, change) for change, _ in [*WRONG, (scale(1000.0, "time"), "")])
+    found += "\n".join(fast_remarks(change) for change, _ in FAST)
+    assert len(shown) > 10
+    for remark in shown:
+        assert re.search(".*".join(map(re.escape, remark.split("…"))), found), remark

@@ -229,5 +229,5 @@ def test_pictures_lie_beside_a_named_file_and_are_kept(tmp_path: Path, refused) 
     assert files == {"variants": tmp_path / "u.svg", "figure-3.7": tmp_path / "u-figure-3.7.svg"}
     (tmp_path / "u-figure-3.7.svg").touch()
     assert "u-figure-3.7.svg exists already" in refused("reproduce", "underwater", "--plot", tmp_path / "u.svg")
-    assert "one picture only" in refused("reproduce", "indoor", "--plot", "-")
+    assert "name a file for the picture" in refused("reproduce", "indoor", "--plot", "-")
     assert "its name must end in" in refused("reproduce", "indoor", "--plot", tmp_path / "u.gif")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from linkpose.cli.cures import sentence
@@ -61,8 +62,45 @@ def _report_j2s(estimator: Estimator, console: Console) -> None:
         )
 
 
+_LONG_S = 5.0  # longer than robots slip or are carried
+_SHORTEST_S = 0.2  # of exclusions that are reported: a late packet excludes a mouse for a sample
+
+
+def _report_excluded(estimator: Estimator, console: Console) -> None:
+    """Which mice were left out, since when, and for how long."""
+    excluded = estimator.excluded
+    long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
+    for name in long:
+        still = "; it is still left out" if name in excluded.now else ""
+        console.report(
+            f"mouse {name.removeprefix('mouse')} was left out for {excluded.total_s[name]:.1f} s, first at "
+            f"{excluded.first_s[name]:.1f} s{still}: it contradicted the other sensors. Check that it is on the floor, "
+            "and its place and angle in the rig file"
+        )
+    mice = len(estimator.rig.mouse)
+    if mice and len(long) == mice and min(excluded.total_s.values()) > _LONG_S:
+        console.report(
+            "all mice were left out for long: together they contradict the gyro. If they were on the floor, their "
+            "counts_per_m or angle_deg in the rig file are wrong: type `linkpose calibrate mice`"
+        )
+
+
 def _report_mice(estimator: Estimator, console: Console) -> None:
-    """The common scale of the mice where it differs from the rig file."""
+    """Excluded mice, jumps of the gyro, and the common scale of the mice where it differs from the rig file."""
+    _report_excluded(estimator, console)
+    jumps = estimator.gyro_jumps
+    if jumps:
+        times = "" if jumps.times == 1 else f" {jumps.times} times, last"
+        console.report(
+            f"the gyro's bias has jumped{times} by {math.degrees(jumps.last_rad_s):+.1f} °/s, found at "
+            f"{jumps.last_time_s:.1f} s: the mice contradicted the gyro, and the heading was corrected by the mice. "
+            "Check the mounting and the supply of the sensor"
+        )
+    for mouse in estimator.moved_mice:
+        console.report(
+            f"mouse {mouse.mouse} is {1e3 * mouse.off_m:.0f} mm from its place in the rig file: the turns show it at "
+            f"x_m = {mouse.x_m:.3f}, y_m = {mouse.y_m:.3f}"
+        )
     if estimator.mice_scale:
         factor, std = estimator.mice_scale
         change = "more" if factor > 1 else "fewer"

@@ -228,6 +228,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     "--plot",
     "picture",
     type=options.FILE,
+    callback=options.refuse_standard_output,
     metavar="PICTURE",
     help="Draw the paths with 2σ ellipses, map, beacons and truth (.png, .pdf, .svg), or play them (.html).",
 )

@@ -226,10 +226,22 @@ def seeds(what: str, default: int = 5) -> Callable[[Function], Function]:
     )
 
 
+def refuse_standard_output(_ctx: click.Context, _param: click.Parameter, path: Path | None) -> Path | None:
+    """The path of a picture; raises BadParameter for the standard output, which already takes the figures."""
+    if str(path) == "-":
+        raise click.BadParameter("the figures go to the standard output: name a file for the picture")
+    return path
+
+
 def plot(what: str) -> Callable[[Function], Function]:
     """--plot of a command that draws its result."""
     return click.option(
-        "--plot", "plot_path", type=FILE, metavar="FILE.png", help=f"{what} PNG, SVG or PDF, by the file's ending."
+        "--plot",
+        "plot_path",
+        type=FILE,
+        callback=refuse_standard_output,
+        metavar="FILE.png",
+        help=f"{what} PNG, SVG or PDF, by the file's ending.",
     )
 
 
@@ -239,6 +251,7 @@ def thesis_figures(chapter: str) -> Callable[[Function], Function]:
         "--plot",
         "plot_path",
         type=FILE,
+        callback=refuse_standard_output,
         metavar="FOLDER|FILE.png",
         help=f"Draw the figures of {chapter}, one picture each, and the errors of all variants, into this folder "
         "(figure-3.1.png …, variants-….png). FILE.png (or .svg, .pdf) names the picture of the variants; figures lie "

@@ -179,11 +179,11 @@ class Screen:
         return [line] if len(line) <= width else _packed([lost, *states], width)
 
     def _headline(self, name: str, width: int) -> str:
-        """Height, roll, pitch and yaw; narrow screens drop the last ones."""
+        """Height, and roll, pitch and yaw as far as they are known; narrow screens drop the last ones."""
         values = self._row[name]
         parts = [f"HEIGHT over joint   {length_with_std(*values[quantities.HEIGHT])}"]
         for quantity in (quantities.ROLL, quantities.PITCH, quantities.YAW):
-            if quantity in values:
+            if quantity in values and math.isfinite(values[quantity][0]):
                 parts.append(f"{quantity.name} {signed_angle(values[quantity][0])}")
         while len(parts) > 1 and len("   ".join(parts)) > width:
             parts.pop()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,41 @@ class FindsMiceScale(Protocol):
     @property
     def scale_change(self) -> tuple[float, float]:
         """Counts per metre, common to all mice, relative to the rig file, and the standard deviation of this factor."""
+
+
+class GyroJumps(NamedTuple):
+    """Jumps of the gyro's bias that mice or a rest have shown: how many, and the last one."""
+
+    times: int
+    last_rad_s: float
+    last_time_s: float  # when it was found
+
+
+class MovedMouse(NamedTuple):
+    """A mouse (1 for the first) that the turns show at another place than the rig file states."""
+
+    mouse: int
+    x_m: float
+    y_m: float
+    off_m: float  # distance between both places
+
+
+@runtime_checkable
+class FindsMovedMice(Protocol):
+    """Further interface of a filter that estimates the places of the mice."""
+
+    @property
+    def moved_mice(self) -> tuple[MovedMouse, ...]:
+        """Mice whose places differ significantly from the rig file."""
+
+
+@runtime_checkable
+class FindsGyroJumps(Protocol):
+    """Further interface of a filter that finds jumps of the gyro's bias."""
+
+    @property
+    def gyro_jumps(self) -> GyroJumps:
+        """Jumps so far."""
 
 
 @runtime_checkable

@@ -112,9 +112,10 @@ def warm_up(names: Iterable[Method]) -> None:
     for name in names:
         if name in ("mcl", "scan-match"):
             estimate_track(in_a_round_room, name, Settings(), _round_room())
-            estimate_track(in_a_round_room[2:], name, Settings(), _round_room())  # without a start: searches the map
         else:
             estimate_track(at_one_place, name, Settings())
+        if name == "scan-match":  # without a start, it searches the map
+            estimate_track(in_a_round_room[2:], name, Settings(), _round_room())
 
 
 def _round_room() -> GridMap:

@@ -105,8 +105,6 @@ def picture_files(place: Path, whole: str, names: Sequence[str], force: bool) ->
     A folder `place` holds them all. A picture file `place` is that of `whole`, and the others lie beside it, after its
     name. Makes the folder. Raises FileError where one of the pictures cannot be written.
     """
-    if place == STDOUT:
-        raise CannotWrite(place, "standard output holds one picture only, not several")
     if place.suffix and not place.is_dir():
         files = {whole: place} | {name: place.with_name(f"{place.stem}-{name}{place.suffix}") for name in names}
     else:

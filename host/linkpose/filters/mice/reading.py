@@ -25,6 +25,10 @@ BIAS_STD, BIAS_FLOOR, _BIAS_MEMORY_S, _BIAS_RATE_HZ = 0.35, 0.01, 10.0, 10.0
 # A gyro that gives one value, to the last bit, for this long (s) and so often is dead: the noise of a real one is half
 # a count or more, which repeats a value so often once in 10^12. Doubled: a dead gyro turns the path for twice as long.
 _DEAD_S, _DEAD_RATES = 0.4, 40
+# A mouse that gives the same counts for so many readings is stuck, if another one has been silent for so long (s), or
+# has changed its counts by so much in about the same time. Doubled: it spoils the path for twice as long.
+_STUCK_REPEATS, _STUCK_SILENT_S, _STUCK_CHANGE, _VARYING_REPEATS = 50, 0.3, 12.0, 10
+_CHANGE_KEPT = 0.98  # of the changes, from reading to reading
 
 
 @inner
@@ -54,17 +58,61 @@ def follow_gyro(state: Record, sample: Record) -> None:
 @inner
 def read_counts(state: Record, mice: Records, sample: Record) -> None:
     """Motion of each mouse in b, and whether its counts cover this step."""
-    has_counts = 0
+    has_counts = at_limit = 0
     for i in range(state.count):
         m = mice[i]
         moved = turned(m.axis, sample.counts[i])
         if math.isfinite(moved.real + moved.imag):
             has_counts |= 1 << i
             m.moved = moved
+            if _is_at_limit(m, sample.counts[i]):
+                at_limit |= 1 << i
+            _watch_repeats(m, sample.counts[i])
     # The first counts of a mouse that was away cover an unknown time.
     state.sound = has_counts & ~state.away
     state.away = ~has_counts & ((1 << state.count) - 1)
+    # A mouse whose counter ran over counts too little: it is left out, or all are lower bounds of the speed.
+    state.is_saturated = at_limit != 0 and state.sound & ~at_limit == 0
+    if not state.is_saturated:
+        state.sound &= ~at_limit
+    _exclude_stuck(state, mice)
     state.used = state.sound & ~state.excluded
+
+
+@inner
+def _is_at_limit(m: Record, counts: complex) -> bool:
+    """Whether an axis shows the largest count of 8 or 9 bits for the second time in a row."""
+    x, y, last = abs(counts.real), abs(counts.imag), m.counts
+    along = (x == 127.0 or x == 128.0 or x == 255.0 or x == 256.0) and counts.real == last.real
+    across = (y == 127.0 or y == 128.0 or y == 255.0 or y == 256.0) and counts.imag == last.imag
+    return bool(along or across)
+
+
+@inner
+def _watch_repeats(m: Record, counts: complex) -> None:
+    """How often a mouse has given the same counts, and by how much they have changed of late."""
+    change = counts - m.counts
+    m.repeats = m.repeats + 1 if square(change) == 0.0 else 0
+    m.change = _CHANGE_KEPT * m.change + abs(change.real) + abs(change.imag)
+    m.counts = counts
+
+
+@inner
+def _exclude_stuck(state: Record, mice: Records) -> None:
+    """Exclude mice that repeat one count while another mouse rests or changes its counts."""
+    for i in range(state.count):
+        m = mice[i]
+        if not (state.sound >> i & 1 and m.repeats >= _STUCK_REPEATS and square(m.counts) > 0.0):
+            continue
+        for k in range(state.count):
+            other = mice[k]
+            varies = other.change > _STUCK_CHANGE and other.repeats < _VARYING_REPEATS
+            is_apart = other.silent_s >= _STUCK_SILENT_S or varies
+            if k != i and state.sound >> k & 1 and is_apart:
+                state.excluded |= 1 << i
+                state.sound &= ~(1 << i)
+                m.agreed_s = m.agreed_m = 0.0
+                break
 
 
 @inner
@@ -153,7 +201,7 @@ def _learn_bias(state: Record) -> None:
 def correct(state: Record, mice: Records, p: Record, finds_bias: bool) -> bool:
     """Velocity from the counts that cover the last step; False where they do not determine it."""
     is_gap = state.missed > 0.0
-    if not is_gap:
+    if not (is_gap or state.is_saturated):
         faults.skip_late(state, mice, p.noise_m_s, p.mismatch)
     if not state.step > 0.0:
         return False
@@ -163,6 +211,8 @@ def correct(state: Record, mice: Records, p: Record, finds_bias: bool) -> bool:
     _fill_window(state, mice)
     if is_gap and is_known:  # the velocity before a gap carries little information on the velocity after it
         state.reference, state.reference_rate = state.velocity, state.turn_rate
+    if state.is_saturated:
+        return is_known
     if faults.exclude(state, mice, p.noise_m_s, p.mismatch):
         is_known = _fuse(state, mice, p)
     if state.disagree_s == 0.0:

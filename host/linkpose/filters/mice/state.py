@@ -52,6 +52,9 @@ MOUSE = np.dtype(
         # Motion.
         ("moved", "c16"),  # over the last step (m)
         ("window", "c16"),  # over the window of the fault tests: an exponentially forgetting sum (m)
+        ("counts", "c16"),  # of the last reading
+        ("repeats", "i8"),  # readings in a row with the same counts
+        ("change", "f8"),  # of the counts over about half a second: a forgetting sum
         ("silent_s", "f8"),  # time without a count (s)
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)
@@ -93,6 +96,7 @@ STATE = np.dtype(
         ("bias", "f8"),  # of the gyro beyond the rig's (rad/s)
         ("bias_std", "f8"),
         ("bias_s", "f8"),  # how long agreeing mice have shown the bias (s)
+        ("is_saturated", "?"),  # whether the counters of all mice have run over in this step
         # Sets of mice as bit masks: bit 0 is the first mouse.
         ("sound", "i8"),  # have counts that cover this step
         ("used", "i8"),  # count for the estimate

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from linkpose.filters import GyroJumps, MovedMouse
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
 from linkpose.filters.mice.reading import BIAS_STD
@@ -40,9 +41,13 @@ from linkpose.filters.planar.state import fresh_state as fresh_planar_state
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
-__all__ = ["FoundMouse", "GyroJumps", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
+__all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
+
+
+# A mouse is reported at another place beyond so much (m), and so many standard deviations.
+_MOVED_M, _MOVED_Z = 0.008, 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +62,6 @@ class FoundMouse:
     x_m: float
     y_m: float
     position_std_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class GyroJumps:
-    """Jumps of the gyro's bias that the mice or a rest have shown: how many, and the last one."""
-
-    count: int
-    last_rad_s: float
-    last_time_s: float
 
 
 class _PlanarFilter:
@@ -118,6 +114,16 @@ class _PlanarFilter:
     def found_mice(self) -> tuple[FoundMouse, ...]:
         """Calibration of each mouse so far."""
         return tuple(self._found(i) for i in range(len(self._rig.mouse)))
+
+    @property
+    def moved_mice(self) -> tuple[MovedMouse, ...]:
+        """Mice that the turns show elsewhere than the rig states, by 5 standard deviations and by 8 mm."""
+        moved = []
+        for found, mouse in zip(self.found_mice, self._rig.mouse, strict=True):
+            off_m = math.hypot(found.x_m - mouse.x_m, found.y_m - mouse.y_m)
+            if off_m > max(_MOVED_M, _MOVED_Z * found.position_std_m):
+                moved.append(MovedMouse(found.mouse, found.x_m, found.y_m, off_m))
+        return tuple(moved)
 
     @property
     def scale_change(self) -> tuple[float, float]:

@@ -55,7 +55,7 @@ def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
     if not m.step > 0.0:
         return
     motion = _motion_by_mice(state, m, mice, p)
-    if motion < 0 or m.missed > 0.0:
+    if motion < 0 or m.missed > 0.0 or m.is_saturated:
         _advance_other(state, complex(state.at.vx, state.at.vy), state.at.wz, m.step + m.missed)
         return
     _watch_dead_gyro(state, m, motion)

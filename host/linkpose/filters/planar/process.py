@@ -9,7 +9,7 @@ from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
 from linkpose.filters.mice.least_squares import squared_speed
-from linkpose.filters.mice.plane import scaled, square, turned, turned_mean, unit
+from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.gyro import agree, is_doubtful, watch_gyro
@@ -22,9 +22,10 @@ _PATIENCE_S = 0.5
 # A change of velocity that only the mice show stays unconfirmed for at most so long (s), until mice and gyro agree on a
 # turn of so much (rad, within a share and a rate in rad/s), or until the velocity jumps back. The stated ± of the
 # position grows by the distance to the position without this change. Doubling the time doubles the ± after a collision
-# on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and this much (m/s, eight
-# times the rounding of three mice): small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
-_JUMP_M_S2, _JUMP_M_S = 6.0, 0.04
+# on a straight. A jump is a change from one reading to the next of this acceleration (m/s²) and so many σ of the
+# velocity: small robots brake with 2 to 4 m/s², a lift at 0.3 m/s is 30 m/s².
+_JUMP_M_S2, _JUMP_Z = 3.0, 6.0
+_SATURATED_SHARE = 0.5  # of the speed that saturated mice show: by so much they may count too little (1σ)
 _SPREAD_S = 0.05  # a jump spreads over two or three readings
 _UNCONFIRMED_S, _CONFIRMING_RAD, _AGREED_SHARE, _AGREED_RAD_S = 10.0, 0.2, 0.1, 0.05
 # Within one step a velocity changes by about this (m/s², rad/s²): the velocity is the mean over the step, the estimate
@@ -39,6 +40,10 @@ _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 
 # Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
 # (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
 _ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# A mouse is misplaced: after so much turning (rad²/s), by at least this much (m), with this share of the squared
+# differences left, once its scale and angle are known to this σ. Its new place has this share of the change as σ.
+# Doubled: a place is corrected later, or a wrong mouse is corrected.
+_PLACE_TURN, _PLACE_M, _PLACE_LEFT, _PLACE_SCALE, _PLACE_SHARE = 0.3, 0.012, 0.15, 0.008, 0.2
 # While the last turn is off by so many standard deviations, the mice are not calibrated. Doubled: positions of the mice
 # take up the scale of another floor.
 _OFF_Z = 3.0
@@ -103,18 +108,24 @@ def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) 
 @inner
 def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
-    if state.at_rest or m.missed > 0.0 or number(m.used) < 2 or not math.isfinite(m.mean_rate):
+    if state.at_rest or m.missed > 0.0 or m.is_saturated or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
     keep, turn = math.exp(-m.step / _FLOOR_MEMORY_S), m.mean_rate - state.at.bias
     if abs(m.turn_rate - turn) > _FLOOR_MOST * abs(turn) + _FLOOR_Z * m.turn_std:
         return
+    if m.excluded:
+        return
+    _add_turn_of_each(state, m, mice, turn, keep)
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
     _add_to_turn(state, turn, m.turn_rate, m.step)
     by_scales = _variance_by_scales(state, m, mice)
     state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
-    if state.turn_square < _FLOOR_TURN or is_doubtful(state):
+    if is_doubtful(state):
+        return
+    _find_misplaced(state, m, mice)
+    if state.turn_square < _FLOOR_TURN:
         return
     off = state.turn_product / state.turn_square - 1.0
     noise = math.sqrt(by_scales + state.turn_variance / state.turn_square**2)
@@ -123,17 +134,91 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     latest, before = _off_of_turn(state), state.off_of_turn
     if latest == 0.0:
         latest, before = before, state.off_of_turn_before
-    if not (latest / off > 0.5 and before / off > 0.5):
+    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
             state.covariance[a, b] += p.floor_scale**2
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     _correct_way(state, off)
+    _restart_turns(state)
+    state.floors += 1
+
+
+@inner
+def _add_turn_of_each(state: Record, m: Record, mice: Records, by_gyro: float, keep: float) -> None:
+    """Add the motion of each mouse relative to the mean of all, times the turn rate of the gyro."""
+    moved = 0j
+    for i in range(m.count):
+        moved += scaled(1.0 / m.count, mice[i].moved)
+    for i in range(m.count):
+        own = scaled(keep, state.lever_of_each[i]) + scaled(by_gyro, mice[i].moved - moved)
+        state.lever_of_each[i] = own
+
+
+@inner
+def _off_of_each(state: Record, m: Record, mice: Records, i: int) -> complex:
+    """Lever of a mouse about the centre of all as the turns have shown it, less the assumed one (m, turned by 90°)."""
+    arm = 0j
+    for k in range(m.count):
+        arm += scaled(1.0 / m.count, mice[k].arm)
+    return complex(scaled(1.0 / state.turn_square, state.lever_of_each[i]) - (mice[i].arm - arm))
+
+
+@inner
+def _spread_of_turns(state: Record, m: Record, mice: Records) -> float:
+    """Spread of the shares of the gyro's turn that the mice show: on another floor all show the same."""
+    least, most, arm = math.inf, -math.inf, 0j
+    for k in range(m.count):
+        arm += scaled(1.0 / m.count, mice[k].arm)
+    for i in range(m.count):
+        lever = mice[i].arm - arm
+        share = dot(lever, _off_of_each(state, m, mice, i)) / max(square(lever), 1e-12)
+        least, most = min(least, share), max(most, share)
+    return most - least
+
+
+@inner
+def _find_misplaced(state: Record, m: Record, mice: Records) -> None:
+    """Correct the place of the one mouse that is elsewhere than the rig states, as the turns show it."""
+    if m.count < 3 or state.turn_square < _PLACE_TURN:
+        return
+    worst, far2, total2 = 0, 0.0, 0.0
+    for i in range(m.count):
+        off2 = square(_off_of_each(state, m, mice, i))
+        total2 += off2
+        if off2 > far2:
+            worst, far2 = i, off2
+    own = 1.0 - 1.0 / m.count
+    off = scaled(1.0 / own, _off_of_each(state, m, mice, worst))
+    left2 = 0.0
+    for i in range(m.count):
+        expected = scaled(own if i == worst else own - 1.0, off)
+        left2 += square(_off_of_each(state, m, mice, i) - expected)
+    at = MICE + OF_MOUSE * worst
+    p, known = state.covariance, _PLACE_SCALE * _PLACE_SCALE
+    is_known = p[at + SCALE, at + SCALE] < known and p[at + ANGLE, at + ANGLE] < known
+    if not is_known or square(off) < _PLACE_M * _PLACE_M or left2 > _PLACE_LEFT * total2:
+        return
+    mouse = state.at.mice[worst]
+    _restart(state, at + POSITION, at + OF_MOUSE, 1.0)
+    mouse.dx += off.imag
+    mouse.dy -= off.real
+    for k in range(2):
+        p[at + POSITION + k, at + POSITION + k] = _PLACE_SHARE * _PLACE_SHARE * square(off)
+    _restart_turns(state)
+    m.excluded &= ~(1 << worst)
+    state.moved |= 1 << worst
+
+
+@inner
+def _restart_turns(state: Record) -> None:
+    """Begin to compare the turns of gyro and mice anew."""
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    for i in range(len(state.lever_of_each)):
+        state.lever_of_each[i] = 0j
     state.is_off = False
-    state.floors += 1
 
 
 @inner
@@ -196,13 +281,14 @@ def _common_errors(state: Record, m: Record, mice: Records) -> tuple[float, floa
 
     The drive shows the mice's errors relative to each other; their mean stays as the rig states it. Where they are far
     apart, the mean is as uncertain as that of so many draws. Positions beyond three standard deviations of the rig's
-    are taken for wrong ones, which show as scale and angle too.
+    are taken for wrong ones, which show as scale and angle too, unless the turns have shown where the mouse is.
     """
     count = m.count
     scale = angle = scale2 = angle2 = moved2 = arm2 = 0.0
     for i in range(count):
         mouse = state.at.mice[i]
-        moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
+        if not state.moved >> i & 1:
+            moved2 += mouse.dx**2 + mouse.dy**2 - 18.0 * state.fresh[MICE + POSITION, MICE + POSITION]
         arm2 += square(mice[i].arm)
         scale += mouse.scale
         angle += mouse.angle
@@ -286,8 +372,9 @@ def _correct(
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
+    learns = not (is_doubtful(state) or state.is_off or m.is_saturated)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, 0.0 if is_doubtful(state) or state.is_off else limit):
+    if not update(state, limit if is_patient else math.inf, limit if learns else 0.0):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -300,7 +387,8 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
 
     `before` is the filter's velocity before this reading.
     """
-    shown, last, limit = m.velocity, state.shown, _JUMP_M_S + _JUMP_M_S2 * dt
+    shown, last = m.velocity, state.shown
+    limit = _JUMP_Z * math.sqrt(m.x_std**2 + m.y_std**2) + _JUMP_M_S2 * dt
     state.shown = shown
     is_jump = square(shown - last) > limit * limit
     if state.unconfirmed_s > 0.0:
@@ -327,11 +415,27 @@ def _add_unconfirmed_way(state: Record, m: Record, dt: float) -> None:
             state.unconfirmed_s = 0.0
             return
     way = scaled(dt, turned(unit(state.at.heading), state.held - complex(state.at.vx, state.at.vy)))
+    _add_systematic(state, way, state.unconfirmed_m)
+    state.unconfirmed_m += math.sqrt(square(way))
+
+
+@inner
+def _add_saturated_way(state: Record, m: Record, dt: float) -> None:
+    """Add the variance of a way of which saturated mice show a lower bound only."""
+    if not m.is_saturated:
+        return
+    way = scaled(_SATURATED_SHARE * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+    _add_systematic(state, way, state.saturated_m)
+    state.saturated_m += math.sqrt(square(way))
+
+
+@inner
+def _add_systematic(state: Record, way: complex, before_m: float) -> None:
+    """Add the variance of an error of position that grows by `way` (m) in this step, and was `before_m` before."""
     length = math.sqrt(square(way))
     if not length > 0.0:
         return
-    grown = length * (2.0 * state.unconfirmed_m + length) / (length * length)
-    state.unconfirmed_m += length
+    grown = length * (2.0 * before_m + length) / (length * length)
     state.covariance[X, X] += grown * way.real * way.real
     state.covariance[Y, Y] += grown * way.imag * way.imag
     state.covariance[X, Y] += grown * way.real * way.imag
@@ -377,6 +481,7 @@ def _step(
         agree(state)
     _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
+    _add_saturated_way(state, m, dt)
     _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)

@@ -104,7 +104,9 @@ _FIELDS = [
     # Common scale of the mice against the gyro: sums over the last turns.
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
-    ("turn_variance", "f8"),  # variance of that (rad⁴/s²)
+    ("lever_of_each", "c16", (MOST,)),  # ∫ ω s dt of each mouse's motion s relative to the mean (m rad/s)
+    ("moved", "i8"),  # bit mask of the mice whose places the turns have corrected
+    ("turn_variance", "f8"),  # variance of turn_product (rad⁴/s²)
     ("recent_square", "f8"),  # the first two over the current turn only
     ("recent_product", "f8"),
     ("turn_rate", "f8"),  # of the gyro, less its bias, in the last step (rad/s)
@@ -131,6 +133,7 @@ _FIELDS = [
     ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
     ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
     ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
+    ("saturated_m", "f8"),  # way that saturated mice may have missed (m)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
