@@ -92,6 +92,17 @@ def test_a_turn_about_one_axis_is_refused_with_its_cure():
         calibrate_mag([recording(tumbled(about=(0.0, 0.0, 1.0)))], Rig())
 
 
+def test_directions_in_one_plane_of_the_sensor_are_refused():
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, 3000)
+    field = 50 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) + 0.2 * rng.standard_normal((3000, 3))
+    block = Measurements.from_imu(
+        np.arange(3000) / 100, np.tile([0, 0, STANDARD_GRAVITY], (3000, 1)), np.zeros((3000, 3)), mag_uT=field
+    )
+    with pytest.raises(LinkposeError, match="turn the sensor by hand"):
+        calibrate_mag([recording(block)], Rig())
+
+
 def test_no_magnetometer_is_refused():
     block = tumbled(5.0)
     with pytest.raises(LinkposeError, match="there is no magnetometer"):

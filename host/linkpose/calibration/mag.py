@@ -40,6 +40,9 @@ LEAST_COVERAGE, GOOD_COVERAGE = 0.3, 0.6
 _CELLS = 60  # of the sphere, 26° wide
 LARGE_RESIDUAL = 0.04  # share of the field; a calibrated QMC5883L leaves 1 %
 _LARGEST_STD_UT = 2.0  # of the hard iron
+# Ratio of the ellipsoid's longest to its shortest axis. Soft iron of a circuit board makes it 1.5 at most; noise on
+# directions in one plane makes it 10 and more. Doubled, two planes a few degrees apart pass.
+_MOST_STRETCH = 3.0
 _FEWEST = 100  # readings
 _PASSES, _HUBER_SIGMAS = 30, 2.5
 _STEP_S = 0.1  # between two readings that the rotation joins: at 1 rad/s the field turns by 0.1 rad, 3 µT
@@ -108,7 +111,8 @@ def calibrate_mag(recordings: Sequence[Recording], rig: Rig) -> MagCalibration:
     hard_iron, soft_iron, field, std, residual = _fit_ellipsoid(together)
     turned = (together - hard_iron) @ soft_iron
     coverage = _coverage(turned)
-    if coverage < LEAST_COVERAGE or std.max() > _LARGEST_STD_UT:
+    is_flat = np.linalg.cond(soft_iron) > _MOST_STRETCH
+    if is_flat or coverage < LEAST_COVERAGE or std.max() > _LARGEST_STD_UT:
         raise _too_little(coverage, float(std.max()))
     rotation, rotation_std = _alignment(blocks, rig.imu, hard_iron, soft_iron)
     dip = None if rotation is None else _dip_deg(blocks, rig.imu, rotation, hard_iron, soft_iron)
