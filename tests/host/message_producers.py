@@ -26,7 +26,9 @@ from linkpose.localization.logs import read_log
 from linkpose.localization.map_check import check_map
 from linkpose.localization.maps import load_map, save_map
 from linkpose.localization.noise import check_correlation
+from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.plausibility import check_units
+from linkpose.localization.stream import Stream
 from linkpose.localization.tables import Truth, read_beacons, read_truth, score
 from linkpose.localization.ukf import Transform
 from linkpose.recording.reader import Recording, load_recording
@@ -63,6 +65,9 @@ def log_of(rows: str, then: Callable[[Log], object]) -> Producer:
 
 
 BEACONS = {"1": (0.0, 0.0, 0.0), "2": (5.0, 0.0, 0.0)}
+
+
+TWICE = "0,pose,0,0,0\n" + "".join(f"{i % 15},range,1,5,\n" for i in range(30))  # the clock is set back once
 
 
 def units(rows: str) -> Producer:
@@ -158,6 +163,10 @@ MORE: dict[str, dict[str, Producer]] = {
         "… line …: unknown kind …; known kinds are …": events("0,sonar,1,1,1\n"),
         "… line …: … needs …; complete or delete the row": events("0,odometry,1,,\n"),
         "… line …: … is not a number; correct or delete the row": events("0,odometry,fast,0,\n"),
+        "… line …: the clock jumps back from … to … s; split the log at this line": events(TWICE),
+        "standard input line …: the clock jumps back from … to … s; start the stream anew": raises(
+            lambda: list(Stream("ekf", LocalizationOptions(), BEACONS, print).rows([EVENTS, *TWICE.splitlines(True)]))
+        ),
         "… is not a CSV file: …; give a log with the header …": events("0,odometry," + "9" * 200_000),
         "… line …: … and … can be read in two ways; save the log with one decimal mark and without separators of thousands": (
             reading(read_log, "time_s;kind;a;b;c\n0;odometry;1,5;0;\n1;odometry;1.5;0;\n")

@@ -9,11 +9,12 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
-from linkpose import compiling
+from linkpose import compiling, filters, precompile
+from linkpose.localization.localizer import Method
 
 HOST = Path(__file__).parents[2] / "host"
 
@@ -233,6 +234,14 @@ def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, t
     elsewhere = {**place, "XDG_CACHE_HOME": tmp_path / "mine"}
     assert run(TEXT, host, **elsewhere) == "1.25 0"
     assert list((tmp_path / "mine").rglob("*.nbc"))
+
+
+@pytest.mark.parametrize(
+    "name", [*filters.NAMES, *get_args(Method), precompile.TEXT, precompile.NOISES, precompile.FILES]
+)
+def test_all_that_the_wheel_contains_compiles(name):
+    precompile.compile_here(name)
+    assert compiling.is_compiled(name)
 
 
 PREPARE = """

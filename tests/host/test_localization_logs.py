@@ -326,3 +326,34 @@ def test_numbers_that_can_be_read_in_two_ways_are_refused(tmp_path, row):
     with pytest.raises(LinkposeError, match="can be read in two ways") as failure:
         read_log(written(tmp_path, text))
     assert "\n" not in str(failure.value)
+
+
+def drive_rows(first, last):
+    """Rows of odometry and of a range at each tenth of a second."""
+    times = np.arange(first, last, 0.1)
+    return [row for t in times for row in (f"{t:.1f},odometry,1,0,\n", f"{t:.1f},range,7,5,\n")]
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        drive_rows(0, 5)[::-1],  # written backwards
+        drive_rows(5, 9) + drive_rows(0, 5),  # parts in another order
+        sorted(drive_rows(0, 5), key=lambda row: "odometry" in row),  # sensor after sensor
+        [*drive_rows(0, 5), "0.2,range,7,5,\n", "0.3,range,7,5,\n"],  # late rows
+    ],
+)
+def test_rows_of_one_clock_are_sorted(tmp_path, rows):
+    read = read_log(written(tmp_path, HEADER + "".join(rows)))
+    assert len(read.events) == len(rows)
+    assert np.all(np.diff([event.time_s for event in read.events]) >= 0)
+
+
+def test_a_clock_that_was_set_back_is_named_with_its_line(tmp_path):
+    rows = drive_rows(0, 5) + drive_rows(0, 4)
+    with pytest.raises(LinkposeError, match=r"line 102: the clock jumps back from 4.9 to 0 s; split the log"):
+        read_log(written(tmp_path, HEADER + "".join(rows)))
+    readings = [Reading(1.0 + 0.1 * i, (0.1 * i, 0.0, 0.0)) for i in range(30)]
+    lines = "\n".join(map(format_reading, [*readings, *readings]))
+    with pytest.raises(LinkposeError, match=r"line 31: the clock jumps back from 3.9 to 1 s"):
+        read_log(written(tmp_path, lines + "\n", "a.log"))

@@ -11,6 +11,7 @@ import pytest
 
 import linkpose
 from linkpose.errors import FileFormatError
+from linkpose.recording.consistency import contradiction
 from linkpose.recording.reader import load_recording
 from linkpose.recording.units import suspicions
 from linkpose.sensors.measurements import Measurements
@@ -196,6 +197,14 @@ def test_one_impossible_pressure_is_left_out(tmp_path: Path, pressure: float) ->
     recording = load_recording(tmp_path / "r.csv")
     assert np.isnan(recording.measurements.pressure_Pa[100])
     assert recording.health["baro"]["invalid"] == {"out of range": 1}
+
+
+@pytest.mark.parametrize("rows", [1, 2, 49, 150, 1200])
+@pytest.mark.parametrize("factor", [1.0, 1e12])
+def test_few_rows_and_huge_values_are_no_contradiction(rows: int, factor: float) -> None:
+    table = {name: factor * values[:rows] for name, values in fast_swing().items()}
+    accel, gyro = np.split(np.stack(list(table.values())[1:], axis=1), 2, axis=1)
+    assert contradiction(Measurements.from_imu(fast_swing()["time_s"][:rows], accel, gyro)) == ""
 
 
 def test_each_remark_of_the_documentation_is_produced(tmp_path: Path) -> None:

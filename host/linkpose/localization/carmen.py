@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import Event, Log, LogFile, Scan, in_order, read_number
+from linkpose.localization.events import Event, Log, LogFile, Scan, check_clock, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
 from linkpose.presentation import counted
@@ -86,6 +86,8 @@ def read_carmen(path: Path, lines: Sequence[str]) -> LogFile:
         )
     if len(timed) < len(readings):
         remarks.append(f"{path}: {counted(len(readings) - len(timed), 'line')} without a time left out")
+    scans = [reading for reading in timed if reading.ranges_m is not None]
+    check_clock([scans, [reading for reading in timed if reading.ranges_m is None]], path)
     ordered, moved = in_order(timed)
     if moved:
         remarks.append(f"{path}: {counted(moved, 'line')} moved into the order of time")

@@ -60,6 +60,18 @@ class Scan:
 Log = list[Event | Scan]
 
 
+# A clock was set back where the times of one sensor jump back by more than SET_BACK_S (s), and at least FEWEST_SET_BACK
+# rows before and after have the same times. With more than MOST_SET_BACK jumps, the rows are out of order instead.
+SET_BACK_S, FEWEST_SET_BACK, MOST_SET_BACK = 1.0, 10, 3
+
+
+class _TimedLine(Protocol):
+    @property
+    def time_s(self) -> float: ...
+    @property
+    def line(self) -> int: ...
+
+
 class _Timed(Protocol):
     @property
     def time_s(self) -> float: ...
@@ -90,6 +102,29 @@ def in_order(items: list[Timed]) -> tuple[list[Timed], int]:
     return (sorted(items, key=lambda item: item.time_s) if moved else items), moved
 
 
+def check_clock(series: Iterable[Sequence[_TimedLine]], path: Path) -> None:
+    """Raises LinkposeError for a log whose clock was set back. `series` are each sensor's rows as they were written.
+
+    Rows of two stretches of a log that have the same times cannot be put into the order of time. A log that is written
+    backwards, in parts, or sensor after sensor can.
+    """
+    for rows in series:
+        starts = [i for i in range(1, len(rows)) if rows[i].time_s < rows[i - 1].time_s - SET_BACK_S]
+        if len(starts) > MOST_SET_BACK:
+            continue
+        for first, second, last in zip([0, *starts], starts, [*starts[1:], len(rows)], strict=False):
+            until, since = rows[second - 1].time_s, rows[second].time_s
+            low, high = max(rows[first].time_s, since), min(until, rows[last - 1].time_s)
+            shared = (
+                sum(low <= row.time_s <= high for row in part) for part in (rows[first:second], rows[second:last])
+            )
+            if min(shared) >= FEWEST_SET_BACK:
+                raise LinkposeError(
+                    f"{path} line {rows[second].line}: the clock jumps back from {until:.6g} to {since:.6g} s; "
+                    "split the log at this line"
+                )
+
+
 def read_events(path: Path, lines: Sequence[str]) -> LogFile:
     """The log in the lines of a CSV file. Rows that are not in order of time are sorted, negative ranges are left out;
     `remarks` has the counts. Raises LinkposeError with file, line and cure for whatever cannot be a measurement.
@@ -103,6 +138,10 @@ def read_events(path: Path, lines: Sequence[str]) -> LogFile:
     remarks = []
     if len(kept) < len(events):
         remarks.append(f"{path}: {counted(len(events) - len(kept), 'negative range')} left out")
+    series: dict[tuple[str, str], list[Event]] = {}
+    for event in kept:
+        series.setdefault((event.kind, event.beacon), []).append(event)
+    check_clock(series.values(), path)
     ordered, moved = in_order(kept)
     if moved:
         remarks.append(f"{path}: {counted(moved, 'row')} moved into the order of time")

@@ -84,6 +84,8 @@ class Paths:
         return iter(self.columns)
 
     def __getattr__(self, name: str) -> Track:
+        if name.startswith("__") or name == "tracks":  # copy and pickle ask before the fields are set
+            raise AttributeError(name)
         for filter_name, track in self.tracks.items():
             if filter_name.replace("-", "_") == name:
                 return track

@@ -9,7 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.events import NAMED, Event, Log, is_negative, stream_events
+from linkpose.localization.events import (
+    FEWEST_SET_BACK,
+    NAMED,
+    SET_BACK_S,
+    Event,
+    Log,
+    is_negative,
+    stream_events,
+)
 from linkpose.localization.localizer import Localizer, Method, Row, check
 from linkpose.localization.measuring import default_constants
 from linkpose.localization.options import LocalizationOptions
@@ -50,6 +58,7 @@ class Stream:
         self.last: Row | None = None
         self.late = self.negative = 0
         self.is_cut = False
+        self._late_in_a_row = 0
         self._rows: Log = []  # for the noises
         self._sightings = 0
         self._tuning: Future[Settings] | None = None
@@ -89,12 +98,23 @@ class Stream:
         with ThreadPoolExecutor(1) as pool:
             for event in itertools.chain(head, events):
                 if event.time_s < self.run.now:
-                    self.late += 1
+                    self._count_late(event, self.run.now)
                     continue
+                self._late_in_a_row = 0
                 self._tune(self.run, event, pool)
                 yield self.run.feed([event])
         if len(self._rows) < max(UNITS_CHECKED_AFTER):
             check_units(self._rows, self.beacons, ORIGIN)
+
+    def _count_late(self, event: Event, now_s: float) -> None:
+        """Counts a row that is late. Raises LinkposeError where the sender's clock was set back."""
+        self.late += 1
+        self._late_in_a_row = self._late_in_a_row + 1 if event.time_s < now_s - SET_BACK_S else 0
+        if self._late_in_a_row >= FEWEST_SET_BACK:
+            raise LinkposeError(
+                f"{ORIGIN} line {event.line}: the clock jumps back from {now_s:.6g} to {event.time_s:.6g} s; start the "
+                "stream anew"
+            )
 
     def remarks(self) -> list[str]:
         """What was left out, with counts."""

@@ -44,7 +44,7 @@ def contradiction(measurements: Measurements) -> str:
     step_s, force, rate = windows
     variation = _Motion(np.zeros_like(rate), step_s).unexplained(force)
     as_is = (motion := _Motion(rate, step_s)).unexplained(force)
-    if as_is < _CLEAR_M_S2 or variation < _CLEAR_M_S2:
+    if not _CLEAR_M_S2 < as_is < np.inf or variation < _CLEAR_M_S2:
         return ""
     left = {f"{factor:g}": _Motion(factor * rate, step_s).unexplained(force) for factor in _FACTORS}
     reversed_ = _Motion(-rate, step_s)
@@ -115,6 +115,8 @@ def _windows(measurements: Measurements) -> tuple[float, Floats, Floats] | None:
         return None
     size = int(np.clip(round(_PERIOD_S / step_s), 1, _MOST_AVERAGED))
     count = len(measurements) // (size * _WINDOW)
+    if count < _FEWEST_WINDOWS:
+        return None
     rows = count * size * _WINDOW
     time_s, force, rate = (
         values[:rows].reshape(count, _WINDOW, size, -1).mean(axis=2)
@@ -138,7 +140,9 @@ class _Motion:
         self._design = _without_tilt(self._turned, lever).reshape(-1, 3)
 
     def unexplained(self, force: Floats) -> float:
-        """Rms (m/s²) of the rest of the specific force (W, n, 3)."""
+        """Rms (m/s²) of the rest of the specific force (W, n, 3); infinite for rates beyond all numbers."""
+        if not np.isfinite(self._design).all():
+            return np.inf
         left = _without_tilt(self._turned, force[..., None]).reshape(-1)
         j2s_m = np.linalg.lstsq(self._design, left, rcond=1e-4)[0]
         return float(np.sqrt(np.mean((left - self._design @ j2s_m) ** 2)))
