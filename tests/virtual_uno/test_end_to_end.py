@@ -107,15 +107,34 @@ def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, t
     assert table.columns["time_s"][-1] == pytest.approx(3.99, abs=0.02)
 
 
+# The simulated link's J2S and field, as `calibrate mag` writes it.
+MAG_RIG = """
+[joint]
+j2s_m = [-0.09, -0.04, 1.65]
+[mag]
+hard_iron_uT = [0.0, 0.0, 0.0]
+field_uT = 51.6
+residual_uT = 0.5
+dip_deg = 54.5
+"""
+
+
 def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_path: Path) -> None:
-    """Two inertial sensors, a barometer, a magnetometer and three mice at 100 Hz: nothing lost, all columns."""
+    """Two inertial sensors, a barometer, a magnetometer, mice at 100 Hz: nothing lost; the field holds the yaw."""
     uno = board(imu2={}, magnetometer="qmc5883l", mice=MICE[:3]).uno
     run = LinkRun(test=1, seed=0, duration_s=None, imu2=True, mag=True)
     feed = RigFeed(uno, run)
-    path = tmp_path / "r.csv"
+    path, estimate, rig = tmp_path / "r.csv", tmp_path / "e.csv", tmp_path / "rig.toml"
     with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
         done = linkpose("record", path, "--port", server.link, "--duration", 6, "--json")
+        rig.write_text(MAG_RIG, encoding="utf-8")
+        options = ("--rig", rig, "--filter", "joint-inertial", "--mag", "--duration", 5, "-o", estimate)
+        live = linkpose("estimate", "--live", "--port", server.link, *options)
     assert done.returncode == 0, done.stderr
+    assert live.returncode == 0, live.stderr
+    held = read_table(estimate, "estimate")
+    assert held.closing["mag"]["used_s"] > 2.0 > held.closing["mag"]["rejected_s"]
+    assert np.isfinite(held.columns["joint_inertial_yaw_deg"][-100:]).all()
     summary = json.loads(done.stdout.splitlines()[-1])
     assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
     table = read_table(path, "recording")

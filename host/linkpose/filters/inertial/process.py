@@ -85,6 +85,7 @@ _START_SWING_S = 0.2  # velocity of such a start per acceleration, without a joi
 # the variance of the velocity. Chosen on BROAD 01 with gaps: with 4 and 1, 89 % of the errors in the 3 s after a gap
 # are within 2σ, with 4 and 2, 98 %. Without the motion before, the errors on BROAD are 20 to 30 % larger.
 _GAP_ACCEL_GROWTH, _GAP_SPEED_GROWTH = 4.0, 2.0
+_MOTION_LASTS_S = 10.0  # after a longer gap nothing is assumed of the motion
 _LEAST_GAP_ACCEL_M2_S4 = 1.0  # at least: a slow hand, as σ of the tilt 6°
 # The tilt is lost when the constraint leaves over this share of (ω×d)² for seconds, where there is that much motion.
 _LOST, _LOST_M2_S2 = 0.5, 0.01
@@ -211,6 +212,8 @@ def _bridge(s: Record, h: float, rate: Vec, imu: ImuCalibration) -> None:
     gap = min(max(h, s.blind_s), 3.0)
     add_noise(s, rotation_variance(gap, gap, imu), 0.0)
     s.rest_s = 0.0
+    if max(h, s.blind_s) > _MOTION_LASTS_S:
+        s.accel_square = 0.0
 
 
 @inner
