@@ -37,7 +37,7 @@ _JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
 _SUM_CALIBRATED = 2.0  # beyond it, the mice are not calibrated. Doubled: a jump spoils the calibration
 _FEWEST_BLOCKS = 4
 # Mice that agree again (|z| below the second number) in so many blocks, in which a jump would show by so many σ, end
-# the doubt. Doubled: σ stays large for longer after a lift.
+# the dispute. Doubled: σ stays large for longer after a lift.
 _CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
 # Blocks after which hypotheses that both fit badly are dropped (10 s): neither a jump nor a slip.
 _PATIENCE_BLOCKS = 50
@@ -76,9 +76,9 @@ def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
         judges = m.sound
     if number(judges) < 2:
         return -1
-    if judges != state.doubt.judges:  # a fault has been found or is over: compare anew
-        state.doubt.judges = judges
-        _forget(state.doubt)
+    if judges != state.dispute.judges:  # a fault has been found or is over: compare anew
+        state.dispute.judges = judges
+        _forget(state.dispute)
     for i in range(m.count):
         if judges >> i & 1 and mice[i].silent_s < _SILENT_S:
             counting |= 1 << i
@@ -112,7 +112,7 @@ def _rounding_share(m: Record, mice: Records) -> float:
 
 @inner
 def _add_gradient(state: Record, m: Record, mice: Records, counting: int) -> None:
-    """∂(turn by the mice) / ∂(ε_i, α_i), summed over the doubt: ε̂, α̂ turn s_i into s_i (1 + ε_i + j α_i)."""
+    """∂(turn by the mice) / ∂(ε_i, α_i), summed over the dispute: ε̂, α̂ turn s_i into s_i (1 + ε_i + j α_i)."""
     weights, centre = 0.0, 0j
     for i in range(m.count):
         if counting >> i & 1:
@@ -123,144 +123,144 @@ def _add_gradient(state: Record, m: Record, mice: Records, counting: int) -> Non
         if counting >> i & 1:
             mouse = mice[i]
             lever = scaled(m.fit_turn_variance * mouse.weight * m.step, mouse.arm - centre)
-            state.doubt.by_scale[i] += dot(lever, mouse.sum)
-            state.doubt.by_angle[i] += dot(lever, complex(-mouse.sum.imag, mouse.sum.real))
+            state.dispute.by_scale[i] += dot(lever, mouse.sum)
+            state.dispute.by_angle[i] += dot(lever, complex(-mouse.sum.imag, mouse.sum.real))
 
 
 @inner
 def _variance_of_calibration(state: Record) -> float:
-    """Variance (rad²) of the turn by the mice since the doubt began, by the uncertainty of their calibration."""
-    doubt, p, total = state.doubt, state.covariance, 0.0
+    """Variance (rad²) of the turn by the mice since the dispute began, by the uncertainty of their calibration."""
+    dispute, p, total = state.dispute, state.covariance, 0.0
     for i in range((state.size - MICE) // OF_MOUSE):
         a = MICE + OF_MOUSE * i
         for k in range((state.size - MICE) // OF_MOUSE):
             b = MICE + OF_MOUSE * k
-            total += doubt.by_scale[i] * p[a + SCALE, b + SCALE] * doubt.by_scale[k]
-            total += doubt.by_angle[i] * p[a + ANGLE, b + ANGLE] * doubt.by_angle[k]
-            total += 2.0 * doubt.by_scale[i] * p[a + SCALE, b + ANGLE] * doubt.by_angle[k]
+            total += dispute.by_scale[i] * p[a + SCALE, b + SCALE] * dispute.by_scale[k]
+            total += dispute.by_angle[i] * p[a + ANGLE, b + ANGLE] * dispute.by_angle[k]
+            total += 2.0 * dispute.by_scale[i] * p[a + SCALE, b + ANGLE] * dispute.by_angle[k]
     return total
 
 
 @inner
 def _advance_other(state: Record, velocity: complex, turn_rate: float, dt: float) -> None:
     """Carry the pose by the mice alone on by `dt` (s)."""
-    doubt, turn = state.doubt, turn_rate * dt
-    doubt.position += scaled(dt, turned(turned(unit(doubt.heading), turned_mean(turn)), velocity))
-    doubt.heading += turn
+    dispute, turn = state.dispute, turn_rate * dt
+    dispute.position += scaled(dt, turned(turned(unit(dispute.heading), turned_mean(turn)), velocity))
+    dispute.heading += turn
 
 
 @inner
 def _add_step(state: Record, m: Record, mice: Records, turn_rate: float, motion: int) -> None:
     """Add a step to the current block, and a whole block to the sums since the last agreement."""
-    doubt = state.doubt
-    doubt.block_s += m.step
-    doubt.block_gyro += (m.mean_rate - state.at.bias) * m.step
-    doubt.block_mice += turn_rate * m.step
+    dispute = state.dispute
+    dispute.block_s += m.step
+    dispute.block_gyro += (m.mean_rate - state.at.bias) * m.step
+    dispute.block_mice += turn_rate * m.step
     if motion:
-        doubt.block_way += m.fit.real * m.step
-        doubt.block_moved_s += m.step
+        dispute.block_way += m.fit.real * m.step
+        dispute.block_moved_s += m.step
     variance = m.step * m.step * m.fit_turn_variance
     rounding = variance * _rounding_share(m, mice) if motion else 0.0
-    if rounding > doubt.block_rounding:
-        doubt.block_rounding = rounding
-    doubt.block_variance += m.step * m.step * state.gyro_variance / max(m.rates, 1)
+    if rounding > dispute.block_rounding:
+        dispute.block_rounding = rounding
+    dispute.block_variance += m.step * m.step * state.gyro_variance / max(m.rates, 1)
     if motion:
-        doubt.block_variance += variance - rounding
-    if doubt.block_s >= _BLOCK_S - 1e-9:
+        dispute.block_variance += variance - rounding
+    if dispute.block_s >= _BLOCK_S - 1e-9:
         _finish_block(state, m)
-        doubt.block_s = doubt.block_gyro = doubt.block_mice = doubt.block_way = doubt.block_variance = 0.0
-        doubt.block_rounding = doubt.block_moved_s = 0.0
+        dispute.block_s = dispute.block_gyro = dispute.block_mice = dispute.block_way = dispute.block_variance = 0.0
+        dispute.block_rounding = dispute.block_moved_s = 0.0
 
 
 @inner
 def _finish_block(state: Record, m: Record) -> None:
-    doubt, span = state.doubt, state.doubt.block_s
-    off, share = doubt.block_gyro - doubt.block_mice, _SHARE * doubt.block_mice
-    variance = doubt.block_variance + doubt.block_rounding + share * share
+    dispute, span = state.dispute, state.dispute.block_s
+    off, share = dispute.block_gyro - dispute.block_mice, _SHARE * dispute.block_mice
+    variance = dispute.block_variance + dispute.block_rounding + share * share
     _add_block(state, off, variance, span)
-    total = variance + _variance_of_calibration(state) * (span / doubt.span) ** 2
+    total = variance + _variance_of_calibration(state) * (span / dispute.span) ** 2
     total += state.covariance[BIAS, BIAS] * span * span
     z = off / math.sqrt(total)
-    doubt.up = min(max(0.0, doubt.up + z - _SUM_DRIFT), _SUM_MOST)
-    doubt.down = min(max(0.0, doubt.down - z - _SUM_DRIFT), _SUM_MOST)
-    if _is_over(state, z, math.sqrt(total)) or (doubt.up == 0.0 and doubt.down == 0.0):
+    dispute.up = min(max(0.0, dispute.up + z - _SUM_DRIFT), _SUM_MOST)
+    dispute.down = min(max(0.0, dispute.down - z - _SUM_DRIFT), _SUM_MOST)
+    if _is_over(state, z, math.sqrt(total)) or (dispute.up == 0.0 and dispute.down == 0.0):
         agree(state)
-    elif max(doubt.up, doubt.down) > _SUM_LIMIT:
+    elif max(dispute.up, dispute.down) > _SUM_LIMIT:
         _decide(state, m)
 
 
 @inner
 def _is_over(state: Record, z: float, std: float) -> bool:
     """Whether moving mice have agreed for some blocks in which a jump that explains the headings would have shown."""
-    doubt = state.doubt
-    turned_by, span = state.at.heading - doubt.heading, doubt.block_s
-    would_show = abs(turned_by) * span > _SHOWS_Z * std * doubt.age and doubt.block_moved_s > 0.5 * span
-    doubt.calm = doubt.calm + 1 if would_show and abs(z) < _CALM_Z else 0
-    return bool(doubt.calm >= _CALM_BLOCKS)
+    dispute = state.dispute
+    turned_by, span = state.at.heading - dispute.heading, dispute.block_s
+    would_show = abs(turned_by) * span > _SHOWS_Z * std * dispute.age and dispute.block_moved_s > 0.5 * span
+    dispute.calm = dispute.calm + 1 if would_show and abs(z) < _CALM_Z else 0
+    return bool(dispute.calm >= _CALM_BLOCKS)
 
 
 @inner
 def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     """Add the terms of both fits: off = J span (a jump), off = c turn + e way (errors of the mice)."""
-    doubt, turn = state.doubt, state.doubt.block_gyro
-    doubt.age += span
-    doubt.span += span
-    doubt.blocks += 1
-    if doubt.blocks == 1 or doubt.block_moved_s < 0.5 * span:  # a change within a block, or a lift, fits neither
+    dispute, turn = state.dispute, state.dispute.block_gyro
+    dispute.age += span
+    dispute.span += span
+    dispute.blocks += 1
+    if dispute.blocks == 1 or dispute.block_moved_s < 0.5 * span:  # a change within a block, or a lift, fits neither
         return
     weight = 1.0 / variance
-    doubt.jump_square += weight * span * span
-    doubt.jump_product += weight * span * off
-    doubt.jump_cost += weight * off * off
-    way = doubt.block_way
-    doubt.turn_square += weight * turn * turn
-    doubt.turn_way += weight * turn * way
-    doubt.way_square += weight * way * way
-    doubt.turn_off += weight * turn * off
-    doubt.way_off += weight * way * off
-    doubt.off_square += weight * off * off
+    dispute.jump_square += weight * span * span
+    dispute.jump_product += weight * span * off
+    dispute.jump_cost += weight * off * off
+    way = dispute.block_way
+    dispute.turn_square += weight * turn * turn
+    dispute.turn_way += weight * turn * way
+    dispute.way_square += weight * way * way
+    dispute.turn_off += weight * turn * off
+    dispute.way_off += weight * way * off
+    dispute.off_square += weight * off * off
 
 
 @inner
-def is_doubtful(state: Record) -> bool:
+def is_undecided(state: Record) -> bool:
     """Whether gyro and mice differ, and neither hypothesis has been accepted: nothing is calibrated meanwhile."""
-    return bool(max(state.doubt.up, state.doubt.down) > _SUM_CALIBRATED)
+    return bool(max(state.dispute.up, state.dispute.down) > _SUM_CALIBRATED)
 
 
 @inner
 def _decide(state: Record, m: Record) -> None:
     """Accept the hypothesis that fits decisively better; keep both while none does."""
-    doubt = state.doubt
-    if doubt.blocks < _FEWEST_BLOCKS or doubt.jump_square == 0.0:
+    dispute = state.dispute
+    if dispute.blocks < _FEWEST_BLOCKS or dispute.jump_square == 0.0:
         return
-    jump = doubt.jump_product / doubt.jump_square
-    by_jump = doubt.jump_cost - jump * doubt.jump_product
-    by_mice = _cost_of_mice(doubt)
-    variance = 1.0 / doubt.jump_square + _variance_of_calibration(state) / (doubt.span * doubt.span)
-    is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * doubt.blocks
+    jump = dispute.jump_product / dispute.jump_square
+    by_jump = dispute.jump_cost - jump * dispute.jump_product
+    by_mice = _cost_of_mice(dispute)
+    variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
+    is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
     if is_jump and abs(jump) < _MOST_RAD_S and jump * jump > _JUMP_Z**2 * (variance + state.covariance[BIAS, BIAS]):
         _accept_jump(state, m, jump, variance)
     elif by_jump - by_mice > _BETTER or (
-        doubt.blocks > _PATIENCE_BLOCKS and min(by_jump, by_mice) > _MOST_CHI2 * doubt.blocks
+        dispute.blocks > _PATIENCE_BLOCKS and min(by_jump, by_mice) > _MOST_CHI2 * dispute.blocks
     ):
-        lost = doubt.turn_off / (doubt.turn_square + 1.0 / _LOST_STD**2)
+        lost = dispute.turn_off / (dispute.turn_square + 1.0 / _LOST_STD**2)
         _widen_way(state, min(abs(lost), 1.0))
         agree(state)
 
 
 @inner
-def _cost_of_mice(doubt: Record) -> float:
+def _cost_of_mice(dispute: Record) -> float:
     """χ² of the best fit of off = c turn + e way."""
-    a, b, d = doubt.turn_square + 1.0 / _LOST_STD**2, doubt.turn_way, doubt.way_square + 1.0 / _VEERING_STD**2
-    x, y = doubt.turn_off, doubt.way_off
-    cost: float = doubt.off_square - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    a, b, d = dispute.turn_square + 1.0 / _LOST_STD**2, dispute.turn_way, dispute.way_square + 1.0 / _VEERING_STD**2
+    x, y = dispute.turn_off, dispute.way_off
+    cost: float = dispute.off_square - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
     return cost
 
 
 @inner
 def _widen_way(state: Record, lost: float) -> None:
-    """The mice have lost a share of the way since the doubt began."""
-    way = complex(state.at.x, state.at.y) - state.doubt.start
+    """The mice have lost a share of the way since the dispute began."""
+    way = complex(state.at.x, state.at.y) - state.dispute.start
     state.covariance[X, X] += (lost * way.real) ** 2
     state.covariance[Y, Y] += (lost * way.imag) ** 2
     state.covariance[X, Y] += lost * lost * way.real * way.imag
@@ -269,49 +269,49 @@ def _widen_way(state: Record, lost: float) -> None:
 
 @inner
 def agree(state: Record) -> None:
-    """End the doubt: both poses are the same again."""
-    doubt = state.doubt
-    doubt.position, doubt.heading = complex(state.at.x, state.at.y), state.at.heading
-    doubt.start = doubt.position
-    doubt.up = doubt.down = doubt.age = 0.0
-    doubt.calm = 0
-    _forget(doubt)
+    """End the dispute: both poses are the same again."""
+    dispute = state.dispute
+    dispute.position, dispute.heading = complex(state.at.x, state.at.y), state.at.heading
+    dispute.start = dispute.position
+    dispute.up = dispute.down = dispute.age = 0.0
+    dispute.calm = 0
+    _forget(dispute)
 
 
 @inner
-def _forget(doubt: Record) -> None:
+def _forget(dispute: Record) -> None:
     """Forget the blocks so far."""
-    doubt.span = 0.0
-    doubt.jump_square = doubt.jump_product = doubt.jump_cost = 0.0
-    doubt.turn_square = doubt.turn_way = doubt.way_square = 0.0
-    doubt.turn_off = doubt.way_off = doubt.off_square = 0.0
-    doubt.blocks = 0
-    for i in range(len(doubt.by_scale)):
-        doubt.by_scale[i] = doubt.by_angle[i] = 0.0
+    dispute.span = 0.0
+    dispute.jump_square = dispute.jump_product = dispute.jump_cost = 0.0
+    dispute.turn_square = dispute.turn_way = dispute.way_square = 0.0
+    dispute.turn_off = dispute.way_off = dispute.off_square = 0.0
+    dispute.blocks = 0
+    for i in range(len(dispute.by_scale)):
+        dispute.by_scale[i] = dispute.by_angle[i] = 0.0
 
 
 @inner
 def explains(state: Record, jump: float) -> bool:
-    """Whether a bias that is wrong by `jump` (rad/s) since the doubt began explains the headings' difference."""
-    turned_by, expected = state.at.heading - state.doubt.heading, jump * state.doubt.age
-    return is_doubtful(state) and abs(turned_by - expected) < 0.5 * abs(expected)
+    """Whether a bias that is wrong by `jump` (rad/s) since the dispute began explains the headings' difference."""
+    turned_by, expected = state.at.heading - state.dispute.heading, jump * state.dispute.age
+    return is_undecided(state) and abs(turned_by - expected) < 0.5 * abs(expected)
 
 
 @inner
 def take_other_pose(state: Record) -> None:
     """Replace the pose by that of the mice alone."""
-    doubt, at, p = state.doubt, state.at, state.covariance
-    back2 = square(doubt.position - complex(at.x, at.y))
+    dispute, at, p = state.dispute, state.at, state.covariance
+    back2 = square(dispute.position - complex(at.x, at.y))
     p[X, X] += _REPAIR_SHARE**2 * back2
     p[Y, Y] += _REPAIR_SHARE**2 * back2
-    at.x, at.y, at.heading = doubt.position.real, doubt.position.imag, doubt.heading
+    at.x, at.y, at.heading = dispute.position.real, dispute.position.imag, dispute.heading
     agree(state)
 
 
 @inner
 def _accept_jump(state: Record, m: Record, jump: float, variance: float) -> None:
-    """The bias is another one since the doubt began: take the pose by the mice, and their velocity."""
-    p, span = state.covariance, state.doubt.span
+    """The bias is another one since the dispute began: take the pose by the mice, and their velocity."""
+    p, span = state.covariance, state.dispute.span
     p[HEADING, HEADING] += variance * span * span + (jump * _BLOCK_S) ** 2
     take_other_pose(state)
     state.at.bias += jump

@@ -12,7 +12,7 @@ from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
-from linkpose.filters.planar.gyro import agree, is_doubtful, watch_gyro
+from linkpose.filters.planar.gyro import agree, is_undecided, watch_gyro
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
@@ -122,7 +122,7 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     _add_to_turn(state, turn, m.turn_rate, m.step)
     by_scales = _variance_by_scales(state, m, mice)
     state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
-    if is_doubtful(state):
+    if is_undecided(state):
         return
     _find_misplaced(state, m, mice)
     if state.turn_square < _FLOOR_TURN:
@@ -372,7 +372,7 @@ def _correct(
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
-    learns = not (is_doubtful(state) or state.is_off or m.is_saturated)
+    learns = not (is_undecided(state) or state.is_off or m.is_saturated)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
     if not update(state, limit if is_patient else math.inf, limit if learns else 0.0):
         return False
@@ -513,10 +513,10 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     if not state.at_rest and math.isfinite(m.interval):
         lag += 0.5 * m.interval
     by_scale, by_angle = _common_errors(state, m, mice)
-    other = state.doubt.position - complex(at.x, at.y)
+    other = state.dispute.position - complex(at.x, at.y)
     out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2 + other.real**2))
     out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2))
-    out.heading_std = _std(state, HEADING, since, state.doubt.heading - at.heading)
+    out.heading_std = _std(state, HEADING, since, state.dispute.heading - at.heading)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
 

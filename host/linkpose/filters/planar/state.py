@@ -47,7 +47,7 @@ _SEEN = np.dtype([("velocity", "c16"), ("variance", "f8")])  # by a mouse, in b 
 _REST_BLOCK = np.dtype([("mean", "f8"), ("count", "i8"), ("squares", "f8")])  # of the gyro's rate (rad/s)
 
 # Gyro and mice that turn by different amounts: sums since the last agreement, see `gyro`.
-_DOUBT = np.dtype(
+_DISPUTE = np.dtype(
     [
         ("start", "c16"),  # position then, in n (m)
         ("position", "c16"),  # by the mice alone since then, in n (m)
@@ -113,7 +113,7 @@ _FIELDS = [
     ("off_of_turn", "f8"),  # share by which the mice turned more than the gyro in the last turn
     ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("off_of_turn_before", "f8"),  # and in the one before
-    ("doubt", _DOUBT),
+    ("dispute", _DISPUTE),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
     ("jump_time", "f8"),  # and when it was found (s)
