@@ -278,7 +278,8 @@ def test_filters_that_share_parts_run_in_one_process_in_any_order(checks, tmp_pa
 
 
 def test_machine_code_has_no_symbol_for_what_it_contains_of_other_functions(monkeypatch):
-    monkeypatch.setattr(compiling, "_the_folder", lambda: None)
+    for place in ("_the_cache", "_the_installed"):
+        monkeypatch.setattr(compiling, place, lambda: None)
     too_long_to_be_copied = "    x = math.sin(x) if x > 0.5 else math.exp(x) / math.sqrt(x * x + 1.0)\n" * 40
     functions: dict[str, Any] = {"math": math, "__name__": __name__}
     exec(f"def part(x):\n{too_long_to_be_copied}    return x\n", functions)

@@ -519,10 +519,11 @@ def test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file(tmp_p
     (tmp_path / "r-2.csv").write_text("taken\n")
     with Session("sim://link?speed=0", said.append) as session, Recorder(session, out, Rig(), plain=plain) as recorder:
         for placements in session.stream(2):
-            if not before and session.timeline.samples - len(placements) > 10:
-                before = session.timeline.samples - len(placements)
-                change(out)
-            recorder.convert(placements)
+            for at, placement in enumerate(placements):  # a list may hold all of them
+                if not before and session.timeline.samples - len(placements) + at > 10:
+                    before = session.timeline.samples - len(placements) + at
+                    change(out)
+                recorder.convert([placement])
         recorder.close("duration")
     assert said == [
         f"cannot write {out}: {reason} while it was being written; the recording goes on in {recorder.path}"

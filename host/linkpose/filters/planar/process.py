@@ -372,9 +372,9 @@ def _correct(
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
-    learns = not (is_undecided(state) or state.is_off or m.is_saturated)
+    is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, limit if learns else 0.0):
+    if not update(state, limit if is_patient else math.inf, limit if is_calibrating else 0.0):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
