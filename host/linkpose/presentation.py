@@ -121,8 +121,11 @@ def working_sensors(health: Health) -> list[str]:
 
 
 def signed_angle(value_deg: float, decimals: int = 1) -> str:
-    """An angle with its sign: +13.1°."""
-    return minus(f"{value_deg:+.{decimals}f}°") if math.isfinite(value_deg) else UNKNOWN
+    """An angle with its sign: +13.1°; one that rounds to zero has none: 0.0°."""
+    if not math.isfinite(value_deg):
+        return UNKNOWN
+    number = f"{value_deg:+.{decimals}f}"
+    return (minus(number) if float(number) else number[1:]) + "°"
 
 
 def angle_with_std(value_deg: float, std_deg: float) -> str:

@@ -172,7 +172,7 @@ def test_filters_that_become_ready_late_give_the_same_estimates() -> None:
     assert np.array_equal(np.concatenate(rows), expected, equal_nan=True)
     extremes = Extremes(whole.columns)
     extremes.add(expected)
-    assert extremes.summary()["tilt"][1] == expected[:, whole.columns.index("tilt_height_m")].max()
+    assert extremes.summary()["tilt", quantities.HEIGHT][1] == expected[:, whole.columns.index("tilt_height_m")].max()
 
 
 def data_rows(path: Path) -> list[str]:
@@ -268,7 +268,8 @@ def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> Non
 
 
 def test_the_final_table_fits() -> None:
-    summary = {"joint-inertial": (1.2, 1.65, 0.001), "baro": (0.9, 2.0, 0.3)}
+    height = quantities.HEIGHT
+    summary = {("joint-inertial", height): (1.2, 1.65, 0.001), ("baro", height): (0.9, 2.0, 0.3)}
     assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
     assert final_table({}, 80) == []
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,7 +118,8 @@ def command(
     """Run the filters, live from the board or over RECORDING (a .csv or a raw .bin).
 
     Without --filter, every filter that the sensors and the rig support runs; -v lists the others with the reason.
-    Without -o, the estimates go to the standard output, unless a live view on the terminal shows them.
+    Without -o, the estimates go to the standard output. On a terminal, a live view or a table of their lowest and
+    highest values takes their place.
 
     Keys of the live view: m marks an instant (the closing line lists it under "marks"), f shows the next filter, q ends
     the run as Ctrl-C does.
@@ -154,7 +157,9 @@ def command(
 
 def _replay(path: Path, request: Request, console: Console) -> None:
     """Estimates over a recording, block by block."""
+    from linkpose.cli.screen import final_table
     from linkpose.estimation import Estimator, with_chain_joint
+    from linkpose.extremes import Extremes
     from linkpose.recording.ahead import ahead
     from linkpose.recording.reader import RecordingFile
 
@@ -175,15 +180,22 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "mag": request.mag, "rig": rig.as_dict()}
     rows = 0
+    extremes = Extremes(estimator.columns)
     with Sink(estimator, request, head) as sink:
         blocks = iter([recording.load()]) if request.smooth else recording.blocks()
         for estimates in ahead(map(estimator.process, blocks)):
             sink.write(estimates)
+            extremes.add(estimates)
             rows += len(estimates)
             share = rows / recording.survey.rows
             console.progress(lambda share=share: f"estimating {path} {share:.0%}")  # type: ignore[misc]
         sink.close({"rows": rows, **estimator.outcome})
+    if not sink.gives_rows:
+        console.clear()
+        click.echo("\n".join(final_table(extremes.summary(), shutil.get_terminal_size().columns)))
     report_findings(estimator, console)
+    if not sink.gives_rows:
+        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.ESTIMATES)
     if request.output:
         console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
         options.show_next(console.is_quiet, "plot", request.output)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from linkpose.cli import options
-from linkpose.errors import printable
 
 if TYPE_CHECKING:
     from linkpose.evaluation.scores import Evaluation
@@ -60,9 +60,8 @@ def command(
         estimate, reference, up, from_s, to_s, lambda share: console.progress(lambda: f"comparing {share:.0%}")
     )
     console.clear()
-    if not quiet:
-        for remark in found.remarks:
-            click.echo(printable(remark), err=True)
+    for remark in found.remarks:
+        console.report(remark)
     if json_lines:
         for score in found.scores:
             click.echo(json.dumps(score.as_dict()))
@@ -78,7 +77,7 @@ def _show(found: Evaluation, quiet: bool) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from linkpose.cli.rendering import show_table
+    from linkpose.cli.rendering import show_table, wrapped
     from linkpose.presentation import same_digits
     from linkpose.quantities import unit_text, words
 
@@ -103,11 +102,14 @@ def _show(found: Evaluation, quiet: bool) -> None:
         return
     for score in found.scores:
         for line in _sentences(score):
-            click.echo(line)
+            click.echo(wrapped(line, sys.stdout))
     if found.scores[0].time_offset_s:
         click.echo(
-            f"The clocks differ: {found.scores[0].time_offset_s:+.4f} s were added to the estimate's to get the "
-            "reference's."
+            wrapped(
+                f"The clocks differ: {found.scores[0].time_offset_s:+.4f} s were added to the estimate's to get the "
+                "reference's.",
+                sys.stdout,
+            )
         )
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import json
+import shutil
 import signal
 import sys
 import time
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import click
 
+from linkpose.cli.rendering import wrapped
 from linkpose.errors import NamedTwice, printable
 from linkpose.presentation import counted
 
@@ -36,7 +37,10 @@ class Console:
         self.shows_progress = sys.stderr.isatty() and not quiet
         self._width = 0
         self._shown_at = 0.0
-        self._print: Callable[[str], object] = functools.partial(click.echo, err=True)
+        self._print: Callable[[str], object] = lambda text: click.echo(wrapped(text, sys.stderr), err=True)
+        context = click.get_current_context(silent=True)
+        if context is not None:  # the end of the command and its error start on a line of their own
+            context.call_on_close(self.clear)
 
     def report(self, text: str) -> None:
         """Prints a line."""
@@ -62,7 +66,7 @@ class Console:
         now = time.perf_counter()
         if self.shows_progress and now - self._shown_at >= PROGRESS_INTERVAL_S:
             self._shown_at = now
-            text = make_text()
+            text = make_text()[: shutil.get_terminal_size().columns - 1]  # \r does not undo a wrapped line
             sys.stderr.write("\r" + text.ljust(self._width))
             sys.stderr.flush()
             self._width = len(text)
@@ -82,6 +86,7 @@ class Console:
         """Removes the progress line from the screen."""
         if self._width:
             sys.stderr.write("\r" + " " * self._width + "\r")
+            sys.stderr.flush()  # before anything that stdout shows on the same terminal
             self._width = 0
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import shlex
@@ -274,13 +275,24 @@ def quiet(function: Function) -> Function:
     return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
 
 
+ESTIMATES = "estimate.csv"  # the file of estimates that `show_next` proposes, numbered where it exists
+
+
 def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
     """The command to type next, and the one after it, on stderr; nothing where a file is the standard output."""
     if quiet or "-" in map(str, words):
         return
     for when, command in (("next", words), ("then", then)):
         if command:
-            click.echo(f"{when}: {typed(command)}", err=True)
+            free = [_free_name(str(word)) if word == ESTIMATES else word for word in command]
+            click.echo(f"{when}: {typed(free)}", err=True)
+
+
+def _free_name(name: str) -> str:
+    """This name of a file, with the first number that makes it new where the file exists: estimate-2.csv."""
+    path = Path(name)
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+    return str(next(free for free in itertools.chain([path], numbered) if not free.exists()))
 
 
 def typed(words: Iterable[object]) -> str:

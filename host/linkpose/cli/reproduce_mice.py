@@ -11,6 +11,7 @@ import click
 
 from linkpose.cli import options
 from linkpose.cli.live import Console
+from linkpose.presentation import counted
 
 if TYPE_CHECKING:
     from linkpose.experiments.mice import Redundancy
@@ -47,7 +48,9 @@ def _show(rows: list[Redundancy], seeds: int) -> None:
 
     from linkpose.cli.rendering import show_table
 
-    table = Table("", "mice", title=f"Noise of the estimated velocity compared with one mouse, {seeds} seeds")
+    table = Table(
+        "", "mice", title=f"Noise of the estimated velocity compared with one mouse, {counted(seeds, 'seed')}"
+    )
     for name in ("one mouse σ", "together σ", "ratio", "theory"):
         table.add_column(name, justify="right")
     for row in rows:

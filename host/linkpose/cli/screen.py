@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from linkpose import quantities
@@ -32,6 +32,8 @@ from linkpose.quantities import Quantity
 
 if TYPE_CHECKING:
     from rich.text import Text
+
+    from linkpose.extremes import Summary
 
 CURVE_S = 20.0  # of the past that the curve shows
 CURVE_ROWS, MAP_ROWS = 5, 8
@@ -249,15 +251,21 @@ def _curve_sections(
     return [(priority, [(line, "") for line in lines]), (2, [(axis, "dim")] if axis else [])]
 
 
-def final_table(summary: Mapping[str, tuple[float, float, float]], width: int) -> list[str]:
-    """The lines that stay after the end: filter -> (lowest, highest height, RMS of σ), m.
+def final_table(summary: Summary, width: int) -> list[str]:
+    """The lines that stay after the end: the extremes and the RMS of σ of each quantity.
 
-    The last column is left out where they would be wider than `width` characters.
+    The last column is left out where the lines would be wider than `width` characters.
     """
     rows = [("filter", "lowest", "highest", "rms σ")]
-    for name, (low, high, std) in summary.items():
-        rows.append((name, aligned_length(low, std), aligned_length(high, std), std_text(std)))
-    lines = [f"  {name:<16} {low:>10} {high:>10}" for name, low, high, _ in rows]
+    for (name, quantity), (low, high, std) in summary.items():
+        title = name if quantity == quantities.HEIGHT else f"{name} {quantity.name.replace('_', ' ')}"
+        if quantity.is_angle:
+            shown = signed_angle(low), signed_angle(high), signed_angle(std).removeprefix("+")
+        else:
+            shown = aligned_length(low, std), aligned_length(high, std), std_text(std)
+        rows.append((title, *shown))
+    first = max(16, *(len(row[0]) for row in rows))
+    lines = [f"  {title:<{first}} {low:>10} {high:>10}" for title, low, high, _ in rows]
     if len(lines[0]) + 10 <= width:
         lines = [f"{line} {row[3]:>9}" for line, row in zip(lines, rows, strict=True)]
     return lines if summary else []

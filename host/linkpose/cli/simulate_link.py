@@ -63,5 +63,8 @@ def command(
         noise_of=noise_of,
     )  # fmt: skip
     write_link(run, output, truth, force)
-    calibrate, estimate = ("calibrate", "imu", output, "--rig", "rig.toml"), ("estimate", output, "-o", "estimate.csv")
+    calibrate, estimate = (
+        ("calibrate", "imu", output, "--rig", "rig.toml"),
+        ("estimate", output, "-o", options.ESTIMATES),
+    )
     options.show_next(quiet, *(calibrate if rests else estimate))

@@ -46,6 +46,11 @@ class Sink:
                 _print("".join(json.dumps(row) + "\n" for row in rows))
 
     @property
+    def gives_rows(self) -> bool:
+        """Whether a file or the standard output gets the estimates; without -o and --json, a terminal gets none."""
+        return self._prints or self._json or self._file is not None
+
+    @property
     def dropped(self) -> list[str]:
         """What live outputs did not accept, in sentences."""
         return [

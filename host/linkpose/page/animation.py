@@ -12,6 +12,7 @@ from linkpose.errors import CannotWrite
 from linkpose.localization.surroundings import Surroundings
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
+from linkpose.page.origin import titled
 from linkpose.page.page import LOOPBACK, free_port, serve
 from linkpose.page.tables import rig_of, rows_of
 from linkpose.recording.table import Table
@@ -71,6 +72,6 @@ def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Su
             if name is not None:
                 drawing.draw(newest, row, name, replay)
             recorded.insert_sleep((end - start) / frames)
-        return recorded.as_html()
+        return titled(recorded.as_html())
     finally:
         server.stop()

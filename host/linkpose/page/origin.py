@@ -39,6 +39,20 @@ def _is_address(name: str) -> bool:
     return True
 
 
+def titled(page: str) -> str:
+    """viser's page with linkpose's title; viser has no parameter for it."""
+    return page.replace("<title>Viser</title>", "<title>linkpose</title>", 1)
+
+
+def _with_title(answer: Any) -> Any:
+    """An answer of viser's server; the page among them gets its title."""
+    if answer is not None and answer.headers.get("Content-Type", "").startswith("text/html"):
+        answer.body = titled(answer.body.decode()).encode()
+        del answer.headers["Content-Length"]
+        answer.headers["Content-Length"] = str(len(answer.body))
+    return answer
+
+
 @contextlib.contextmanager
 def own_requests_only(host: str) -> Iterator[None]:
     """A server that viser starts within this context answers only requests that `is_own` allows; others get 403."""
@@ -50,8 +64,9 @@ def own_requests_only(host: str) -> Iterator[None]:
         async def process(connection: Any, request: Any) -> Any:
             if not is_own(request.headers, host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "This page is not open to other pages.\n")
+            del request.headers["Accept-Encoding"]  # `_with_title` needs the page's text
             answer = process_request(connection, request) if process_request is not None else None
-            return await answer if inspect.isawaitable(answer) else answer
+            return _with_title(await answer if inspect.isawaitable(answer) else answer)
 
         return serve(*args, process_request=process, **options)
 

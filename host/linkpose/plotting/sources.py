@@ -47,7 +47,7 @@ class Sources:
     tracks: list[DrawnTrack]  # of filters, best first
     reference: DrawnTrack | None  # on the clock of the first estimate
     scores: dict[tuple[int, str], Score]  # by file and filter; empty without a reference
-    hidden: list[str]  # filters that are not drawn
+    hidden: list[str]  # filters that are not drawn although the user chose none
     remarks: list[str]
 
     @property
@@ -96,7 +96,7 @@ def gather(tables: Sequence[Table], wanted: Sequence[str]) -> Sources:
     scores, offset_s, remarks = _scores(estimates, references[0]) if references else ({}, 0.0, [])
     remarks += [f"{table.path} has {table.whole.rows} rows: {_THINNED}" for table in tables if table.whole]
     reference = _reference(references[0], offset_s) if references else None
-    hidden = [name for name in dict.fromkeys(found) if name not in shown]
+    hidden = [] if wanted else [name for name in dict.fromkeys(found) if name not in shown]
     return Sources(tracks, reference, scores, hidden, remarks)
 
 

@@ -170,6 +170,8 @@ def split_cells(path: Path, data: bytes, before: Sequence[str] = (), first_line:
     table = [(i, line) for i, line in numbered if not _is_comment(line)]
     if not table:
         raise FileFormatError(path, f"{path} ends before its first row; it holds no data")
+    if path.suffix.lower() in _SETTINGS or _TOML_TABLE.fullmatch(table[0][1].strip()):
+        raise FileFormatError(path, f"{path} holds settings, no table; name a rig file with --rig, a map with --map")
     separator = _separator(table[0][1])
     comments = [_comment(i, line, separator) for i, line in numbered if _is_comment(line)]
     numbers, rows = _parse(path, table, separator)
@@ -192,6 +194,10 @@ def last_comment(lines: Sequence[str], before: Sequence[str]) -> dict[str, Any] 
     """The JSON object in the last of these comment lines; the names are in the last line of `before`."""
     comments = [line for line in lines if _is_comment(line)]
     return _comment(0, comments[-1], _separator(before[-1])).as_object() if comments else None
+
+
+_SETTINGS = (".toml", ".yaml", ".yml")
+_TOML_TABLE = re.compile(r"\[\[?[\w.-]+\]?\](\s*#.*)?")
 
 
 def _is_comment(line: str) -> bool:
