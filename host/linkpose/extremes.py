@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 BLOCKS = 250  # of estimates whose extremes are found at once
 
 
+_OF_A_ROBOT = (quantities.X, quantities.Y)  # a link's filter has them too, where its yaw is known to a constant alone
 # What the end of a run lists. A heading turns on past every bound, so its lowest and highest value say nothing.
 _LISTED = (
     quantities.HEIGHT,
@@ -23,8 +24,7 @@ _LISTED = (
     *quantities.BALL_ANGLES,
     quantities.HEIGHT1,
     quantities.HEIGHT2,
-    quantities.X,
-    quantities.Y,
+    *_OF_A_ROBOT,
 )
 
 # (filter, quantity) -> (lowest, highest, RMS of σ), in the unit of the quantity's column.
@@ -40,7 +40,7 @@ class Extremes:
             (name, quantity): (at[found[quantity]], at.get(quantities.std_column(found[quantity]) or "", -1))
             for name, found in quantities.by_filter(columns).items()
             for quantity in _LISTED
-            if quantity in found
+            if quantity in found and (quantity not in _OF_A_ROBOT or quantities.HEADING in found)
         }
         self._low = dict.fromkeys(self._of, math.inf)
         self._high = dict.fromkeys(self._of, -math.inf)

@@ -258,6 +258,7 @@ def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Pa
     estimate.write_text("time_s,tilt_height_m,mice_x_m,mice_y_m,mice_heading_rad\n" + "".join(rows))
     assert linkpose("plot", estimate, "-o", tmp_path / "e.html").status == 0
     text = (tmp_path / "e.html").read_text()
+    assert "<title>linkpose</title>" in text
     payload = base64.b64decode(text.split('__VISER_EMBED_DATA__="')[1].split('"')[0])
     inner = zstandard.ZstdDecompressor().decompress(payload[8:], int.from_bytes(payload[:8], "little"))
     recorded = msgspec.msgpack.decode(inner[8 : 8 + int.from_bytes(inner[:8], "little")])
@@ -313,9 +314,13 @@ def test_without_a_browser_nothing_waits_and_old_blocks_are_dropped() -> None:
         assert page.url.startswith("http://127.0.0.1:")
 
 
-def test_no_file_of_the_machine_is_served() -> None:
+def test_no_file_of_the_machine_is_served_and_the_page_has_its_title() -> None:
     with Page(LINK, Rig(), "sim://link") as page:
         host, port = page.url.removeprefix("http://").split(":")
+        connection = http.client.HTTPConnection(host, int(port), timeout=30)
+        connection.request("GET", "/", headers={"Accept-Encoding": "gzip"})
+        assert b"<title>linkpose</title>" in connection.getresponse().read()
+        connection.close()
         for path in ("/../../../../etc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd", "/..%5c..%5cx"):
             connection = http.client.HTTPConnection(host, int(port), timeout=30)
             connection.request("GET", path)

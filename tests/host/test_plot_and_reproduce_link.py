@@ -137,6 +137,7 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     figure, remarks = plotting.plot_tables([read_table(Path(path)) for path in paths])
     path, error, speed, heading, mice = figure.axes
     assert remarks == ["not drawn beside a path: tilt (add --filter tilt)"]
+    assert plotting.plot_tables([read_table(Path(paths[0]))], ["tilt"])[1] == []  # the user chose
     assert (error.get_ylabel(), drawn(error)) == ("position error (m)", ["planar-ekf 0 m rms", "2σ planar-ekf"])
     band = error.collections[0].get_paths()[0].vertices[:, 1]
     assert band.max() == pytest.approx(2 * np.hypot(0.01, 0.02)) and error.get_ylim()[0] == 0.0

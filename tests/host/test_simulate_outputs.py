@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from pathlib import Path
 
 import pytest
 
@@ -55,6 +56,14 @@ def test_what_to_type_next_is_said_unless_quiet(linkpose, tmp_path):
     spaced = linkpose(*typed[:3], tmp_path / "left knee.csv", *typed[4:], "--force").err
     assert shlex.split(spaced.removeprefix("next: "))[2] == str(tmp_path / "left knee.csv")  # a shell reads one word
     assert linkpose(*typed, "--force", "-q") == (0, "", "")
+
+
+def test_the_proposed_file_of_estimates_is_new(linkpose, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("estimate.csv").touch()
+    Path("estimate-2.csv").touch()
+    typed = ("simulate", "link", "-o", "r.csv", "--truth", "t.csv", "--duration", 3)
+    assert linkpose(*typed).err == "next: linkpose estimate r.csv -o estimate-3.csv\n"
 
 
 def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):

@@ -327,3 +327,17 @@ def test_beacons_that_spreadsheets_saved(tmp_path):
     ):
         path.write_text(text, encoding="utf-16" if ";" in text else "utf-8")
         assert read_beacons(path) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("rig.toml", "# my rig\n[joint]\nj2s_m = [1, 2, 3]\n"),
+        ("rig", "[[mouse]]\nx_m = 1\n"),
+        ("m.yaml", "a: 1\nb: 2\n"),
+    ],
+)
+def test_a_file_of_settings_is_no_table(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FileFormatError, match="holds settings, no table"):
+        read_table(tmp_path / name)

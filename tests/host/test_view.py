@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +19,7 @@ from linkpose import quantities
 from linkpose.cli.characters import replacement
 from linkpose.cli.curve import Canvas, curve, path_map, time_axis
 from linkpose.cli.keys import Keys, Marker
+from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
 from linkpose.extremes import Extremes
@@ -272,6 +275,45 @@ def test_the_final_table_fits() -> None:
     summary = {("joint-inertial", height): (1.2, 1.65, 0.001), ("baro", height): (0.9, 2.0, 0.3)}
     assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
     assert final_table({}, 80) == []
+
+
+def test_the_final_table_lists_joint_angles_and_places() -> None:
+    columns = ["time_s", "chain_angle_deg", "chain_angle_std_deg", "mice_x_m", "mice_y_m", "mice_heading_rad"]
+    extremes = Extremes([*columns, "tilt_x_m"])
+    extremes.add(np.array([[0.0, -0.04, 1.0, 1.0, 2.0, 0.0, 5.0], [1.0, 30.0, 1.0, 3.0, 4.0, 0.0, 6.0]]))
+    lines = [line.split() for line in final_table(extremes.summary(), 80)]
+    assert lines[1] == ["chain", "angle", "0.0°", "+30.0°", "1.0°"]
+    assert [line[:2] for line in lines[2:]] == [["mice", "x"], ["mice", "y"]]
+
+
+def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:
+    recording, rows = tmp_path / "r.csv", tmp_path / "rows.csv"
+    linkpose("simulate", "link", "--duration", 3, "-o", recording, "--truth", tmp_path / "t.csv")
+    with Terminal("estimate", recording, "--filter", "tilt", columns=200) as terminal:
+        assert terminal.wait() == 0
+        lines = terminal.text.split("\n")
+    at = next(i for i, line in enumerate(lines) if line.split()[:1] == ["filter"])
+    assert lines[at + 1].split()[0] == "tilt" and lines[at + 2] == "300 rows of tilt"
+    assert lines[at + 3] == f"next: linkpose estimate {recording} --filter tilt -o estimate.csv"
+    assert "100%" not in terminal.text
+    with Terminal("estimate", recording, "--filter", "chain", columns=200) as terminal:
+        assert terminal.wait() == 1
+        assert terminal.text.startswith("linkpose: the filter chain cannot run")
+    with rows.open("wb") as stdout, Terminal("estimate", recording, "--filter", "tilt", stdout=stdout) as terminal:
+        assert terminal.wait() == 0 and "next:" not in terminal.text
+    assert len(data_rows(rows)) == 301
+
+
+class _Tty(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_sentences_break_between_words_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "20")
+    text = "tilt:\n  height: many well-known errors"
+    assert wrapped(text, io.StringIO()) == text
+    assert wrapped(text, _Tty()) == "tilt:\n  height: many\n  well-known errors"
 
 
 def test_the_next_filter_is_shown_with_its_own_curve() -> None:

@@ -192,13 +192,15 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         sink.close({"rows": rows, **estimator.outcome})
     if not sink.gives_rows:
         console.clear()
-        click.echo("\n".join(final_table(extremes.summary(), shutil.get_terminal_size().columns)))
+        for line in final_table(extremes.summary(), shutil.get_terminal_size().columns):
+            click.echo(line)
     report_findings(estimator, console)
-    if not sink.gives_rows:
-        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.ESTIMATES)
-    if request.output:
+    if request.output or not sink.gives_rows:
         console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
+    if request.output:
         options.show_next(console.is_quiet, "plot", request.output)
+    elif not sink.gives_rows:
+        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.ESTIMATES)
 
 
 def _smooth(estimator: Estimator) -> None:
