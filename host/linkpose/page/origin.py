@@ -64,7 +64,7 @@ def own_requests_only(host: str) -> Iterator[None]:
         async def process(connection: Any, request: Any) -> Any:
             if not is_own(request.headers, host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "This page is not open to other pages.\n")
-            del request.headers["Accept-Encoding"]  # `_with_title` needs the page's text
+            request.headers.pop("Accept-Encoding", None)  # `_with_title` needs the page's text
             answer = process_request(connection, request) if process_request is not None else None
             return _with_title(await answer if inspect.isawaitable(answer) else answer)
 
