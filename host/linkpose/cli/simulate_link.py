@@ -63,5 +63,9 @@ def command(
         noise_of=noise_of,
     )  # fmt: skip
     write_link(run, output, truth, force)
-    calibrate, estimate = ("calibrate", "imu", output, "--rig", "rig.toml"), ("estimate", output, "-o", "estimate.csv")
+    held = ("--mag",) if has_mag and level != "datasheet" else ()  # a data sheet's specimen has no calibration
+    calibrate, estimate = (
+        ("calibrate", "imu", output, "--rig", "rig.toml"),
+        ("estimate", output, *held, "-o", "estimate.csv"),
+    )
     options.show_next(quiet, *(calibrate if rests else estimate))
