@@ -257,15 +257,21 @@ class UncalibratedMagnetometer(CannotRun):
 
     def __init__(self) -> None:
         super().__init__(
-            "the magnetometer is not calibrated: the iron of the board itself would turn the heading by tens of degrees"
+            "the magnetometer is not calibrated (the rig has no [mag]): the iron of the board would turn the heading "
+            "by tens of degrees"
         )
 
 
 class NoMagnetometer(CannotRun):
-    """The heading is to be held by a magnetometer, and none gives a value."""
+    """The heading is to be held by a magnetometer, and none gives a value. `simulated` is a simulated board's port."""
 
-    def __init__(self) -> None:
-        super().__init__("no magnetometer gives a value: check its wiring, or leave it out")
+    def __init__(self, simulated: str | None = None) -> None:
+        super().__init__(
+            f"{simulated} simulates no magnetometer"
+            if simulated
+            else "no magnetometer gives a value: check its wiring, or leave it out"
+        )
+        self.simulated = simulated
 
 
 class FilterCannotRun(LinkposeError):

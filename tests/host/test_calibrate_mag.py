@@ -88,8 +88,35 @@ def test_the_calibrated_field_is_in_the_inertial_sensors_axes(tmp_path):
 
 
 def test_a_turn_about_one_axis_is_refused_with_its_cure():
-    with pytest.raises(LinkposeError, match=r"covers \d+ % of all attitudes.*turn the sensor by hand"):
+    with pytest.raises(LinkposeError, match=r"do not determine the hard iron.*turn the sensor by hand"):
         calibrate_mag([recording(tumbled(about=(0.0, 0.0, 1.0)))], Rig())
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("about", [(0.0, 0.0, 0.0), (0.02, 0.0, 0.0), (0.1, 0.1, 0.1)])
+def test_a_sensor_that_hardly_turns_is_refused_without_a_figure_that_is_none(about):
+    """The readings at rest are noise on a small sphere, which the fit would cover completely."""
+    with pytest.raises(LinkposeError, match="too little to calibrate the magnetometer") as refused:
+        calibrate_mag([recording(tumbled(5.0, about=about))], Rig())
+    assert "nan" not in str(refused.value) and "%" not in str(refused.value)
+
+
+def test_spikes_are_left_out_with_their_count(tmp_path):
+    block = tumbled(40.0)
+    spiked = block.mag_uT.copy()
+    spiked[1500], spiked[3000] = [3000.0, -2000.0, 1500.0], [-300.0, 0.0, 0.0]
+    path = save(replace(block, mag_uT=spiked), tmp_path / "mag.csv")
+    done = CliRunner().invoke(mag_command.command, [path, "--rig", str(tmp_path / "rig.toml"), "--json"])
+    found = json.loads(done.stdout)
+    assert found["outliers"] == 2 and found["readings"] == len(block) - 2 and found["is_clean"]
+    assert found["hard_iron_uT"] == pytest.approx(HARD_IRON, abs=0.2)
+    assert "2 readings are left out" in done.stderr
+
+
+def test_hard_iron_stronger_than_the_field_makes_no_outliers():
+    block, magnet = tumbled(40.0), np.array([150.0, 0.0, 0.0])
+    found = calibrate_mag([recording(replace(block, mag_uT=block.mag_uT + magnet))], Rig())
+    assert found.outliers == 0 and found.hard_iron_uT == pytest.approx(HARD_IRON + magnet, abs=0.2)
 
 
 def test_directions_in_one_plane_of_the_sensor_are_refused():

@@ -47,6 +47,25 @@ def truth(estimate):
     return c["time_s"][3:], place, Rotation.from_euler("xyz", angles, degrees=True)
 
 
+def test_a_filter_without_poses_is_passed_over(tmp_path):
+    """Of a rest of one second, tilt-inertial has no attitude yet; the mice have poses."""
+    names = ["time_s"] + [f"tilt_inertial_{name}" for name in ("height_m", "roll_deg", "pitch_deg")]
+    names += [f"mice_{name}" for name in ("x_m", "y_m", "heading_rad")]
+    path, empty = tmp_path / "est.csv", tmp_path / "empty.csv"
+    for file_path, mice in ((path, ",1,2,0"), (empty, ",,,")):
+        with CsvFile(file_path, "estimate", {}, names, False) as file:
+            for at in range(9):
+                file.write(f"{at / 100},,,{mice}\n")
+            file.close({"rows": 9})
+    remarks = convert(path, tmp_path / "m.tum")
+    assert np.loadtxt(tmp_path / "m.tum")[:, :3] == pytest.approx(np.column_stack([np.arange(9) / 100, [[1, 2]] * 9]))
+    assert any("the one of the filter mice" in remark for remark in remarks)
+    with pytest.raises(LinkposeError, match="no two poses of tilt-inertial"):
+        convert(path, tmp_path / "t.tum", "tilt-inertial")
+    with pytest.raises(LinkposeError, match="no two poses of any filter"):
+        convert(empty, tmp_path / "n.tum")
+
+
 def test_opensim_reads_the_orientations(estimate, truth, tmp_path):
     opensim = importlib.import_module("opensim")
     out = tmp_path / "out.sto"

@@ -54,8 +54,41 @@ def test_the_verdict_says_by_how_much_sigma_is_off(claimed, verdict):
 
 
 def test_a_sigma_that_was_rounded_to_zero_is_that_of_its_last_digit():
-    found = Statistics.of(np.full(100, 1e-6), np.zeros(100), least_std=1e-6)
-    assert found.nees == pytest.approx(1.0) and Statistics.of(np.ones(9), np.zeros(9)).nees is None
+    found = Statistics.of(np.full(100, 3e-6), np.zeros(100), least_std=1e-6)
+    assert found.nees == pytest.approx(9.0) and found.within_2sigma == 0.0
+    assert Statistics.of(np.ones(9), np.zeros(9)).nees is None
+
+
+def test_rows_fixed_by_definition_have_no_part_in_nees():
+    """The yaw of the first row is 0 with σ 0. In other rows, σ of 0 with a real error counts as outside."""
+    error, std = np.append(0.3 * np.sign(NOISE), [0.0, 1e-6, -1e-6]), np.append(np.full(len(T), 0.3), [0.0, 0.0, 1e-7])
+    found = Statistics.of(error, std, least_std=1e-6)
+    assert found.rows == len(T) + 3 and found.nees == pytest.approx(1.0) and found.within_2sigma == 1.0
+    assert Statistics.of(np.zeros(9), np.zeros(9), least_std=1e-6).verdict() is None
+    wrong = Statistics.of(np.append(error, 0.1), np.append(std, 0.0), least_std=1e-6)
+    assert wrong.within_2sigma == pytest.approx(len(T) / (len(T) + 1)) and wrong.nees > 1e6
+
+
+@pytest.mark.parametrize(
+    ("claimed", "start"), [(1.0, "σ is right for most"), (3.0, "σ is 3.0 times too large for most")]
+)
+def test_the_verdict_names_errors_far_outside_of_sigma(claimed, start):
+    std = np.full(len(T), claimed)
+    std[:4] = np.abs(NOISE[:4]) / 500
+    found = Statistics.of(NOISE, std)
+    assert found.nees > 200 and found.within_2sigma > 0.9
+    assert found.verdict().startswith(start) and found.verdict().endswith("are far outside, up to 500σ.")
+
+
+def test_no_more_rows_are_compared_than_are_known():
+    """Stamps in pairs 1 ms apart every 0.1 s: their usual interval does not state how many there are."""
+    time_s = np.sort(np.concatenate([T[::10], T[::10] + 1e-3, T[::10] + 2e-3]))
+    height = motion(time_s)
+    estimate = Table(Path("e.csv"), "estimate", {"time_s": time_s, "joint_height_m": height}, {}, None, 2)
+    at = np.arange(0, 39, 0.1) + 1e-3
+    reference = Table(Path("truth.csv"), "truth", {"time_s": at, "height_m": motion(at)}, {}, None, 2)
+    found = score(estimate, reference)
+    assert 0 < found.rows <= found.known_rows
 
 
 def test_what_is_not_known_yet_is_left_out_and_counted():

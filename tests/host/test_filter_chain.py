@@ -207,6 +207,9 @@ def test_the_smoother_is_better_than_the_filter_and_its_std_holds() -> None:
     assert np.mean(error < 2 * smoothed["chain_rotation_std_deg"]) > 0.9
     turned = smoothed["chain_angle_deg"]
     assert min(np.std(sign * turned - angle) for sign in (1, -1)) < 0.6
+    last = smoothed["chain_angle_std_deg"][-1]  # the filter backwards counts from there, with σ = 0
+    ends = [sign * (turned[-1] - turned[0]) - (angle[-1] - angle[0]) for sign in (1, -1)]
+    assert last < 5 and min(np.abs(ends)) < 3 * last
 
 
 def test_the_angle_of_a_vertical_hinge_does_not_drift_between_its_end_stops() -> None:

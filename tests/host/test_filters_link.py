@@ -212,7 +212,7 @@ def test_baro_without_an_accelerometer_does_not_know_the_height_of_its_start():
     assert (error < 3 * estimate[:, 1]).all()
 
 
-@pytest.mark.parametrize("name", INERTIAL)
+@pytest.mark.parametrize("name", [*INERTIAL, "imu-baro", "baro"])
 def test_what_is_not_known_of_j2s_is_in_the_standard_deviation(name):
     run, block = recorded(1, 0)
     exact, rough = (

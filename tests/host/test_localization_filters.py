@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from linkpose.errors import LinkposeError
 from linkpose.localization import models
+from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
 from linkpose.localization.grid import GridMap, no_map
@@ -449,6 +451,18 @@ def test_a_bias_for_each_beacon_and_the_verdict_on_its_noise():
     small = estimate_track(log, "ekf", replace(settings, ranges=RangeNoise("fixed", 0.01), gate=None), None, beacons)
     assert "times too small" in small.consistency.verdicts()[0].sentence()
     assert {verdict.sensor for verdict in small.consistency.verdicts(each=True)} == {f"range:{b}" for b in beacons}
+
+
+def test_the_figures_of_a_verdict_are_those_it_is_decided_by():
+    """A few outliers raise the mean NIS, not the median: the noise of the other ranges fits."""
+    found = Consistency()
+    for value in np.append(np.random.default_rng(0).chisquare(1, 1000), np.full(20, 150.0)):
+        found.add("range", 1, value)
+    (verdict,) = found.verdicts()
+    assert verdict.sentence() == "range noise fits"
+    assert re.fullmatch(r"median NIS [01]\.\d\d, 1 is consistent; outliers raise the mean to 3\.\d+", verdict.figures())
+    (clean,) = Consistency({"range": found.nis["range"][:1000]}, {"range": 1}).verdicts()
+    assert re.fullmatch(r"median NIS [01]\.\d\d, 1 is consistent", clean.figures())
 
 
 def test_smoothing_lowers_the_error_in_a_silence_of_the_beacons():

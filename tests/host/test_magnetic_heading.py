@@ -144,6 +144,25 @@ def test_what_it_refuses():
         lp.estimate(block, ["tilt"], rig=calibrated, mag=True)
 
 
+def test_an_uncalibrated_magnetometer_gets_one_sentence_with_its_cure(tmp_path: Path, linkpose) -> None:
+    """Whether the recording brings no calibration, or the named rig file replaces the one that it brings."""
+    for errors in ("datasheet", "calibrated"):
+        files = ("-o", tmp_path / f"{errors}.csv", "--truth", tmp_path / f"{errors}-truth.csv")
+        assert linkpose("simulate", "link", "--mag", "--errors", errors, "--duration", 3, *files).status == 0
+    rig = tmp_path / "rig.toml"
+    Rig().with_j2s((-0.09, -0.04, 1.65)).save(rig)
+    brought = linkpose("estimate", tmp_path / "datasheet.csv", "--mag", "-o", tmp_path / "e.csv", "-q")
+    named = linkpose("estimate", tmp_path / "calibrated.csv", "--rig", rig, "--mag", "-o", tmp_path / "e.csv", "-q")
+    assert brought.status == named.status == 1 and brought.err == named.err
+    assert "the rig has no [mag]" in named.err and "linkpose calibrate mag RECORDING --rig rig.toml" in named.err
+
+
+@pytest.mark.parametrize("port", ["sim://link", "sim://mice"])
+def test_a_simulated_board_without_a_magnetometer_names_the_one_that_has_it(port: str, linkpose) -> None:
+    done = linkpose("estimate", "--live", "--port", port, "--mag", "--duration", 1, "-q")
+    assert done.status == 1 and f"{port} simulates no magnetometer; type --port 'sim://link?mag=1'" in done.err
+
+
 def test_the_command(tmp_path: Path, linkpose) -> None:
     recording, estimates = tmp_path / "r.csv", tmp_path / "e.csv"
     typed = ["simulate", "link", "--mag-disturbance", "iron", "--duration", 30, "-o", recording, "--truth"]

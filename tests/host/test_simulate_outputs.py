@@ -53,6 +53,10 @@ def test_a_duration_that_is_no_time_is_wrong_usage(duration, linkpose, tmp_path)
 def test_what_to_type_next_is_said_unless_quiet(linkpose, tmp_path):
     typed = ("simulate", "link", "-o", tmp_path / "r.csv", "--truth", tmp_path / "t.csv", "--duration", 3)
     assert linkpose(*typed).err == f"next: linkpose estimate {tmp_path / 'r.csv'} -o estimate.csv\n"
+    with_mag = linkpose(*typed, "--mag", "--force").err
+    assert with_mag == f"next: linkpose estimate {tmp_path / 'r.csv'} --mag -o estimate.csv\n"
+    uncalibrated = linkpose(*typed, "--mag", "--errors", "datasheet", "--force").err
+    assert "--mag" not in uncalibrated  # estimate --mag would refuse it
     spaced = linkpose(*typed[:3], tmp_path / "left knee.csv", *typed[4:], "--force").err
     assert shlex.split(spaced.removeprefix("next: "))[2] == str(tmp_path / "left knee.csv")  # a shell reads one word
     assert linkpose(*typed, "--force", "-q") == (0, "", "")

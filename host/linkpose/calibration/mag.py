@@ -44,10 +44,19 @@ _LARGEST_STD_UT = 2.0  # of the hard iron
 # directions in one plane makes it 10 and more. Doubled, two planes a few degrees apart pass.
 _MOST_STRETCH = 3.0
 _FEWEST = 100  # readings
+# A reading is left out if its magnitude differs from the median by more than so many median absolute deviations and by
+# more than twice the strongest field of the earth, by which hard iron alone can change it. Doubled, spikes of a field
+# of 300 µT stay, and the algebraic fit fails.
+_OUTLIER_DEVIATIONS = 10.0
+_OUTLIER_UT = 2 * MOST_FIELD_UT
+# Median distance of the readings from their middle. A third of all attitudes makes it 15 µT at 25 µT, noise at rest
+# 0.3 µT. Doubled, weak fields are refused; halved, a swing by a few degrees passes.
+_LEAST_SPREAD_UT = 5.0
 _PASSES, _HUBER_SIGMAS = 30, 2.5
 _STEP_S = 0.1  # between two readings that the rotation joins: at 1 rad/s the field turns by 0.1 rad, 3 µT
 _LONGEST_STEP_S = 0.3
 _ALIGNMENT_PASSES = 6
+_UNDETERMINED = "the attitudes of the recording do not determine the hard iron"
 _LARGEST_ALIGNMENT_STD_RAD = math.radians(3.0)
 _SLOW_M_S2 = 0.5  # ‖force‖ differs from g by less: the force is vertical
 
@@ -65,6 +74,7 @@ class MagCalibration:
     residual_uT: float  # rms of ‖W (s − h)‖ − F
     coverage: float  # share of the sphere
     readings: int
+    outliers: int  # readings left out, their magnitude far from the median
     dip_deg: float | None  # below the horizon; None without a rotation
 
     @property
@@ -89,6 +99,7 @@ class MagCalibration:
             "residual_uT": self.residual_uT,
             "coverage": self.coverage,
             "readings": self.readings,
+            "outliers": self.outliers,
             "dip_deg": self.dip_deg,
             "is_plausible": self.is_plausible,
             "is_clean": self.is_clean,
@@ -101,19 +112,25 @@ def calibrate_mag(recordings: Sequence[Recording], rig: Rig) -> MagCalibration:
     Raises LinkposeError where there is no magnetometer, or where its attitudes do not determine the ellipsoid.
     """
     names = ", ".join(str(r.path) for r in recordings)
-    blocks = [r.measurements for r in recordings if r.measurements.has_mag]
-    readings = [block.mag_uT[_usable(block)] for block in blocks]
-    if not readings:
+    measured = [r.measurements for r in recordings if r.measurements.has_mag]
+    if not measured:
         raise LinkposeError(f"{names}: there is no magnetometer; check its wiring, and record again")
+    blocks, outliers = _without_outliers(measured)
+    readings = [block.mag_uT[_usable(block)] for block in blocks]
     together = np.concatenate(readings)
     if len(together) < _FEWEST:
         raise LinkposeError(f"{names}: {len(together)} magnetometer readings are too few; record half a minute or more")
-    hard_iron, soft_iron, field, std, residual = _fit_ellipsoid(together)
-    turned = (together - hard_iron) @ soft_iron
-    coverage = _coverage(turned)
-    is_flat = np.linalg.cond(soft_iron) > _MOST_STRETCH
-    if is_flat or coverage < LEAST_COVERAGE or std.max() > _LARGEST_STD_UT:
-        raise _too_little(coverage, float(std.max()))
+    if _spread(together) < _LEAST_SPREAD_UT:
+        raise _too_little("the readings hardly change")
+    try:
+        hard_iron, soft_iron, field, std, residual = _fit_ellipsoid(together)
+    except np.linalg.LinAlgError:  # the fit diverges
+        raise _too_little(_UNDETERMINED) from None
+    if not (np.linalg.cond(soft_iron) <= _MOST_STRETCH and std.max() <= _LARGEST_STD_UT):
+        raise _too_little(_UNDETERMINED)
+    coverage = _coverage((together - hard_iron) @ soft_iron)
+    if coverage < LEAST_COVERAGE:
+        raise _too_little(f"the recording covers {100 * coverage:.0f} % of all attitudes")
     rotation, rotation_std = _alignment(blocks, rig.imu, hard_iron, soft_iron)
     dip = None if rotation is None else _dip_deg(blocks, rig.imu, rotation, hard_iron, soft_iron)
     return MagCalibration(
@@ -126,6 +143,7 @@ def calibrate_mag(recordings: Sequence[Recording], rig: Rig) -> MagCalibration:
         residual,
         coverage,
         len(together),
+        outliers,
         dip,
     )
 
@@ -139,17 +157,35 @@ def with_calibration(rig: Rig, found: MagCalibration) -> Rig:
     return replace(rig, mag=mag)
 
 
-def _too_little(coverage: float, std_uT: float) -> LinkposeError:
+def _too_little(finding: str) -> LinkposeError:
     return LinkposeError(
-        f"the recording covers {100 * coverage:.0f} % of all attitudes (hard iron known to {std_uT:.1f} µT), too few "
-        "to calibrate the magnetometer: turn the sensor by hand through all attitudes, each axis up, down and "
-        "sideways, for a minute, away from iron"
+        f"{finding}, too little to calibrate the magnetometer: turn the sensor by hand through all attitudes, each "
+        "axis up, down and sideways, for a minute, away from iron"
     )
+
+
+def _spread(readings: Floats) -> float:
+    """Median distance of readings (N, 3) from their middle, µT."""
+    return float(np.median(np.linalg.norm(readings - np.median(readings, axis=0), axis=1)))
 
 
 def _usable(block: Measurements) -> Any:
     """(N,) Rows with a new reading."""
     return block.mag_fresh & np.isfinite(block.mag_uT).all(axis=1)
+
+
+def _without_outliers(blocks: Sequence[Measurements]) -> tuple[list[Measurements], int]:
+    """The measurements without the readings whose magnitude is far from the median, and how many these are."""
+    usable = [_usable(block) for block in blocks]
+    magnitudes = [np.linalg.norm(block.mag_uT, axis=1) for block in blocks]
+    together = np.concatenate([values[rows] for values, rows in zip(magnitudes, usable, strict=True)])
+    if not len(together):
+        return list(blocks), 0
+    middle = float(np.median(together))
+    limit = max(_OUTLIER_DEVIATIONS * float(np.median(np.abs(together - middle))), _OUTLIER_UT)
+    kept = [rows & (np.abs(values - middle) <= limit) for values, rows in zip(magnitudes, usable, strict=True)]
+    cleaned = [replace(block, mag_fresh=rows) for block, rows in zip(blocks, kept, strict=True)]
+    return cleaned, len(together) - sum(int(rows.sum()) for rows in kept)
 
 
 def _fit_ellipsoid(readings: Floats) -> tuple[Floats, Floats, float, Floats, float]:
@@ -185,7 +221,8 @@ def _fit_ellipsoid(readings: Floats) -> tuple[Floats, Floats, float, Floats, flo
             break
     rms = float(np.sqrt(np.mean(residual**2)))
     covariance = np.linalg.pinv(system.T @ system) * max(scale, rms) ** 2
-    return hard_iron, soft_iron, field, np.sqrt(np.diag(covariance)[:3]), rms
+    variance = np.diag(covariance)[:3]  # rounded below zero where the system is singular
+    return hard_iron, soft_iron, field, np.sqrt(np.where(variance >= 0, variance, np.inf)), rms
 
 
 def _algebraic(readings: Floats) -> tuple[Floats, Floats]:

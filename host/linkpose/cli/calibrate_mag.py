@@ -41,6 +41,9 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             f"{MOST_FIELD_UT:.0f} µT): a magnet or iron is near the sensor. "
             f"{rig_file} is unchanged; record elsewhere, or add --force"
         )
+    if found.outliers:
+        readings = "1 reading is" if found.outliers == 1 else f"{found.outliers} readings are"
+        click.echo(f"{readings} left out: the magnitude is far from the median of all readings.", err=True)
     if not found.is_clean:
         click.echo(
             "The residual is large: iron or a current was near the sensor in a part of the recording. Record again, "

@@ -13,6 +13,7 @@ from linkpose.cli import options
 from linkpose.cli.findings import report_findings, report_running
 from linkpose.cli.page import show_newest
 from linkpose.cli.sink import Sink
+from linkpose.errors import NoMagnetometer
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -51,7 +52,10 @@ def estimate_live(
 
         estimator = Estimator.for_board(request.filter_names, connected, request.chain_joint)
         if request.mag:
-            estimator.hold_heading()
+            try:
+                estimator.hold_heading()
+            except NoMagnetometer:
+                raise NoMagnetometer(connected.port if connected.port.startswith("sim://") else None) from None
         report_running(estimator, request.joint, console)
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))

@@ -391,7 +391,7 @@ def _sentence(name: str, track: Track, result: PathScore | None) -> str:
     if track.relocated:
         text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found anew"
     for verdict in track.consistency.verdicts():
-        text += f"\n  {verdict.sentence()} (mean NIS {verdict.mean_nis:.2f}, 1 is consistent)"
+        text += f"\n  {verdict.sentence()} ({verdict.figures()})"
     if result is not None:
         text += (
             f"\n  position error {result.position_rmse_m:.3f} m rms, {result.position_max_m:.3f} m at most, "

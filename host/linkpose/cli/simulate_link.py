@@ -63,8 +63,9 @@ def command(
         noise_of=noise_of,
     )  # fmt: skip
     write_link(run, output, truth, force)
+    held = ("--mag",) if has_mag and level != "datasheet" else ()  # a data sheet's specimen has no calibration
     calibrate, estimate = (
         ("calibrate", "imu", output, "--rig", "rig.toml"),
-        ("estimate", output, "-o", options.ESTIMATES),
+        ("estimate", output, *held, "-o", options.ESTIMATES),
     )
     options.show_next(quiet, *(calibrate if rests else estimate))

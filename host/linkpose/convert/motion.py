@@ -82,27 +82,37 @@ def only_filter(table: Table, wanted: str) -> Table:
 
 
 def motion_of(table: Table, wanted: str | None, label: str) -> Motion:
-    """The motion that the filter `wanted`, or the first that estimates an orientation, has estimated."""
+    """The motion that the filter `wanted`, or the first that has at least two poses, has estimated."""
     table.require("time_s")
     prefixes = dict.fromkeys(_prefix_of(name) for name in table.columns if split(name))
     choices = [prefix for prefix in prefixes if prefix is not None and _has_orientation(table, prefix)]
-    prefix = _prefix(table, wanted) if wanted else next(iter(choices), None)
-    if prefix is None or prefix not in choices:
+    candidates = [_prefix(table, wanted)] if wanted else choices
+    if not candidates or candidates[0] not in choices:
         kind = f"the filter {wanted}" if wanted else "it"
         raise LinkposeError(
             f"{table.path}: {kind} has no orientation (roll_deg and pitch_deg, heading_rad, or qw to qz); "
             "a recording must be estimated before it has one"
         )
-    name = prefix.replace("_", "-")
-    remarks = [] if wanted or len(choices) < 2 else [f"{table.path}: the motion is the one of the filter {name}"]
+    for prefix in candidates:
+        name = prefix.replace("_", "-")
+        is_obvious = wanted or len(choices) < 2
+        remarks = [] if is_obvious else [f"{table.path}: the motion is the one of the filter {name}"]
+        motion = _poses(table, prefix, label, remarks)
+        if len(motion.time_s) >= 2:
+            return motion
+    who = "any filter" if len(candidates) > 1 else name or str(table.path)
+    raise LinkposeError(f"{table.path} has no two poses of {who}")
+
+
+def _poses(table: Table, prefix: str, label: str, remarks: list[str]) -> Motion:
+    """The poses that the filter with this prefix has estimated; `remarks` come before its own."""
+    remarks = list(remarks)
     columns = {column.removeprefix(f"{prefix}_" if prefix else ""): values for column, values in table.columns.items()}
-    who = name or str(table.path)
+    who = prefix.replace("_", "-") or str(table.path)
     motion = Motion(
         label, table.columns["time_s"], _position(columns, who, remarks), _orientation(columns, who, remarks), ()
     )
     known = motion.known()
-    if len(known.time_s) < 2:
-        raise LinkposeError(f"{table.path} has no two poses of {who}")
     if len(known.time_s) < len(motion.time_s):
         remarks.append(f"{table.path}: {len(motion.time_s) - len(known.time_s)} rows without an estimate left out")
     return replace(known, remarks=tuple(remarks))

@@ -168,7 +168,9 @@ class Scorer:
                 f"{self._paths[0]} and {self._paths[1]} have no instant in common for {self._name}: "
                 "check that they are of the same run"
             )
-        known, empty = round(self._share * self._stamps), round(self._share * self._empty_stamps)
+        # Irregular stamps have no one interval, so that their share is approximate; a compared instant is a known one.
+        known = max(self._rows, round(self._share * self._stamps))
+        empty = round(self._share * self._empty_stamps)
         if self._rows < _FEWEST * known:
             raise TooFewRows(self._name, self._paths, (self._rows, known), self._common_s)
         kept = {name: np.concatenate([part.columns[name] for part in self._kept]) for name in self._kept[0].columns}

@@ -14,6 +14,10 @@ _HIGH = 0.95  # the quantile of the magnitudes
 _SURPLUS = 1.25
 # A verdict on σ: shares of errors within 2σ between which σ is right. A normal error has 95.4 %.
 HONEST_SHARE = (0.90, 0.99)
+# NEES beyond which some errors are far outside although the share is not too low. σ of the least such share, 1.2 times
+# too small, has 1.5 with normal errors. Doubled, an error of 20σ in 100 is still named.
+_FAR_NEES = 2.0
+_ROUNDING = 1.001  # that two rounded files differ by, in units of the last digit, with some for binary fractions
 _NORMAL_95 = 1.96  # 95 % of normal errors are within so many σ
 
 
@@ -29,12 +33,15 @@ class Statistics:
     nees: float | None = None  # normalised estimation error squared: mean of (error/σ)², 1 where σ is right
     within_2sigma: float | None = None  # share of errors within ±2σ
     sigma_ratio: float | None = None  # actual 95 % magnitude of error/σ over a normal error's: 2 where σ is half
+    worst_ratio: float | None = None  # largest magnitude of error/σ
 
     @staticmethod
     def of(error: Floats, std: Floats | None = None, least_std: float = 0.0) -> Statistics:
         """Of the finite errors (N,), at least one, and their σ (N,), NaN where unknown.
 
-        `least_std` is the resolution of σ in its file: a smaller one was rounded.
+        `least_std` is the resolution of σ in its file: a smaller one was rounded and counts as `least_std`. A row with
+        such a σ whose error is within the rounding, too, has no part in NEES and shares: its quantity is fixed by
+        definition, as the yaw of the first row.
         """
         collected = Collector(len(error), least_std)
         collected.add(error, std)
@@ -42,15 +49,27 @@ class Statistics:
 
     def verdict(self) -> str | None:
         """One sentence on σ; None where there is no σ."""
-        if self.within_2sigma is None or self.sigma_ratio is None:
+        if self.within_2sigma is None or self.sigma_ratio is None or self.nees is None:
             return None
         low, high = HONEST_SHARE
         share = f"{100 * self.within_2sigma:.0f} % of the errors are within ±2σ (95 % expected)"
         if self.within_2sigma < low:
             return f"σ is {self.sigma_ratio:.1f} times too small: {share}."
-        if self.within_2sigma > high:
-            return f"σ is {1 / max(self.sigma_ratio, 0.01):.1f} times too large: {share}."
-        return f"σ is right: {share}."
+        found = f"{1 / max(self.sigma_ratio, 0.01):.1f} times too large" if self.within_2sigma > high else "right"
+        if self.nees > _FAR_NEES:
+            far = f"single errors are far outside, up to {self.worst_ratio:.3g}σ"
+            return f"σ is {found} for most errors: {share}, but {far}."
+        return f"σ is {found}: {share}."
+
+
+def normalised_errors(error: Floats, std: Floats, least_std: float) -> Floats:
+    """error/σ of the rows (N,) that have both, without those fixed by definition: see `Statistics.of`."""
+    is_rounded = (std < least_std) | (std == 0)
+    is_fixed = is_rounded & (np.abs(error) <= _ROUNDING * least_std)
+    paired = np.isfinite(error) & np.isfinite(std) & ~is_fixed
+    sigma = np.maximum(std[paired], least_std)
+    with np.errstate(divide="ignore"):
+        return np.where(sigma > 0, error[paired] / sigma, np.inf)
 
 
 class Collector:
@@ -77,11 +96,9 @@ class Collector:
         self._size.add(np.abs(errors))
         if std is None or not self._is_positive:
             return
-        paired = known & np.isfinite(std)
-        sigma = np.maximum(std[paired], self._least_std)
-        self._is_positive = bool((sigma > 0).all())
+        normalised = np.abs(normalised_errors(error, std, self._least_std))
+        self._is_positive = bool(np.isfinite(normalised).all())
         if self._is_positive:
-            normalised = np.abs(error[paired]) / sigma
             self._paired += len(normalised)
             self._within += int(np.count_nonzero(normalised <= 2.0))
             self._normalised_squares += float((normalised**2).sum())
@@ -100,6 +117,7 @@ class Collector:
             nees=self._normalised_squares / paired,
             within_2sigma=self._within / paired,
             sigma_ratio=self._normalised.quantile() / _NORMAL_95,
+            worst_ratio=self._normalised.largest,
         )
 
 

@@ -68,17 +68,19 @@ class BaroParameters(NamedTuple):
     """The rig's parameters that Methods C and D share."""
 
     imu: ImuCalibration
-    j2s: Vec  # m, 0 where it is unknown
+    j2s: Vec  # m; 0 without one: heights are then above the start
+    j2s_std: Vec  # m, 1σ along each axis
     noise_Pa: float  # 1σ of one pressure
 
     @staticmethod
     def of(rig: Rig) -> BaroParameters:
-        j2s = rig.joint.known_j2s_m or (0.0, 0.0, 0.0)
-        return BaroParameters(ImuCalibration.of(rig.imu), j2s, rig.baro.pressure_noise_Pa)
+        nothing = (0.0, 0.0, 0.0)
+        j2s, std = (nothing, nothing) if rig.joint.j2s_m is None else (rig.joint.j2s_m, rig.joint.std_of_axes_m)
+        return BaroParameters(ImuCalibration.of(rig.imu), j2s, std, rig.baro.pressure_noise_Pa)
 
     def packed(self) -> Floats:
-        """(16,) its numbers in order: see `ImuCalibration.packed`."""
-        return np.array([*self.imu.packed(), *self.j2s, self.noise_Pa])
+        """(19,) its numbers in order: see `ImuCalibration.packed`."""
+        return np.array([*self.imu.packed(), *self.j2s, *self.j2s_std, self.noise_Pa])
 
 
 class BaroFilter:
@@ -112,7 +114,7 @@ class BaroFilter:
 @inner
 def unpacked_baro(a: Floats) -> BaroParameters:
     """The parameters that `packed` gave."""
-    return BaroParameters(unpacked(a), (a[12], a[13], a[14]), a[15])
+    return BaroParameters(unpacked(a), (a[12], a[13], a[14]), (a[15], a[16], a[17]), a[18])
 
 
 @inner
@@ -156,9 +158,15 @@ def start_height(state: Any, j2s: Vec) -> float:
 
 
 @inner
-def start_variance(state: Any, height: float, j2s: Vec) -> float:
-    """Variance (m²) of the height at the start, `height` (m)."""
-    return float(state.unsteady[2] * max(vec.dot(j2s, j2s) - height * height, 0.0))
+def start_variance(state: Any, height: float, q: BaroParameters) -> float:
+    """Variance (m²) of the height at the start, `height` (m): from the tilt, and from J2S along the vertical."""
+    tilted = state.unsteady[2] * max(vec.dot(q.j2s, q.j2s) - height * height, 0.0)
+    force = vec.load(state.force)
+    length2 = vec.dot(force, force)
+    if not length2 > 0.0:
+        return float(tilted + vec.dot(q.j2s_std, q.j2s_std))
+    along = (force[0] * q.j2s_std[0], force[1] * q.j2s_std[1], force[2] * q.j2s_std[2])
+    return float(tilted + vec.dot(along, along) / length2)
 
 
 @inner
@@ -194,7 +202,7 @@ def measure(
     """Height (m) from a fresh pressure, and its variances (m²) from the sensor's noise and from all other causes."""
     first, scale = start_height(state, q.j2s), metres_per_pascal(state)
     air = air_variance(samples.time_s[i] - state.time[0], samples, i, q)
-    other = scale * scale * air + start_variance(state, first, q.j2s)
+    other = scale * scale * air + start_variance(state, first, q)
     return first + barometric_height(baro.pressure_Pa[i], state), (q.noise_Pa * scale) ** 2, other
 
 

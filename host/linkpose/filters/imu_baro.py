@@ -197,7 +197,7 @@ def _process(
             variance = (rig.noise_Pa * metres_per_pascal(start)) ** 2
             mean = (start_height(start, rig.j2s), 0.0, 0.0)
             covariance = (variance / start.pressure[1], 0.0, 0.0, 0.01, 0.0, q.bias_std_m_s2**2)
-            vertical.other[0] = start_variance(start, mean[0], rig.j2s)
+            vertical.other[0] = start_variance(start, mean[0], rig)
             innovation = (0.0, 0.0, time_s)
             vertical.started[0] = 1.0 if time_s - start.time[0] > START_S else 0.0
         elif known:

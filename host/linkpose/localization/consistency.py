@@ -18,6 +18,9 @@ from linkpose.presentation import counted
 FEWEST = 20  # innovations of a sensor below which there is no verdict
 # The stated noise is called too small or too large beyond this factor. The median of 100 innovations scatters by 15 %.
 FACTOR = 1.3
+# The mean NIS of normal errors equals their median over the χ² one. A larger ratio is due to outliers; that of 100
+# innovations in one dimension scatters by 25 %.
+_RULED = FACTOR**2
 LEAST_FACTOR = 0.01  # a sensor is not a hundred times better than stated: it is silent, or the filter's only source
 NAMES = {
     "range": "range", "bearing_range": "range and bearing", "depth": "depth", "attitude": "attitude", "pose": "pose",
@@ -49,7 +52,15 @@ class Verdict:
             return f"{name} noise: the measurements equal their predictions, no verdict"
         if self.noise_factor < 1.0 / FACTOR:
             return f"{name} noise is set {1.0 / self.noise_factor:.1f} times too large"
-        return f"{name} noise fits (factor {self.noise_factor:.2f})"
+        return f"{name} noise fits"
+
+    def figures(self) -> str:
+        """The median NIS, by which the verdict is decided, over the χ² one; and the mean where outliers rule it."""
+        median = self.noise_factor**2
+        text = f"median NIS {median:.2f}, 1 is consistent"
+        if self.mean_nis > _RULED * max(median, 1.0):
+            text += f"; outliers raise the mean to {self.mean_nis:.3g}"
+        return text
 
 
 @dataclass(slots=True)

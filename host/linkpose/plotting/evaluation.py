@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linkpose import filters
+from linkpose.evaluation.statistics import normalised_errors
 from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, others_hide_best
@@ -146,8 +147,7 @@ def _histogram(axes: Axes, scores: Sequence[Score], name: str) -> None:
 
 def _normalised(of: Errors) -> Floats:
     std = of.std if of.std is not None else np.full(len(of.error), np.nan)
-    known = np.isfinite(of.error) & np.isfinite(std)
-    return np.asarray(of.error[known] / np.maximum(std[known], of.least_std))
+    return normalised_errors(of.error, std, of.least_std)
 
 
 def _table(axes: Axes, scores: Sequence[Score]) -> None:

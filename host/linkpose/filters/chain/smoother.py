@@ -132,18 +132,21 @@ def _covariance(found: Any) -> Floats:
 
 
 def _combine_angles(out: Any, after: Any) -> None:
-    """The hinge angle. That of the filter backwards counts from the last sample, so its mean is fitted first.
+    """The hinge angle. That of the filter backwards counts from the last sample, so its offset is fitted first.
 
+    The errors of both filters persist, so the offset is no surer than where their common variance is least.
     Where the heading is unknown, the filters may also have found opposite senses of the axis.
     """
-    angle, std = after["angle"].copy(), after["angle_std"]
+    angle, std = after["angle"].copy(), after["angle_std"].copy()
     both = np.isfinite(out["angle"]) & np.isfinite(angle)
     if both.any():
-        weight = 1 / (out["angle_std"][both] ** 2 + std[both] ** 2 + 1e-12)
+        variance = out["angle_std"][both] ** 2 + std[both] ** 2
+        weight = 1 / (variance + 1e-12)
         fits = [np.sum(weight * np.exp(1j * (out["angle"][both] - sense * angle[both]))) for sense in (1, -1)]
         sense = 1 if abs(fits[0]) >= abs(fits[1]) else -1
         angle = sense * angle + np.angle(fits[0 if sense > 0 else 1])
         angle[both] = out["angle"][both] - wrapped(out["angle"][both] - angle[both])
+        std = np.minimum(np.sqrt(std**2 + variance.min()), np.pi)
     _combine(out["angle"], out["angle_std"], angle, std)
     out["angle"] = wrapped(out["angle"])
 
