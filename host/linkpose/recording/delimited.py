@@ -171,7 +171,7 @@ def split_cells(path: Path, data: bytes, before: Sequence[str] = (), first_line:
     if not table:
         raise FileFormatError(path, f"{path} ends before its first row; it holds no data")
     if path.suffix.lower() in _SETTINGS or _TOML_TABLE.fullmatch(table[0][1].strip()):
-        raise FileFormatError(path, f"{path} holds settings, no table; name a rig file with --rig, a map with --map")
+        raise FileFormatError(path, f"{path} holds settings, no table: it is a rig file, or describes a map")
     separator = _separator(table[0][1])
     comments = [_comment(i, line, separator) for i, line in numbered if _is_comment(line)]
     numbers, rows = _parse(path, table, separator)
