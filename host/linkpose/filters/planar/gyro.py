@@ -211,7 +211,6 @@ def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     weight = 1.0 / variance
     dispute.jump_square += weight * span * span
     dispute.jump_product += weight * span * off
-    dispute.jump_cost += weight * off * off
     way = dispute.block_way
     dispute.turn_square += weight * turn * turn
     dispute.turn_way += weight * turn * way
@@ -234,7 +233,7 @@ def _decide(state: Record, m: Record) -> None:
     if dispute.blocks < _FEWEST_BLOCKS or dispute.jump_square == 0.0:
         return
     jump = dispute.jump_product / dispute.jump_square
-    by_jump = dispute.jump_cost - jump * dispute.jump_product
+    by_jump = dispute.off_square - jump * dispute.jump_product
     by_mice = _cost_of_mice(dispute)
     variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
     is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
@@ -244,7 +243,7 @@ def _decide(state: Record, m: Record) -> None:
         dispute.blocks > _PATIENCE_BLOCKS and min(by_jump, by_mice) > _MOST_CHI2 * dispute.blocks
     ):
         lost = dispute.turn_off / (dispute.turn_square + 1.0 / _LOST_STD**2)
-        _widen_way(state, min(abs(lost), 1.0))
+        widen_way(state, min(abs(lost), 1.0), complex(state.at.x, state.at.y) - dispute.start)
         agree(state)
 
 
@@ -258,13 +257,13 @@ def _cost_of_mice(dispute: Record) -> float:
 
 
 @inner
-def _widen_way(state: Record, lost: float) -> None:
-    """The mice have lost a share of the way since the dispute began."""
-    way = complex(state.at.x, state.at.y) - state.dispute.start
-    state.covariance[X, X] += (lost * way.real) ** 2
-    state.covariance[Y, Y] += (lost * way.imag) ** 2
-    state.covariance[X, Y] += lost * lost * way.real * way.imag
-    state.covariance[Y, X] = state.covariance[X, Y]
+def widen_way(state: Record, share: float, way: complex) -> None:
+    """Add the variance of an error of the position by a share of the way."""
+    p = state.covariance
+    p[X, X] += (share * way.real) ** 2
+    p[Y, Y] += (share * way.imag) ** 2
+    p[X, Y] += share * share * way.real * way.imag
+    p[Y, X] = p[X, Y]
 
 
 @inner
@@ -282,7 +281,7 @@ def agree(state: Record) -> None:
 def _forget(dispute: Record) -> None:
     """Forget the blocks so far."""
     dispute.span = 0.0
-    dispute.jump_square = dispute.jump_product = dispute.jump_cost = 0.0
+    dispute.jump_square = dispute.jump_product = 0.0
     dispute.turn_square = dispute.turn_way = dispute.way_square = 0.0
     dispute.turn_off = dispute.way_off = dispute.off_square = 0.0
     dispute.blocks = 0
@@ -338,8 +337,6 @@ def _watch_dead_gyro(state: Record, m: Record, motion: int) -> None:
     elif state.dead_turn != 0.0:
         _turn_heading(state, state.dead_turn)
         state.dead_turn = 0.0
-        state.deaths += 1
-        state.death_time = m.time
 
 
 @inner

@@ -12,7 +12,7 @@ from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
-from linkpose.filters.planar.gyro import agree, is_undecided, watch_gyro
+from linkpose.filters.planar.gyro import agree, is_undecided, watch_gyro, widen_way
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
@@ -157,22 +157,27 @@ def _add_turn_of_each(state: Record, m: Record, mice: Records, by_gyro: float, k
 
 
 @inner
+def _middle_of_arms(m: Record, mice: Records) -> complex:
+    """Mean of the mice's levers (m, turned by 90°)."""
+    middle = 0j
+    for i in range(m.count):
+        middle += scaled(1.0 / m.count, mice[i].arm)
+    return middle
+
+
+@inner
 def _off_of_each(state: Record, m: Record, mice: Records, i: int) -> complex:
     """Lever of a mouse about the centre of all as the turns have shown it, less the assumed one (m, turned by 90°)."""
-    arm = 0j
-    for k in range(m.count):
-        arm += scaled(1.0 / m.count, mice[k].arm)
-    return complex(scaled(1.0 / state.turn_square, state.lever_of_each[i]) - (mice[i].arm - arm))
+    arm = mice[i].arm - _middle_of_arms(m, mice)
+    return complex(scaled(1.0 / state.turn_square, state.lever_of_each[i]) - arm)
 
 
 @inner
 def _spread_of_turns(state: Record, m: Record, mice: Records) -> float:
     """Spread of the shares of the gyro's turn that the mice show: on another floor all show the same."""
-    least, most, arm = math.inf, -math.inf, 0j
-    for k in range(m.count):
-        arm += scaled(1.0 / m.count, mice[k].arm)
+    least, most, middle = math.inf, -math.inf, _middle_of_arms(m, mice)
     for i in range(m.count):
-        lever = mice[i].arm - arm
+        lever = mice[i].arm - middle
         share = dot(lever, _off_of_each(state, m, mice, i)) / max(square(lever), 1e-12)
         least, most = min(least, share), max(most, share)
     return most - least
@@ -207,7 +212,6 @@ def _find_misplaced(state: Record, m: Record, mice: Records) -> None:
     for k in range(2):
         p[at + POSITION + k, at + POSITION + k] = _PLACE_SHARE * _PLACE_SHARE * square(off)
     _restart_turns(state)
-    m.excluded &= ~(1 << worst)
     state.moved |= 1 << worst
 
 
@@ -269,10 +273,7 @@ def _correct_way(state: Record, off: float) -> None:
     if state.floors == 0:
         state.at.x -= off * x
         state.at.y -= off * y
-    state.covariance[X, X] += (off * x) ** 2
-    state.covariance[Y, Y] += (off * y) ** 2
-    state.covariance[X, Y] += off * off * x * y
-    state.covariance[Y, X] = state.covariance[X, Y]
+    widen_way(state, off, complex(x, y))
 
 
 @inner
@@ -415,8 +416,7 @@ def _add_unconfirmed_way(state: Record, m: Record, dt: float) -> None:
             state.unconfirmed_s = 0.0
             return
     way = scaled(dt, turned(unit(state.at.heading), state.held - complex(state.at.vx, state.at.vy)))
-    _add_systematic(state, way, state.unconfirmed_m)
-    state.unconfirmed_m += math.sqrt(square(way))
+    state.unconfirmed_m += _add_systematic(state, way, state.unconfirmed_m)
 
 
 @inner
@@ -425,21 +425,24 @@ def _add_saturated_way(state: Record, m: Record, dt: float) -> None:
     if not m.is_saturated:
         return
     way = scaled(_SATURATED_SHARE * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
-    _add_systematic(state, way, state.saturated_m)
-    state.saturated_m += math.sqrt(square(way))
+    state.saturated_m += _add_systematic(state, way, state.saturated_m)
 
 
 @inner
-def _add_systematic(state: Record, way: complex, before_m: float) -> None:
-    """Add the variance of an error of position that grows by `way` (m) in this step, and was `before_m` before."""
+def _add_systematic(state: Record, way: complex, before_m: float) -> float:
+    """Add the variance of an error of position that grows by `way` (m) in this step, and was `before_m` before.
+
+    Returns the length of the way (m).
+    """
     length = math.sqrt(square(way))
     if not length > 0.0:
-        return
+        return length
     grown = length * (2.0 * before_m + length) / (length * length)
     state.covariance[X, X] += grown * way.real * way.real
     state.covariance[Y, Y] += grown * way.imag * way.imag
     state.covariance[X, Y] += grown * way.real * way.imag
     state.covariance[Y, X] = state.covariance[X, Y]
+    return length
 
 
 @inner

@@ -71,7 +71,6 @@ _DISPUTE = np.dtype(
         ("span", "f8"),  # s
         ("jump_square", "f8"),
         ("jump_product", "f8"),
-        ("jump_cost", "f8"),
         ("turn_square", "f8"),
         ("turn_way", "f8"),
         ("way_square", "f8"),
@@ -104,21 +103,19 @@ _FIELDS = [
     # Common scale of the mice against the gyro: sums over the last turns.
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
+    ("turn_variance", "f8"),  # variance of turn_product (rad⁴/s²)
     ("lever_of_each", "c16", (MOST,)),  # ∫ ω s dt of each mouse's motion s relative to the mean (m rad/s)
     ("moved", "i8"),  # bit mask of the mice whose places the turns have corrected
-    ("turn_variance", "f8"),  # variance of turn_product (rad⁴/s²)
-    ("recent_square", "f8"),  # the first two over the current turn only
+    ("recent_square", "f8"),  # turn_square and turn_product over the current turn only
     ("recent_product", "f8"),
     ("turn_rate", "f8"),  # of the gyro, less its bias, in the last step (rad/s)
     ("off_of_turn", "f8"),  # share by which the mice turned more than the gyro in the last turn
-    ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("off_of_turn_before", "f8"),  # and in the one before
+    ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("dispute", _DISPUTE),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
     ("jump_time", "f8"),  # and when it was found (s)
-    ("deaths", "i8"),  # how often the gyro repeated one value until it was given up
-    ("death_time", "f8"),  # when it was found last (s)
     ("floors", "i8"),  # how often the floor has changed
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
