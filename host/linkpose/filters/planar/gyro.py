@@ -308,6 +308,16 @@ def take_other_pose(state: Record) -> None:
 
 
 @inner
+def restart_turns(state: Record) -> None:
+    """Begin again to compare the turns of gyro and mice."""
+    state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    for i in range(len(state.lever_of_each)):
+        state.lever_of_each[i] = 0j
+    state.is_off = False
+
+
+@inner
 def _accept_jump(state: Record, m: Record, jump: float, variance: float) -> None:
     """The bias is another one since the dispute began: take the pose by the mice, and their velocity."""
     p, span = state.covariance, state.dispute.span
@@ -320,7 +330,8 @@ def _accept_jump(state: Record, m: Record, jump: float, variance: float) -> None
         p[at_index, at_index] = state.fresh[at_index, at_index]
     p[BIAS, BIAS] = variance + (_JUMP_SHARE * jump) ** 2
     m.excluded = NOBODY
-    state.since_rest_s = state.turn_square = state.turn_product = state.turn_variance = 0.0
+    state.since_rest_s = 0.0
+    restart_turns(state)
     state.jumps += 1
     state.jump, state.jump_time = jump, m.time
 

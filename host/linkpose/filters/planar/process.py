@@ -12,7 +12,7 @@ from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
-from linkpose.filters.planar.gyro import agree, is_undecided, watch_gyro, widen_way
+from linkpose.filters.planar.gyro import agree, is_undecided, restart_turns, watch_gyro, widen_way
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
@@ -141,7 +141,7 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
             state.covariance[a, b] += p.floor_scale**2
         _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
     _correct_way(state, off)
-    _restart_turns(state)
+    restart_turns(state)
     state.floors += 1
 
 
@@ -211,18 +211,8 @@ def _find_misplaced(state: Record, m: Record, mice: Records) -> None:
     mouse.dy -= off.real
     for k in range(2):
         p[at + POSITION + k, at + POSITION + k] = _PLACE_SHARE * _PLACE_SHARE * square(off)
-    _restart_turns(state)
+    restart_turns(state)
     state.moved |= 1 << worst
-
-
-@inner
-def _restart_turns(state: Record) -> None:
-    """Begin to compare the turns of gyro and mice anew."""
-    state.turn_square = state.turn_product = state.turn_variance = 0.0
-    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
-    for i in range(len(state.lever_of_each)):
-        state.lever_of_each[i] = 0j
-    state.is_off = False
 
 
 @inner
