@@ -281,6 +281,14 @@ def test_readings_that_no_joint_gives_are_reported_and_have_no_estimate(name: st
     assert np.isnan(estimates["chain_angle_deg"][late]).all()
 
 
+def test_a_sensor_that_is_often_absent_is_not_taken_for_one_in_another_unit() -> None:
+    measured, _, _ = _chain("hinge")
+    seldom = np.where(np.arange(len(measured))[:, None] % 4 == 0, measured.accel2_m_s2, np.nan)
+    with pytest.warns(UserWarning, match="could not be used"):
+        remarks = lp.estimate(_changed(measured, accel2_m_s2=seldom), filters=["chain"], joint="hinge").remarks
+    assert not any("mean acceleration" in remark for remark in remarks)
+
+
 def test_a_sensor_that_is_mounted_anew_is_found_again() -> None:
     run = ChainRun("hinge", 3, 60.0)
     measured = run.measurements()

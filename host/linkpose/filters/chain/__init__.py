@@ -90,8 +90,8 @@ class ChainFilter:
         bank, found = self._bank[0], []
         samples = max(int(bank.samples), 1)
         for k in range(2):
-            mean = float(bank.force_sum[k]) / samples
-            if samples >= _FEWEST and not _LEAST_SHARE < mean / GRAVITY < 1 / _LEAST_SHARE:
+            mean = float(bank.force_sum[k]) / max(int(bank.forces[k]), 1)
+            if bank.forces[k] >= _FEWEST and not _LEAST_SHARE < mean / GRAVITY < 1 / _LEAST_SHARE:
                 found.append(
                     f"chain: the mean acceleration of sensor {k + 1} is {mean:.3g} m/s², and gravity alone is 9.81 "
                     "m/s². Check that the sensor works and that its unit is m/s²."

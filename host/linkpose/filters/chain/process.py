@@ -426,6 +426,7 @@ def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, cali
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
     if is_possible:
         bank.force_sum[k] += math.sqrt(norm)
+        bank.forces[k] += 1
     frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
     return is_possible and not frozen
 
