@@ -75,9 +75,12 @@ _PREFIX = "compiled-"
 _OTHERS_KEPT = 2  # those last used: another version of this package may be at work beside this one
 
 
-def cache_folder(package: Path = _PACKAGE) -> Path | None:
-    """The folder for the machine code of this package's sources, created if missing; None if no place is writable."""
-    name = _folder_name(package)
+def cache_folder(package: Path = _PACKAGE, name: str = "") -> Path | None:
+    """The folder for the machine code of this package's sources, created if missing; None if no place is writable.
+
+    `name` is that of the folder, if it is known already.
+    """
+    name = name or _folder_name(package)
     for root in _roots(package):
         folder = root / "linkpose" / name
         with contextlib.suppress(OSError):
@@ -86,9 +89,12 @@ def cache_folder(package: Path = _PACKAGE) -> Path | None:
     return None
 
 
-def installed_folder(package: Path = _PACKAGE) -> Path | None:
-    """The installation's machine code for these sources and this processor; None if it is missing or not trusted."""
-    folder = package / _INSTALLED / _folder_name(package)
+def installed_folder(package: Path = _PACKAGE, name: str = "") -> Path | None:
+    """The installation's machine code for these sources and this processor; None if it is missing or not safe.
+
+    `name` is as for `cache_folder`.
+    """
+    folder = package / _INSTALLED / (name or _folder_name(package))
     with contextlib.suppress(OSError):
         for each in (folder.parent, folder):
             if not stat.S_ISDIR(os.lstat(each).st_mode) or not _is_as_safe(os.lstat(each), package):
@@ -225,6 +231,7 @@ class _Place(UserProvidedCacheLocator):  # type: ignore[misc]
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file, self._lineno = file, function.__code__.co_firstlineno
         path = Path(file)
+        self._stamp = hashlib.blake2b(path.read_bytes()).digest()
         if path.is_relative_to(_PACKAGE):  # an installation may move
             self.below = "-".join(["linkpose", *path.parent.relative_to(_PACKAGE).parts])
         else:
@@ -242,7 +249,7 @@ class _Place(UserProvidedCacheLocator):  # type: ignore[misc]
 
     def get_source_stamp(self) -> bytes:
         """Of the content: older versions of numba use the time of the file, which an installation changes."""
-        return hashlib.blake2b(Path(self._py_file).read_bytes()).digest()
+        return self._stamp
 
 
 class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
@@ -300,8 +307,9 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
 
 
-_the_cache = functools.cache(cache_folder)
-_the_installed = functools.cache(installed_folder)
+_the_name = functools.cache(lambda: _folder_name(_PACKAGE))  # reads all sources
+_the_cache = functools.cache(lambda: cache_folder(name=_the_name()))
+_the_installed = functools.cache(lambda: installed_folder(name=_the_name()))
 
 
 def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
