@@ -15,7 +15,14 @@ from linkpose.cli import options
 from linkpose.cli.live import Console, ending_well
 from linkpose.cli.page import PageOptions
 from linkpose.errors import InvalidValue
-from linkpose.localization.options import ESTIMATED_NOISES, LocalizationOptions, check_constants, check_start_std
+from linkpose.localization.options import (
+    ESTIMATED_NOISES,
+    MAY_BE_NEGATIVE,
+    MAY_BE_ZERO,
+    LocalizationOptions,
+    check_constants,
+    check_start_std,
+)
 from linkpose.presentation import counted
 
 if TYPE_CHECKING:
@@ -23,14 +30,16 @@ if TYPE_CHECKING:
     from linkpose.localization.tables import PathScore
     from linkpose.localization.track import Track
 
-POSITIVE, NOT_NEGATIVE = options.FiniteRange(min=0, min_open=True), options.FiniteRange(min=0)
 DEFAULTS = LocalizationOptions()
 
 
 def _number(
-    flag: str, name: str, kind: click.ParamType[Any], text: str
+    flag: str, name: str, text: str, kind: click.ParamType[Any] | None = None
 ) -> Callable[[options.Function], options.Function]:
-    """The option of the number `name` of LocalizationOptions, with its default."""
+    """The option of the number `name` of LocalizationOptions, with its default; `kind` if its bounds are others."""
+    if kind is None:
+        least = None if name in MAY_BE_NEGATIVE else 0
+        kind = options.FiniteRange(min=least, min_open=least == 0 and name not in MAY_BE_ZERO)
     default = getattr(DEFAULTS, name)
     if default is None and (assumed := ESTIMATED_NOISES[name][1]) is not None:
         text += f" Default: estimated from the log; in a stream, or with few measurements, {assumed:g}."
@@ -137,7 +146,7 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     show_default=True,
     help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)².",
 )
-@_number("--correlation", "correlation", options.FiniteRange(), "Between ranges taken at one instant.")
+@_number("--correlation", "correlation", "Between ranges taken at one instant.")
 @click.option(
     "--gate",
     callback=gate_probability,
@@ -146,44 +155,39 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     metavar="P|off",
     help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
 )
-@_number("--range-std", "range_std_m", POSITIVE, "σ of a range (m).")
+@_number("--range-std", "range_std_m", "σ of a range (m).")
 @_number(
     "--range-growth",
     "range_growth",
-    NOT_NEGATIVE,
     "Growth k of the range's standard deviation with --noise affine (m/m).",
 )
-@_number("--eta", "eta", POSITIVE, "η of --noise adaptive.")
-@_number("--bearing-std", "bearing_std_rad", POSITIVE, "σ of a bearing (rad).")
-@_number("--depth-std", "depth_std_m", POSITIVE, "σ of a depth (m).")
-@_number("--attitude-std", "attitude_std_rad", POSITIVE, "σ of a yaw reading (rad).")
-@_number("--speed-std", "speed_std_m_s", POSITIVE, "σ of one odometry sample's speed (m/s).")
-@_number("--turn-std", "turn_std_rad_s", POSITIVE, "σ of one odometry sample's turn rate (rad/s).")
-@_number("--velocity-std", "velocity_std_m_s", POSITIVE, "σ of one velocity sample on each axis (m/s).")
+@_number("--eta", "eta", "η of --noise adaptive.")
+@_number("--bearing-std", "bearing_std_rad", "σ of a bearing (rad).")
+@_number("--depth-std", "depth_std_m", "σ of a depth (m).")
+@_number("--attitude-std", "attitude_std_rad", "σ of a yaw reading (rad).")
+@_number("--speed-std", "speed_std_m_s", "σ of one odometry sample's speed (m/s).")
+@_number("--turn-std", "turn_std_rad_s", "σ of one odometry sample's turn rate (rad/s).")
+@_number("--velocity-std", "velocity_std_m_s", "σ of one velocity sample on each axis (m/s).")
 @_number(
     "--acceleration-std",
     "acceleration_std_m_s2",
-    POSITIVE,
     "σ of the acceleration on each axis of a log without odometry (m/s²).",
 )
 @_number(
     "--error-time",
     "error_time_s",
-    NOT_NEGATIVE,
     "Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
     "count less. Default: estimated for landmarks; with few measurements 0, and 0.5 for landmarks.",
 )
 @_number(
     "--drift-std",
     "drift_std_m",
-    NOT_NEGATIVE,
     "σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose.",
 )
-@_number("--drift-time", "drift_time_s", POSITIVE, "Time for which this part persists (s); estimated with it.")
+@_number("--drift-time", "drift_time_s", "Time for which this part persists (s); estimated with it.")
 @_number(
     "--motion-correlation",
     "motion_correlation",
-    options.FiniteRange(),
     "Between the errors of speed and turn rate.",
 )
 @click.option(
@@ -217,12 +221,12 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     show_default=True,
     help="Sigma points √(n + κ) σ out, as the thesis has them, or α times that: better in a map with many edges.",
 )
-@_number("--alpha", "alpha", options.FiniteRange(0, 1, min_open=True), "α of --transform scaled.")
-@_number("--beta", "beta", NOT_NEGATIVE, "β of --transform scaled.")
-@_number("--kappa", "kappa", NOT_NEGATIVE, "κ of either transform.")
+@_number("--alpha", "alpha", "α of --transform scaled.", options.FiniteRange(0, 1, min_open=True))
+@_number("--beta", "beta", "β of --transform scaled.")
+@_number("--kappa", "kappa", "κ of either transform.")
 @click.option("--smooth", is_flag=True, help="Smooth the path afterwards with all measurements.")
-@_number("--particles", "particles", click.IntRange(10, 1000000), "Of --filter mcl.")
-@_number("--seed", "seed", click.IntRange(min=0), "Of --filter mcl.")
+@_number("--particles", "particles", "Of --filter mcl.", click.IntRange(10, 1000000))
+@_number("--seed", "seed", "Of --filter mcl.", click.IntRange(min=0))
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
     "--plot",

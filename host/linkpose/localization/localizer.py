@@ -159,6 +159,8 @@ class Localizer:
             grid or no_map(),
             drifts_of(settings, motion),
         )
+        # Of a row: all but the drifts of the ranges, which come last.
+        self.states = tuple(name for name in motion.states if not name.startswith(DRIFT))
         self.sensors = MeasurementBuilder(settings, motion, beacons)
         self.control, self.hold = np.zeros(motion.controls), np.ones(motion.noises)
         self.now = head[0].time_s
@@ -224,8 +226,9 @@ class Localizer:
         self.filter.drifts = drifts_of(settings, self.filter.motion)
 
     def _add_drifts(self) -> None:
-        """Adds a state for the drifting error of each beacon's ranges. The pose so far has assumed that there is none,
-        so that it is off by as much.
+        """Adds a state for the drifting error of each beacon's ranges.
+
+        The pose so far assumed no drift, so its variance grows by that of the drift.
         """
         before, beacons = self.filter, self.sensors.beacons
         motion = before.motion.extended(tuple(map(drift_state, beacons)))
@@ -237,11 +240,6 @@ class Localizer:
         self.filter = replace(before, motion=motion, state=state, covariance=covariance)
         self.sensors = MeasurementBuilder(self.settings, motion, beacons, self.sensors)
         self.relocator = Relocator(motion, self.sensors)
-
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the states in a row: all but the drifts of the ranges, which come last."""
-        return tuple(name for name in self.filter.motion.states if not name.startswith(DRIFT))
 
     def track(self, rows: Sequence[Row]) -> Track:
         """The path of all rows, with the counts so far. Raises LinkposeError for an estimate that is infinite."""

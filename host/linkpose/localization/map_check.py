@@ -43,8 +43,10 @@ def check_map(log: Log, grid: GridMap, share: float, origin: str) -> str:
 
     Raises MapMismatch where the scans fit the map much better after one of CHANGES.
     """
+    if share >= LEAST_SHARE:
+        return ""
     scans = [points for points in map(beam_ends, _spread(log)) if len(points) >= FEWEST_BEAMS]
-    if share >= LEAST_SHARE or not scans:
+    if not scans:
         return ""
     matcher = ScanMatcher(grid)
     best_share, likelihood = _fit(matcher, scans, (1.0, 1.0))

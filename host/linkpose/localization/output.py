@@ -17,7 +17,7 @@ _UNITS = ("rad_s", "m_s", "rad", "m")  # of states, the longer ones first
 
 
 def table_of(tracks: Mapping[str, Track], log: Path) -> Table:
-    """The paths by filter, with one time axis, as `write_tracks` writes them; `log` names the table."""
+    """The paths by filter, with one time axis, as `write_table` writes them; `log` names the table."""
     first = next(iter(tracks.values()))
     columns = {"time_s": first.time_s}
     for name, track in tracks.items():
@@ -28,11 +28,10 @@ def table_of(tracks: Mapping[str, Track], log: Path) -> Table:
     return Table(log, "estimate", columns, metadata, {"rows": len(first.time_s), **rejected}, 1)
 
 
-def write_tracks(path: Path, tracks: Mapping[str, Track], log: Path, force: bool) -> None:
+def write_table(path: Path, table: Table, force: bool) -> None:
     """The estimate CSV: `time_s`, then for each filter its states, their standard deviations, and the covariances of x,
     y and the heading. Raises LinkposeError where the file cannot be made.
     """
-    table = table_of(tracks, log)
     with CsvFile(path, table.kind, table.metadata, list(table.columns), force) as file:
         rows = np.column_stack(list(table.columns.values()))
         line = "%.6f" + ",%.9g" * (rows.shape[1] - 1) + "\n"

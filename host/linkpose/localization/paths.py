@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -20,7 +21,7 @@ from linkpose.localization.maps import load_map
 from linkpose.localization.measuring import default_constants
 from linkpose.localization.odometry import with_mice_odometry
 from linkpose.localization.options import LocalizationOptions
-from linkpose.localization.output import table_of, write_tracks
+from linkpose.localization.output import table_of, write_table
 from linkpose.localization.plausibility import check_units
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons, PathScore, Truth, read_beacons, read_truth, score_track
@@ -38,7 +39,7 @@ Places = Mapping[str, Sequence[float]]
 IN_MEMORY = Path("the log")  # names a log that was not read from a file
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Paths:
     """What `localize` returns: the path of each filter, a row for each instant with a measurement.
 
@@ -56,7 +57,7 @@ class Paths:
         """Names of the filters that ran."""
         return tuple(self.tracks)
 
-    @property
+    @functools.cached_property
     def table(self) -> Table:
         """All columns with the names of the file that `save` writes."""
         return table_of(self.tracks, self.log)
@@ -107,7 +108,7 @@ class Paths:
 
     def save(self, path: PathName, *, force: bool = False) -> None:
         """Writes an estimate CSV, as `linkpose localize -o` does. Raises FileExists (unless `force`), CannotWrite."""
-        write_tracks(Path(path), self.tracks, self.log, force)
+        write_table(Path(path), self.table, force)
 
 
 def localize(
@@ -167,7 +168,8 @@ class PreparedLog:
             track = estimate_track(self.log, method, chosen, self.grid, self.beacons, str(self.origin))
             if method == "scan-match" and self.grid is not None:
                 share = track.applied / max(track.applied + track.rejected, 1)
-                remarks += tuple(filter(None, [check_map(self.log, self.grid, share, str(self.origin))]))
+                if remark := check_map(self.log, self.grid, share, str(self.origin)):
+                    remarks += (remark,)
             track.check_applied(str(self.origin), method)
             tracks[method] = track
         return Paths(tracks, self.origin, remarks, next(iter(settings.values())))
