@@ -28,7 +28,7 @@ _METRES = {"m": 1.0, "meters": 1.0, "dm": 0.1, "cm": 0.01, "centimeters": 0.01, 
 _FARTHEST_M = 1e6
 _LARGEST = 1e15  # of a coordinate in any unit; larger ones count as hidden
 # Bounds of the process that reads a C3D file, for an empty file and for each byte. An hour of ten markers at 100 Hz
-# (60 MB) takes 2 s and 0.2 GB; starting takes up to 3 s on a busy machine. Twice of them: a damaged file costs twice.
+# (60 MB) takes 2 s and 0.2 GB; starting takes up to 3 s on a busy machine. Doubled: a damaged file costs twice.
 _LONGEST_S = 8.0
 _LONGEST_S_PER_BYTE = 2e-7
 _MOST_BYTES = 400_000_000
@@ -57,8 +57,8 @@ def read_c3d(path: Path, up: str | None) -> Table:
     except ImportError as error:
         raise MissingLibrary("ezc3d", path) from error
     try:
-        check_sizes(data := read_bytes(path))
-        positions, names, rate_hz, unit, screen, first = _read_in_child(path, len(data))
+        check_sizes(read_bytes(path))
+        positions, names, rate_hz, unit, screen, first = _read_in_child(path)
     except Damaged as error:
         raise FileFormatError(path, f"{path} is damaged or no C3D file: {error}; export the take again") from error
     positions[~(np.abs(positions) < _LARGEST)] = np.nan
@@ -95,12 +95,12 @@ numpy.savez(sys.argv[2], positions=positions, facts=json.dumps(facts))
 """
 
 
-def _read_in_child(path: Path, size: int) -> tuple[Floats, list[str], float, str, str, int]:
-    """Positions (N, markers, 3), names, rate (Hz), unit, vertical axis of the screen, and number of the first frame,
-    of a file of `size` bytes.
+def _read_in_child(path: Path) -> tuple[Floats, list[str], float, str, str, int]:
+    """Positions (N, markers, 3), names, rate (Hz), unit, vertical axis of the screen, and number of the first frame.
 
     Raises Damaged where ezc3d cannot read the file within the bounds.
     """
+    size = path.stat().st_size
     most_bytes = _MOST_BYTES + _MOST_BYTES_PER_BYTE * size
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder, "take.npz")

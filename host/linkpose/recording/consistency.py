@@ -9,6 +9,7 @@ and r are reversed with it; `units.is_negated` therefore needs a known J2S.
 
 from __future__ import annotations
 
+import functools
 import itertools
 
 import numpy as np
@@ -16,8 +17,8 @@ import numpy as np
 from linkpose.sensors.measurements import Floats, Measurements
 
 _WINDOW = 50  # samples: half a second at 100 Hz, in which a gyro's offset turns the tilt little; doubled, twice as far
-_PERIOD_S = 0.01  # samples closer than this are averaged, at most _MOST_AVERAGED: a wrong unit of time is no reason
-_MOST_AVERAGED = 5
+_PERIOD_S = 0.01  # samples closer than this are averaged; a wrong unit of time must not average more than
+_MOST_AVERAGED = 5  # of them
 _WINDOWS = 30  # those with the fastest motion; twice of them take twice as long (50 ms)
 _FEWEST_WINDOWS = 3
 # A contradiction is reported where a change leaves less than these parts of what is left without it, and of the
@@ -46,10 +47,10 @@ def contradiction(measurements: Measurements) -> str:
     as_is = (motion := _Motion(rate, step_s)).unexplained(force)
     if not _CLEAR_M_S2 < as_is < np.inf or variation < _CLEAR_M_S2:
         return ""
-    left = {f"{factor:g}": _Motion(factor * rate, step_s).unexplained(force) for factor in _FACTORS}
-    reversed_ = _Motion(-rate, step_s)
-    for name, (sign, axes) in _EXCHANGES.items():
-        left[name] = (motion if sign > 0 else reversed_).unexplained(force @ axes.T)
+    motions = {factor: _Motion(factor * rate, step_s) for factor in _FACTORS}
+    left = {f"{factor:g}": scaled.unexplained(force) for factor, scaled in motions.items()}
+    for name, (sign, axes) in _exchanges().items():
+        left[name] = (motion if sign > 0 else motions[-1.0]).unexplained(force @ axes.T)
     best = min(left.values())
     if best > _BETTER * as_is or best > _EXPLAINS * variation:
         return ""
@@ -57,7 +58,7 @@ def contradiction(measurements: Measurements) -> str:
 
 
 def _silent(gyro: Floats, accel: Floats) -> str:
-    """A sentence on axes of the gyro that read the same in all rows. Data without any noise are of a simulation."""
+    """A sentence on axes of the gyro that read the same in all rows. Data without noise come from a simulation."""
     same = np.ptp(gyro, axis=0) == 0
     known = accel[np.isfinite(accel).all(axis=1)]
     if not same.any() or len(known) < _WINDOW or (np.ptp(known, axis=0) == 0).any():
@@ -72,7 +73,7 @@ def _sentence(names: list[str]) -> str:
     name = names[0]
     if name == "-1":
         return "gyro_* states the reverse of the rotation of gravity: its sign is wrong"
-    if name in _EXCHANGES:
+    if name in _exchanges():
         how = f" ({name})" if len(names) == 1 else ""
         return f"accel_* and gyro_* do not have the same axes{how}: were columns exchanged, or an axis reversed?"
     factor = float(name)
@@ -84,11 +85,12 @@ def _sentence(names: list[str]) -> str:
     )
 
 
+@functools.cache
 def _exchanges() -> dict[str, tuple[int, Floats]]:
     """Exchanges and reversals of axes: sign of the gyro, and rotation (3, 3) of the accelerometer's axes, by name.
 
     A rotation of the accelerometer's axes is also named by its reverse, which fits as well, if that reverses fewer. A
-    rotation with a reversed gyro is named by what it is of the gyro's axes.
+    rotation with a reversed gyro is named by the change of the gyro's axes.
     """
     found: dict[str, tuple[int, Floats]] = {}
     for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)):
@@ -102,9 +104,6 @@ def _exchanges() -> dict[str, tuple[int, Floats]]:
 def _axes_text(axes: Floats) -> str:
     """Such as "y, x, -z"."""
     return ", ".join("-" * int(row.min() < 0) + _AXES[np.abs(row).argmax()] for row in axes)
-
-
-_EXCHANGES = _exchanges()
 
 
 def _windows(measurements: Measurements) -> tuple[float, Floats, Floats] | None:
