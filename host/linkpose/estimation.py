@@ -62,7 +62,7 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
-_LONGEST_STEP_S = 0.1  # of the time for which a sample stands where others were lost
+_LONGEST_STEP_S = 0.1  # the longest time that one sample counts for, where others were lost
 
 
 class ExcludedMice:
@@ -85,12 +85,12 @@ class ExcludedMice:
         """Count the exclusions in the estimates (N, columns) of a block of N samples."""
         if not self._columns or not len(block):
             return
-        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=self._last_s)), 0.0, _LONGEST_STEP_S)
-        self._last_s = float(block.time_s[-1])
+        last_s, self._last_s = self._last_s, float(block.time_s[-1])
         masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
         self.now = set()
         if not masks.any():
             return
+        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=last_s)), 0.0, _LONGEST_STEP_S)
         valid = np.isfinite(block.mice_counts).all(axis=2)
         excluded = valid & (masks[:, None] >> np.arange(valid.shape[1]) & 1 != 0)
         for port in np.flatnonzero(excluded.any(axis=0)).tolist():
@@ -322,7 +322,6 @@ class LiveEstimator:
     def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
         """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
         self._estimator, self._filters = estimator, estimator.filters
-        self._excluded = estimator.excluded
         self._width = [len(f.columns) for f in estimator.filters]
         self._is_ready = is_ready
         self._blocks: list[Measurements] = []  # not yet processed by all filters
@@ -361,7 +360,7 @@ class LiveEstimator:
             return self._rows(0, 0)
         rows, first = self._rows(0, count), 0
         for block in self._blocks[:count]:
-            self._excluded.count(block, rows[first : first + len(block)])
+            self._estimator.excluded.count(block, rows[first : first + len(block)])
             first += len(block)
         del self._blocks[:count]
         for results in self._results:

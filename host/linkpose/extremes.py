@@ -13,11 +13,9 @@ from linkpose import quantities
 if TYPE_CHECKING:
     from linkpose.sensors.measurements import Floats
 
-BLOCKS = 250  # of estimates whose extremes are found at once
-
-
+ROWS = 1000  # of estimates that wait until their extremes are found at once; live blocks have a few rows
 _OF_A_ROBOT = (quantities.X, quantities.Y)  # a link's filter has them too, where its yaw is known to a constant alone
-# What the end of a run lists. A heading turns on past every bound, so its lowest and highest value say nothing.
+# What the end of a run lists. A heading turns on past every bound, so its lowest and highest value are meaningless.
 _LISTED = (
     quantities.HEIGHT,
     quantities.ANGLE,
@@ -47,17 +45,20 @@ class Extremes:
         self._squares = dict.fromkeys(self._of, 0.0)
         self._count = dict.fromkeys(self._of, 0)
         self._waiting: list[Floats] = []  # blocks not yet in these
+        self._waiting_rows = 0
 
     def add(self, estimates: Floats) -> None:
         """Adds a block of estimates (N, columns)."""
         self._waiting.append(estimates)
-        if len(self._waiting) >= BLOCKS:
+        self._waiting_rows += len(estimates)
+        if self._waiting_rows >= ROWS:
             self._fold()
 
     def _fold(self) -> None:
         """Adds the waiting blocks at once: NumPy takes 0.3 ms for one row as for a thousand."""
         estimates = np.concatenate(self._waiting)
         self._waiting.clear()
+        self._waiting_rows = 0
         for key, (value_at, std_at) in self._of.items():
             known = np.isfinite(estimates[:, value_at])
             if not known.any():

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,7 +16,7 @@ from linkpose.recording.writer import RecordingWriter, closing, layout_of, metad
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.devices import MOUSE_VALID, slow_mouse_remarks
 from linkpose.sensors.health import HealthMonitor, expected_sensors
-from linkpose.sensors.measurements import Block, Measurements
+from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
 
@@ -54,7 +55,7 @@ class Recorder:
         """
         block = self._converter.convert_placed([p.sample for p in placements], [p.place for p in placements])
         if self._writer is not None and placements:
-            self._write(self._writer, block)
+            self._write(self._writer, partial(self._writer.write_block, block))
         checked, changes = self.monitor.check(block.measurements)
         for change in changes:
             self._session.notify(str(change))
@@ -67,18 +68,15 @@ class Recorder:
         """The recording, which has another name than at the start if another program took the file away."""
         return self._path
 
-    def _write(self, writer: RecordingWriter, block: Block) -> None:
-        """Writes rows, into a new file if another program removed or changed the recording."""
+    def _write(self, writer: RecordingWriter, write: Callable[[], None]) -> None:
+        """Writes, into a new file if another program removed or changed the recording."""
         try:
-            writer.write_block(block)
+            write()
         except FileChanged as change:
-            self._continue_elsewhere(writer, change)
-            writer.write_block(block)
-
-    def _continue_elsewhere(self, writer: RecordingWriter, change: FileChanged) -> None:
-        writer.continue_elsewhere()
-        self._path = writer.path
-        self._session.notify(f"{change}; the recording goes on in {writer.path}")
+            writer.continue_elsewhere()
+            self._path = writer.path
+            self._session.notify(f"{change}; the recording goes on in {writer.path}")
+            write()
 
     def _report_speed_limits(self) -> None:
         """Once the board has measured its polls, report mice that the rig's calibration shows to overflow early."""
@@ -115,11 +113,7 @@ class Recorder:
                 if self.marks:
                     more["marks"] = [round(time_s, 6) for time_s in sorted(self.marks)]
                 end = closing(timeline, health.corrupt, health.drift_ppm, **more)
-                try:
-                    writer.close(end)
-                except FileChanged as change:
-                    self._continue_elsewhere(writer, change)
-                    writer.close(end)
+                self._write(writer, partial(writer.close, end))
 
     def __enter__(self) -> Recorder:
         return self

@@ -180,17 +180,18 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     head: dict[str, Any] = {"recording": str(path), "filters": [f.name for f in estimator.filters]}
     head |= {"smooth": request.smooth, "mag": request.mag, "rig": rig.as_dict()}
     rows = 0
-    extremes = Extremes(estimator.columns)
     with Sink(estimator, request, head) as sink:
+        extremes = None if sink.gives_rows else Extremes(estimator.columns)
         blocks = iter([recording.load()]) if request.smooth else recording.blocks()
         for estimates in ahead(map(estimator.process, blocks)):
             sink.write(estimates)
-            extremes.add(estimates)
+            if extremes is not None:
+                extremes.add(estimates)
             rows += len(estimates)
             share = rows / recording.survey.rows
             console.progress(lambda share=share: f"estimating {path} {share:.0%}")  # type: ignore[misc]
         sink.close({"rows": rows, **estimator.outcome})
-    if not sink.gives_rows:
+    if extremes is not None:
         console.clear()
         for line in final_table(extremes.summary(), shutil.get_terminal_size().columns):
             click.echo(line)
@@ -200,7 +201,7 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     if request.output:
         options.show_next(console.is_quiet, "plot", request.output)
     elif not sink.gives_rows:
-        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.ESTIMATES)
+        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.new_estimates())
 
 
 def _smooth(estimator: Estimator) -> None:

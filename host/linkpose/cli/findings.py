@@ -22,7 +22,6 @@ def report_running(estimator: Estimator, joint: Joint | None, console: Console) 
     Raises LinkposeError if J2S is to be estimated and no filter that runs does it.
     """
     from linkpose import filters
-    from linkpose.filters import REGISTRY
 
     if joint is not None and joint.known_j2s_m is None and estimator.found_j2s is None:
         name = next(name for name, able in filters.REGISTRY.items() if able.j2s == "guess")
@@ -32,8 +31,8 @@ def report_running(estimator: Estimator, joint: Joint | None, console: Console) 
         names = ", ".join(name for name, why in left_out.items() if why == reason)
         console.detail(f"not running: {names}: {reason}")
     missing = [name for name, reason in estimator.left_out.items() if isinstance(reason, MissingJ2S)]
-    is_robot = any(REGISTRY[f.name].is_odometric for f in estimator.filters)  # J2S is nothing to a robot
-    if missing and not is_robot and any(REGISTRY[f.name].sensors for f in estimator.filters):
+    is_robot = any(filters.REGISTRY[f.name].is_odometric for f in estimator.filters)  # which does not use J2S
+    if missing and not is_robot and any(filters.REGISTRY[f.name].sensors for f in estimator.filters):
         console.report(left_out[missing[0]])
     others = " (-v: why not others)" if left_out else ""
     console.report(f"Running: {', '.join(f.name for f in estimator.filters)}{others}")

@@ -69,7 +69,7 @@ class SecondsType(click.ParamType):  # type: ignore[type-arg]
         return seconds
 
 
-# Of numbers in options: squares of larger ones, and divisions by smaller ones, leave the range of numbers in a filter.
+# Bounds of numbers in options: products of several much larger or smaller ones leave the range of numbers.
 LARGEST, SMALLEST = 1e9, 1e-9
 
 
@@ -275,24 +275,21 @@ def quiet(function: Function) -> Function:
     return click.option("-q", "--quiet", is_flag=True, help="Print results and errors only.")(function)
 
 
-ESTIMATES = "estimate.csv"  # the file of estimates that `show_next` proposes, numbered where it exists
-
-
 def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
     """The command to type next, and the one after it, on stderr; nothing where a file is the standard output."""
     if quiet or "-" in map(str, words):
         return
     for when, command in (("next", words), ("then", then)):
         if command:
-            free = [_free_name(str(word)) if word == ESTIMATES else word for word in command]
-            click.echo(f"{when}: {typed(free)}", err=True)
+            click.echo(f"{when}: {typed(command)}", err=True)
 
 
-def _free_name(name: str) -> str:
-    """This name of a file, with the first number that makes it new where the file exists: estimate-2.csv."""
-    path = Path(name)
-    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-    return str(next(free for free in itertools.chain([path], numbered) if not free.exists()))
+def new_estimates() -> Path:
+    """The file of estimates to propose: estimate.csv, or estimate-2.csv and so on where it exists."""
+    from linkpose.recording.csvfile import numbered
+
+    path = Path("estimate.csv")
+    return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())
 
 
 def typed(words: Iterable[object]) -> str:

@@ -83,7 +83,7 @@ def command(
         live.run_board(connected, duration, handle)
         path = connected.recording or path
         live.show_summary(console, connected.health, json_lines, options.written(path))
-        options.show_next(quiet, "estimate", path, "-o", options.ESTIMATES)
+        options.show_next(quiet, "estimate", path, "-o", options.new_estimates())
         connected.check_usable()
 
 

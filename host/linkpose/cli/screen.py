@@ -41,7 +41,7 @@ POINT_INTERVAL_S = 0.05  # between two points of a curve: a column of dots is wi
 PATH_POINTS = 4000  # of the map; older ones are thinned out
 WIDEST = 78
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
-LEAST_ANGLE_DEG = 5.0  # ditto, of a joint angle
+LEAST_ANGLE_DEG = 5.0  # that the axis of a joint angle covers
 _FAULTS, _HEADLINE = 10, 8  # priorities of sections
 
 Points = deque[tuple[float, float]]  # time (s) and value

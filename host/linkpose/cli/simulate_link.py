@@ -64,8 +64,6 @@ def command(
     )  # fmt: skip
     write_link(run, output, truth, force)
     held = ("--mag",) if has_mag and level != "datasheet" else ()  # a data sheet's specimen has no calibration
-    calibrate, estimate = (
-        ("calibrate", "imu", output, "--rig", "rig.toml"),
-        ("estimate", output, *held, "-o", options.ESTIMATES),
-    )
+    calibrate = ("calibrate", "imu", output, "--rig", "rig.toml")
+    estimate = ("estimate", output, *held, "-o", options.new_estimates())
     options.show_next(quiet, *(calibrate if rests else estimate))

@@ -34,8 +34,6 @@ from linkpose.sensors.rig import Rig
 if TYPE_CHECKING:
     import viser
 
-    from linkpose.sensors.rig import Rig
-
 Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose import filters
 from linkpose.evaluation.statistics import normalised_errors
 from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, others_hide_best
-from linkpose.plotting.sources import shortened
+from linkpose.plotting.sources import is_barometric, shortened
 from linkpose.presentation import same_digits, with_unit
 from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
 from linkpose.sensors.measurements import Floats
@@ -77,7 +76,7 @@ def _shown(scores: Sequence[Score]) -> list[Score]:
     """The filters that are drawn: no barometric ones, and beside a chain no filters of one of its sensors."""
     if chains := [score for score in scores if ROTATION.name in score.errors]:
         return chains
-    quiet = [s for s in scores if not ((of := filters.capabilities(s.filter)) and of.is_barometric)]
+    quiet = [score for score in scores if not is_barometric(score.filter)]
     return quiet or list(scores)
 
 

@@ -18,7 +18,7 @@ import json
 import os
 import stat
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -81,8 +81,8 @@ class CsvFile:
         has_all_rows = not _is_changed(self._fd)
         with os.fdopen(self._fd, "rb") as old:
             self._fd = -1
-            for number in itertools.count(2):
-                self.path = self._asked.with_name(f"{self._asked.stem}-{number}{self._asked.suffix}")
+            for path in numbered(self._asked):
+                self.path = path
                 with contextlib.suppress(FileExists):
                     self._open(force=False)
                     break
@@ -116,8 +116,7 @@ class CsvFile:
         if self._beside is not None:
             os.close(create(metadata_path(self.path), force))
         self._fd = create(self.path, force)
-        # What is behind - or /dev/stdout may have no name, and other programs may write it.
-        self._is_own = os.fstat(self._fd).st_nlink > 0 and self.path != STDOUT
+        self._is_own = os.fstat(self._fd).st_nlink > 0  # what is behind /dev/stdout may have no name
         self._write_beside()
 
     def _write_beside(self) -> None:
@@ -132,6 +131,11 @@ class CsvFile:
     def _release(self) -> None:
         os.close(self._fd)
         self._fd = -1
+
+
+def numbered(path: Path) -> Iterator[Path]:
+    """Further names for a file: run-2.csv, run-3.csv and so on for run.csv."""
+    return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
 
 
 def create(path: Path, force: bool) -> int:
@@ -167,9 +171,12 @@ def _standard_output() -> int:
 
 
 def check_unchanged(fd: int, path: Path) -> None:
-    """Raises FileChanged when another program removed the file, or changed its size. A pipe or a device has none."""
+    """Raises FileChanged when another program removed the file, or changed its size.
+
+    A pipe or a device has no size, and other programs may write what is behind the standard output.
+    """
     of = os.fstat(fd)
-    if not stat.S_ISREG(of.st_mode):
+    if path == STDOUT or not stat.S_ISREG(of.st_mode):
         return
     if of.st_nlink == 0:
         raise FileChanged(path, "it was removed while it was being written")
