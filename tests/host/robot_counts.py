@@ -17,6 +17,7 @@ STEP_S, STEPS_PER_SAMPLE = 0.001, 10
 TRIANGLE = ((0.12, 0.0), (-0.08, 0.11), (-0.08, -0.11))
 COUNTS_PER_M = 8000.0
 DEG = np.pi / 180
+BIAS_DEG_S, WHITE_DEG_S = 0.4, 0.07
 
 LEGS = (
     (2.0, 0.0, 0.0), (2.5, 0.4, 0.0), (2.0, 0.3, 0.9), (2.5, 0.5, 0.0), (1.5, 0.0, -1.5), (3.0, 0.3, 0.0),
@@ -48,30 +49,28 @@ def robot(seed: int = 0, legs: tuple[tuple[float, float, float], ...] = LEGS) ->
     return Robot(speed, turn_rate, np.arange(len(speed))[at] * STEP_S, np.column_stack([x, y, heading])[at], seed)
 
 
-def gyro(run: Robot, bias_deg_s: float = 0.4, white_deg_s: float = 0.07) -> np.ndarray:
-    """Rate (rad/s) at the samples."""
+def gyro(run: Robot) -> np.ndarray:
+    """Rate (rad/s) at the samples, with the noise of a real MPU-6050."""
     noise = np.random.default_rng([run.seed, 1]).standard_normal(len(run.time_s))
-    return run.turn_rate[::STEPS_PER_SAMPLE] + DEG * (bias_deg_s + white_deg_s * noise)
+    return run.turn_rate[::STEPS_PER_SAMPLE] + DEG * (BIAS_DEG_S + WHITE_DEG_S * noise)
 
 
 def counts(
     run: Robot,
     places: tuple[tuple[float, float], ...] = TRIANGLE,
-    counts_per_m: float | tuple[float, ...] = COUNTS_PER_M,
-    angles_deg: tuple[float, ...] = (0.0,) * 4,
+    counts_per_m: float = COUNTS_PER_M,
     seen: np.ndarray | None = None,
     limit: int | None = None,
 ) -> np.ndarray:
     """(N, M, 2): each mouse sees the share `seen` (steps, M) of its motion; `limit` cuts the counts of a sample off."""
     rng = np.random.default_rng([run.seed, 2])
-    per_m = np.broadcast_to(counts_per_m, len(places))
     out = np.zeros((len(run.time_s), len(places), 2))
     for i, (x, y) in enumerate(places):
         motion = (run.speed - run.turn_rate * y) + 1j * run.turn_rate * x
         motion = motion + 0.003 * np.abs(motion) * (rng.standard_normal((len(motion), 2)) @ [1, 1j])
         if seen is not None:
             motion = motion * seen[:, i]
-        way = np.cumsum(motion * np.exp(-1j * DEG * angles_deg[i])) * STEP_S * per_m[i]
+        way = np.cumsum(motion) * STEP_S * counts_per_m
         whole = np.floor(np.column_stack([way.real, way.imag]) + rng.uniform(0, 1, 2))[::STEPS_PER_SAMPLE]
         out[1:, i] = np.diff(whole, axis=0)
     return out if limit is None else np.clip(out, -limit, limit)
