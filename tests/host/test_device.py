@@ -6,6 +6,8 @@ import json
 import os
 import random
 import re
+import subprocess
+import sys
 import threading
 import time
 import types
@@ -15,6 +17,7 @@ import numpy as np
 import pytest
 from pty_board import PtyBoard, link_run
 from serial.tools import list_ports_common
+from terminal import HOST
 
 from linkpose.device import ports
 from linkpose.device import session as session_module
@@ -539,6 +542,17 @@ def test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence(tmp_
     with raw_capture(raw) as file, Session("sim://link?speed=0", print, file) as session, refusal:
         for _ in session.stream(2):
             raw.unlink(missing_ok=True)
+
+
+def test_a_raw_capture_is_added_to_what_the_standard_output_has(tmp_path):
+    record = ("record", "r.csv", "--raw", "-", "--port", "sim://link?speed=0", "--duration", "1", "-q")
+    with (tmp_path / "all.bin").open("ab") as behind:
+        behind.write(b"before")
+        behind.flush()
+        environment = {**os.environ, "PYTHONPATH": str(HOST)}
+        command = [sys.executable, "-m", "linkpose", *record]
+        done = subprocess.run(command, stdout=behind, cwd=tmp_path, env=environment, check=False)
+    assert done.returncode == 0 and len((tmp_path / "all.bin").read_bytes()) > 3000
 
 
 def test_a_recording_is_not_called_a_raw_capture(refused, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import linkpose as lp
+from linkpose.cli import options
 from linkpose.sensors.rig import Chain
 
 KINDS = {
@@ -68,6 +69,13 @@ def test_the_proposed_file_of_estimates_is_new(linkpose, tmp_path, monkeypatch):
     Path("estimate-2.csv").touch()
     typed = ("simulate", "link", "-o", "r.csv", "--truth", "t.csv", "--duration", 3)
     assert linkpose(*typed).err == "next: linkpose estimate r.csv -o estimate-3.csv\n"
+
+
+def test_a_recording_named_as_the_proposed_file_keeps_its_name(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("estimate.csv").touch()
+    options.show_next(False, "estimate", "estimate.csv", "-o", options.new_estimates())
+    assert capsys.readouterr().err == "next: linkpose estimate estimate.csv -o estimate-2.csv\n"
 
 
 def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):

@@ -29,10 +29,9 @@ _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the who
 TimePanel = tuple[float, Callable[["Axes"], None]]
 
 
-def path_panel(sources: Sources, scene: Surroundings | None) -> Callable[[Axes], None] | None:
+def path_panel(sources: Sources, scene: Surroundings | None, wide: bool) -> Callable[[Axes], None] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
     tracks = _with_path(sources)
-    wide = is_wide(sources, scene)
     return (lambda axes: _path(axes, tracks, scene or Surroundings(), wide)) if tracks else None
 
 
@@ -52,12 +51,15 @@ def _with_path(sources: Sources) -> list[DrawnTrack]:
     return [track for track in sources.all if track.has(X, Y) and HEIGHT not in track.values]
 
 
-def time_panels(sources: Sources, scene: Surroundings | None = None) -> list[TimePanel]:
-    """Error of the position, speed, unwrapped heading and the mice left out, as far as a filter estimates them."""
+def time_panels(sources: Sources, wide: bool) -> list[TimePanel]:
+    """Error of the position, speed, unwrapped heading and the mice left out, as far as a filter estimates them.
+
+    `wide` is whether the panels take the whole width.
+    """
     found: list[TimePanel] = []
     shown = sources.tracks or sources.all
     if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
-        columns = 6 if is_wide(sources, scene) else 2
+        columns = 6 if wide else 2
         if hides_best(sources, "position"):
             found.append((1.4, lambda axes: _position_errors(axes, sources, columns, best_only=True)))
         found.append((1.8, lambda axes: _position_errors(axes, sources, columns)))

@@ -161,9 +161,10 @@ def _chain(sources: Sources) -> Section | None:
 
 def _robot(sources: Sources, scene: Surroundings | None) -> Section | None:
     """The path, then speed, heading and the mice left out over time."""
-    path = robots.path_panel(sources, scene)
-    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources, scene)]
-    return Section(over_time, path, robots.is_wide(sources, scene)) if path or over_time else None
+    wide = robots.is_wide(sources, scene)
+    path = robots.path_panel(sources, scene, wide)
+    over_time = [PlotPanel(share, draw) for share, draw in robots.time_panels(sources, wide)]
+    return Section(over_time, path, wide) if path or over_time else None
 
 
 def _readings(table: Table) -> Section | None:
