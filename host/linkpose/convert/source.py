@@ -36,7 +36,7 @@ class Source:
         for block in self.blocks():
             self.rows += len(block[self.names[0]])
             if "time_s" in block:
-                times.append(block["time_s"])
+                times.append(block["time_s"].copy())  # a view would hold all columns of the block
                 for prefix, rows in known.items():
                     rows.append(poses_of(block, prefix).is_known)
         self.closing = file.closing
