@@ -155,9 +155,9 @@ def test_scale_angle_and_position_are_within_their_standard_deviations(turns, cl
     z = []
     for seed in range(8):
         rng = np.random.default_rng([seed, 7])
-        exact = ring(3)
+        exact, ruler = ring(3), rng.normal(0, 1e-3, (3, 2)).tolist()
         stated = Rig(
-            mouse=tuple(replace(m, x_m=m.x_m + x, y_m=m.y_m + y) for m, (x, y) in zip(exact, rng.normal(0, 1e-3, (3, 2))))
+            mouse=tuple(replace(m, x_m=m.x_m + x, y_m=m.y_m + y) for m, (x, y) in zip(exact, ruler, strict=True))
         )
         run, line = driven("line", seed)
         whole = turns + np.radians(closing_deg) * rng.standard_normal() / (2 * np.pi)
