@@ -112,11 +112,13 @@ def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
 @inner
 def _nearly_sound(state: Record, m: Record, mice: Records) -> int:
     """All mice; of two, the excluded one only where its motion differs no more than a jump of the gyro explains."""
-    velocity, turn_rate, nearly = complex(state.at.vx, state.at.vy), state.at.wz, m.sound & ~m.excluded
-    if nearly == NOBODY or number(m.sound) > 2:
-        return m.sound
+    everybody: int = m.sound
+    nearly: int = trusted(m)
+    if nearly == NOBODY or number(everybody) > 2:
+        return everybody
+    velocity, turn_rate = complex(state.at.vx, state.at.vy), state.at.wz
     for i in range(m.count):
-        if m.sound >> i & 1:
+        if everybody >> i & 1:
             expected = velocity + scaled(turn_rate, mice[i].arm)
             off2 = square(scaled(1.0 / m.step, mice[i].moved) - expected)
             if off2 < _NEARLY_SHARE**2 * square(expected) + _NEARLY_M_S**2:
