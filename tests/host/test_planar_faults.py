@@ -184,7 +184,7 @@ def test_slips_in_some_turns_widen_the_position():
 
 
 def test_one_count_in_a_second_does_not_end_a_rest():
-    run = robot(11)
+    run = robot(11, ((6.0, 0.0, 0.0), *LEGS))
     creeping = counts(run)
     creeping[50::100, 1, 0] += np.all(creeping[50::100] == 0, axis=(1, 2))
     _, out, _ = estimated(run, rig(), measurements(run, creeping, gyro(run)))

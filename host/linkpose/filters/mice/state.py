@@ -72,6 +72,7 @@ MOUSE = np.dtype(
         ("reports", "i8"),  # readings with counts
         ("missing", "i8"),  # readings taken for missing reports
         ("creeps", "i8"),  # single counts at rest
+        ("is_lone", "?"),  # whether the last count came alone after a silence
         ("share", "f8"),  # of the last counts that belongs to the last step
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)

@@ -66,9 +66,9 @@ _BIAS_MARGIN_RAD_S = 0.005
 _SPOILT_Z = 2.0
 _UNKNOWN_SHARE = 0.25  # of the variance to begin with: above it, nothing is lost. Doubled: a mouse wrong from the start
 # turns the others by a degree.
-# One count of a mouse that has hardly changed its counts for half a second does not end a rest. Doubled: a robot that
-# starts slowly loses two counts.
-_CREEPING_CHANGE = 1.4
+# A single count of a mouse that has hardly changed its counts for half a second, with silence of so long (s) after it,
+# is creeping. After so many, one does not end a rest. Doubled: the gyro's bias is measured later.
+_CREEPING_CHANGE, _CREEPING_S, _KNOWN_CREEPS = 1.4, 0.3, 2
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -519,16 +519,28 @@ def _scatter_way(state: Record, p: Record, q: Record, dt: float, missed: float) 
 
 @inner
 def _are_silent(m: Record, mice: Records) -> bool:
-    """Whether no mouse counts, but for a single count now and then: some mice creep at rest."""
+    """Whether no mouse counts, but for single counts of a mouse that creeps at rest."""
     judges = trusted(m) or m.sound
+    is_silent = judges != 0
     for i in range(m.count):
-        mouse = mice[i]
-        creeps = square(mouse.counts) == 1.0 and mouse.change < _CREEPING_CHANGE
-        if judges >> i & 1 and not (mouse.silent_s > 0.0 or creeps):
-            return False
-    for i in range(m.count):
-        mice[i].creeps += square(mice[i].counts) == 1.0 and judges >> i & 1
-    return bool(judges)
+        if judges >> i & 1:
+            is_silent = is_silent & (_is_lone_count(mice[i]) or mice[i].silent_s > 0.0)
+    return bool(is_silent)
+
+
+@inner
+def _is_lone_count(mouse: Record) -> bool:
+    """Whether a mouse that is known to creep gives a single count after long silence; counts such counts.
+
+    A robot that starts gives a single count too, but more after it.
+    """
+    is_lone = square(mouse.counts) == 1.0 and mouse.change < _CREEPING_CHANGE
+    if is_lone or mouse.silent_s >= _CREEPING_S:
+        mouse.creeps += mouse.is_lone and mouse.silent_s >= _CREEPING_S
+        mouse.is_lone = is_lone
+    elif square(mouse.counts) > 0.0:
+        mouse.is_lone = False
+    return bool(is_lone and mouse.creeps >= _KNOWN_CREEPS)
 
 
 @inner

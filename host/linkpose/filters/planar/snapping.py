@@ -20,6 +20,7 @@ _TANGENT, _STD = 0.15, 0.08
 # Readings for which so many counts across the axis are expected; this many readings, of which this share has none, show
 # snapping. Doubled: a bend goes by in which the mice contradict the gyro.
 _EXPECTED_COUNTS, _READINGS, _WITHOUT = 1.5, 8.0, 0.8
+_SHOWN_SHARE = 0.3  # of the gyro's turn that snapping mice show by their motion along the axis. Doubled: none is found
 _LEAST_COUNTS = 4.0  # along the axis: with fewer, directions are not resolved. Doubled: slow motion is not repaired
 # After so many readings of one mouse, all mice are taken for snapping ones: a robot has mice of one kind, and those
 # that lose least would be found last. Doubled: a bend goes by.
@@ -33,6 +34,8 @@ def watch_snapping(state: Record, m: Record, mice: Records, sample: Record) -> N
     if not (m.step > 0.0 and m.mean_rate == m.mean_rate) or state.at_rest:
         return
     velocity, turn_rate = complex(state.at.vx, state.at.vy), m.mean_rate - state.at.bias
+    if m.turn_rate * turn_rate < _SHOWN_SHARE * turn_rate * turn_rate:  # the gyro's turn may be a jump of its bias
+        return
     for i in range(m.count):
         if m.sound >> i & 1:
             mouse = mice[i]
