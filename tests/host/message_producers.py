@@ -322,7 +322,9 @@ MORE: dict[str, dict[str, Producer]] = {
         f"the attitudes of the recording do not determine the hard iron{TOO_LITTLE}": magnetometer(
             spread(500, 2.0) * [1.0, 1.0, 0.0]
         ),
-        f"the recording covers … % of all attitudes{TOO_LITTLE}": magnetometer(spread(2000, 0.33)),
+        f"the recording covers … % of all attitudes{TOO_LITTLE}": magnetometer(
+            np.concatenate([spread(1000, 0.1), -spread(1000, 0.1)])
+        ),
         "the field of … µT is not the earth's (… to … µT): a magnet or iron is near the sensor. … is unchanged; record elsewhere, or add --force": magnetometer(
             2.0 * spread(500, 2.0)
         ),
