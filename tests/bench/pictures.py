@@ -17,7 +17,6 @@ import linkpose as lp
 from linkpose.cli.screen import Screen
 from linkpose.estimation import Estimates
 from linkpose.page import Page, PageStatus
-from linkpose.presentation import RowReader
 from linkpose.simulation.link import PAPER_J2S_M, simulate
 
 ROOT = Path(__file__).parents[2]
@@ -29,10 +28,8 @@ HEALTH: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": "
 
 def draw_terminal(estimates: Estimates) -> None:
     """The terminal view at 80 × 24 after the last row."""
-    rows = RowReader(estimates.columns)
-    screen = Screen(TITLE, rows.filters)
-    for row in estimates.values.tolist():
-        screen.add(row[0], rows.read(row))
+    screen = Screen(TITLE, estimates.columns)
+    screen.add(estimates.values)
     with Path("/dev/null").open("w") as nowhere:
         console = Console(record=True, width=80, file=nowhere)
         console.print(screen.render(HEALTH, 80, 24))

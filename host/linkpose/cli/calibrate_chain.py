@@ -52,8 +52,7 @@ def command(
         click.echo(remark, err=True)
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
         click.echo("The residual is large. Check that each sensor is firm on its own link.", err=True)
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
 def _show(found: ChainCalibration, stated: str | None, of_rig: str) -> None:

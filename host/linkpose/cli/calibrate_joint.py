@@ -58,8 +58,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
             click.echo(
                 "The rig file does not calibrate the sensor: add --imu, or type `linkpose calibrate imu`.", err=True
             )
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
 def _show_weak(found: JointCalibration) -> None:

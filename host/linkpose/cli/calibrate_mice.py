@@ -43,8 +43,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     if not quiet:
         for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
             click.echo(remark, err=True)
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
 def _line(mouse: MouseCalibration) -> str:

@@ -284,6 +284,11 @@ def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
             click.echo(f"{when}: {typed(command)}", err=True)
 
 
+def estimate_command(recording: Path, *flags: object) -> tuple[object, ...]:
+    """The command that estimates over a recording, to propose as the next one."""
+    return "estimate", recording, *flags, "-o", new_estimates()
+
+
 def new_estimates() -> Path:
     """The file of estimates to propose: estimate.csv, or estimate-2.csv and so on where it exists."""
     from linkpose.recording.csvfile import numbered

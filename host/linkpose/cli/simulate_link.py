@@ -65,5 +65,5 @@ def command(
     write_link(run, output, truth, force)
     held = ("--mag",) if has_mag and level != "datasheet" else ()  # a data sheet's specimen has no calibration
     calibrate = ("calibrate", "imu", output, "--rig", "rig.toml")
-    estimate = ("estimate", output, *held, "-o", options.new_estimates())
+    estimate = options.estimate_command(output, *held)
     options.show_next(quiet, *(calibrate if rests else estimate))

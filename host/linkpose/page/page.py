@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from linkpose import quantities
 from linkpose.errors import LinkposeError
+from linkpose.exclusions import Exclusions
 from linkpose.localization.surroundings import Surroundings
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import PageStatus
-from linkpose.presentation import Exclusions, fault_lines, working_sensors
-from linkpose.quantities import EXCLUDED
+from linkpose.presentation import fault_lines, working_sensors
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -78,7 +77,7 @@ class Page:
         self._columns = list(columns)
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
-        self._exclusions = Exclusions()
+        self._exclusions = Exclusions(self._columns)
         self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
         self._status, self._blocks = PageStatus(), 0
         self._updates = 0
@@ -88,7 +87,6 @@ class Page:
         self._closing = threading.Event()
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self._follows_mice = any(EXCLUDED in of for of in quantities.by_filter(columns).values())
         self._build(rig, surroundings or Surroundings())
         self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
         self._thread.start()
@@ -197,12 +195,10 @@ class Page:
         last_anew = max((at for at, (_, is_anew) in enumerate(blocks) if is_anew), default=None)
         if last_anew is not None:
             del blocks[:last_anew]
-            self._history, self._exclusions = History(self._columns), Exclusions()
+            self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
         rows = np.vstack([rows for rows, _ in blocks])
         self._history.add(rows)
-        if self._follows_mice:
-            for row in rows:
-                self._exclusions.follow(float(row[0]), self._drawing.read(row))
+        self._exclusions.follow(rows)
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -219,7 +215,7 @@ class Page:
         newest, status = self._history.newest, self._status
         row = self._drawing.read(newest) if newest is not None else {}
         if self._replay is not None:
-            self._exclusions.follow(self._place_s, row)
+            self._exclusions.follow(self._replay.newest[np.newaxis])
         name = self._panel.chosen or self._drawing.best(row)
         with self._server.atomic():
             if self._is_status_changed:
