@@ -67,7 +67,7 @@ def simulated(seeds: int) -> Iterator[Case]:
 
 def _calibrated(seed: int) -> Rig:
     """The rig with a calibration: the same specimen of sensors, laid on its six sides."""
-    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, rests=True)
+    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, motion="sides")
     recording = cast(Any, SimpleNamespace(measurements=turned.measurements(), path=Path("turned.csv")))
     return with_calibration(turned.rig, calibrate_mag([recording], turned.rig))
 

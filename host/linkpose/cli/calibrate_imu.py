@@ -41,8 +41,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
             f"{FEWEST_ATTITUDES} needed.",
             err=True,
         )
-    calibrate = ("calibrate", "joint", "swing.csv", "--rig", rig_file)
-    options.show_rig_written(rig_file, quiet, "record", "swing.csv", then=calibrate)
+    record = options.record_command("swing.csv", loaded[0], "swing")
+    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "joint", record[1], "--rig", rig_file))
 
 
 def _show(found: FoundImuErrors) -> None:

@@ -286,14 +286,32 @@ def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
 
 def estimate_command(recording: Path, *flags: object) -> tuple[object, ...]:
     """The command that estimates over a recording, to propose as the next one."""
-    return "estimate", recording, *flags, "-o", new_estimates()
+    return "estimate", recording, *flags, "-o", new_file("estimate.csv")
 
 
-def new_estimates() -> Path:
-    """The file of estimates to propose: estimate.csv, or estimate-2.csv and so on where it exists."""
+def record_command(name: str, before: Recording, motion: str) -> tuple[object, ...]:
+    """The command that records a new file of this name, to propose after the recording `before`.
+
+    A simulated board is simulated again, with another motion ("swing" or "sides").
+    """
+    device = str(before.metadata.get("device"))
+    port = ("--port", _with_motion(device, motion)) if device.startswith("sim://link") else ()
+    return "record", new_file(name), *port
+
+
+def _with_motion(address: str, motion: str) -> str:
+    """The address of a simulated link with this motion."""
+    rig, _, query = address.partition("?")
+    options = [option for option in query.split("&") if option and not option.startswith("motion=")]
+    options += [f"motion={motion}"] * (motion != "swing")
+    return "?".join(filter(None, (rig, "&".join(options))))
+
+
+def new_file(name: str) -> Path:
+    """A file to propose: of this name, or estimate-2.csv and so on where estimate.csv exists."""
     from linkpose.recording.csvfile import numbered
 
-    path = Path("estimate.csv")
+    path = Path(name)
     return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())
 
 
