@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 ROWS = 1000  # of estimates that wait until their extremes are found at once; live blocks have a few rows
 _OF_A_ROBOT = (quantities.X, quantities.Y)  # a link's filter has them too, where its yaw is known to a constant alone
-# What the end of a run lists. A heading turns on past every bound, so its lowest and highest value are meaningless.
 _LISTED = (
     quantities.HEIGHT,
     quantities.ANGLE,
@@ -23,6 +22,7 @@ _LISTED = (
     quantities.HEIGHT1,
     quantities.HEIGHT2,
     *_OF_A_ROBOT,
+    quantities.HEADING,
 )
 
 # (filter, quantity) -> (lowest, highest, RMS of σ), in the unit of the quantity's column.
@@ -30,7 +30,10 @@ Summary = dict[tuple[str, quantities.Quantity], tuple[float, float, float]]
 
 
 class Extremes:
-    """Lowest and highest value and the RMS of σ of heights, joint angles and places of each filter, over all blocks."""
+    """Lowest and highest value and the RMS of σ of heights, joint angles and poses of each filter, over all blocks.
+
+    A heading counts whole turns, from its first value on: −180° and +180° of a robot that turns would mean nothing.
+    """
 
     def __init__(self, columns: Sequence[str]) -> None:
         at = {column: index for index, column in enumerate(columns)}
@@ -44,6 +47,7 @@ class Extremes:
         self._high = dict.fromkeys(self._of, -math.inf)
         self._squares = dict.fromkeys(self._of, 0.0)
         self._count = dict.fromkeys(self._of, 0)
+        self._last = dict.fromkeys(self._of, math.nan)
         self._waiting: list[Floats] = []  # blocks not yet in these
         self._waiting_rows = 0
 
@@ -63,11 +67,22 @@ class Extremes:
             known = np.isfinite(estimates[:, value_at])
             if not known.any():
                 continue
-            self._low[key] = min(self._low[key], float(estimates[known, value_at].min()))
-            self._high[key] = max(self._high[key], float(estimates[known, value_at].max()))
+            values = self._continued(key, estimates[known, value_at])
+            self._low[key] = min(self._low[key], float(values.min()))
+            self._high[key] = max(self._high[key], float(values.max()))
             if std_at >= 0:
                 self._squares[key] += float(np.nansum(estimates[known, std_at] ** 2))
                 self._count[key] += int(known.sum())
+
+    def _continued(self, key: tuple[str, quantities.Quantity], values: Floats) -> Floats:
+        """The values (N ≥ 1,), those of a heading without jumps by a whole turn, from the last one before on."""
+        period = key[1].period
+        if key[1] != quantities.HEADING or period is None:
+            return values
+        before = values[:1] if math.isnan(self._last[key]) else np.array([self._last[key]])
+        unwrapped: Floats = np.unwrap(np.concatenate([before, values]), period=period)[1:]
+        self._last[key] = float(unwrapped[-1])
+        return unwrapped
 
     def summary(self) -> Summary:
         """The extremes of the quantities that had a value."""

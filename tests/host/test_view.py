@@ -306,13 +306,18 @@ def test_the_final_table_fits() -> None:
     assert final_table({}, 80) == []
 
 
-def test_the_final_table_lists_joint_angles_and_places() -> None:
-    columns = ["time_s", "chain_angle_deg", "chain_angle_std_deg", "mice_x_m", "mice_y_m", "mice_heading_rad"]
-    extremes = Extremes([*columns, "tilt_x_m"])
-    extremes.add(np.array([[0.0, -0.04, 1.0, 1.0, 2.0, 0.0, 5.0], [1.0, 30.0, 1.0, 3.0, 4.0, 0.0, 6.0]]))
+def test_the_final_table_lists_joint_angles_and_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("linkpose.extremes.ROWS", 1)  # rows that are looked at together
+    columns = ["time_s", "chain_angle_deg", "chain_angle_std_deg", "mice_x_m", "mice_y_m"]
+    extremes = Extremes([*columns, "mice_heading_rad", "mice_heading_std_rad", "tilt_x_m"])
+    std = math.radians(0.5)
+    for heading in ([0.0, 3.0], [math.nan, -2.0], [1.0]):  # a full turn, and a rad more
+        extremes.add(np.array([[0.0, -0.04, 1.0, 1.0, 2.0, rad, std, 5.0] for rad in heading]))
+    extremes.add(np.array([[1.0, 30.0, 1.0, 3.0, 4.0, math.nan, math.nan, 6.0]]))
     lines = [line.split() for line in final_table(extremes.summary(), 80)]
     assert lines[1] == ["chain", "angle", "0.0°", "+30.0°", "1.0°"]
-    assert [line[:2] for line in lines[2:]] == [["mice", "x"], ["mice", "y"]]
+    assert [line[:2] for line in lines[2:]] == [["mice", name] for name in ("x", "y", "heading")]
+    assert lines[4][2:] == ["0.0°", f"+{math.degrees(1 + 2 * math.pi):.1f}°", "0.5°"]
 
 
 def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:

@@ -270,6 +270,7 @@ def final_table(summary: Summary, width: int) -> list[str]:
     for (name, quantity), (low, high, std) in summary.items():
         title = name if quantity == quantities.HEIGHT else f"{name} {quantity.name.replace('_', ' ')}"
         if quantity.is_angle:
+            low, high, std = (quantity.value.scale * value for value in (low, high, std))
             shown = signed_angle(low), signed_angle(high), signed_angle(std).removeprefix("+")
         else:
             shown = aligned_length(low, std), aligned_length(high, std), std_text(std)
