@@ -10,26 +10,20 @@ machine without a graphics card renders the scene with its CPU, which delays the
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from _report import Row, report
+from _views import HEALTH, Browser
 
 import linkpose as lp
 from linkpose.page import Page, PageStatus
 from linkpose.simulation.link import PAPER_J2S_M, simulate
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "host"))
-from browser import Browser
-
 WARM_UP_S, MEASURED_S, INTERVAL_S = 5.0, 20.0, 0.01
 BUDGET = 0.01  # of a core
 BOUND_S = 0.1
-HEALTH: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": "ok"}, "baro": {"state": "ok"}})
 # Each change of the headline with the time at which the document had it.
 WATCH = """
   window.seen = [];
