@@ -76,6 +76,9 @@ def test_a_recording_named_as_the_proposed_file_keeps_its_name(tmp_path, monkeyp
     Path("estimate.csv").touch()
     options.show_next(False, *options.estimate_command(Path("estimate.csv")))
     assert capsys.readouterr().err == "next: linkpose estimate estimate.csv -o estimate-2.csv\n"
+    Path("estimate.png").touch()
+    options.show_next(False, *options.plot_command(Path("estimate.csv")))
+    assert capsys.readouterr().err == "next: linkpose plot estimate.csv -o estimate-2.png\n"
 
 
 def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 from linkpose.errors import LinkposeError
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
@@ -33,7 +34,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
     """
     from linkpose.calibration.noise import calibrate_noise, with_calibration
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_noise(loaded)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))

@@ -70,7 +70,7 @@ def estimate_live(
         run.finish(ended)
         live.show_summary(console, run.health, request.json_lines, options.written(request.output))
         if request.output:
-            options.show_next(console.is_quiet, "plot", request.output)
+            options.show_next(console.is_quiet, *options.plot_command(request.output))
         connected.check_usable()
 
 

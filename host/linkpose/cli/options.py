@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.errors import printable
 from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
@@ -289,6 +288,12 @@ def estimate_command(recording: Path, *flags: object) -> tuple[object, ...]:
     return "estimate", recording, *flags, "-o", new_file("estimate.csv")
 
 
+def plot_command(estimates: Path) -> tuple[object, ...]:
+    """The command that draws estimates, to propose as the next one; it replaces no picture."""
+    picture = estimates.with_suffix(".png")
+    return "plot", estimates, *(("-o", new_file(str(picture))) if picture.exists() else ())
+
+
 def record_command(name: str, before: Recording, motion: str) -> tuple[object, ...]:
     """The command that records a new file of this name, to propose after the recording `before`.
 
@@ -357,9 +362,18 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     return replace(rig, joint=joint) if joint else rig
 
 
-def recordings_and_rig(paths: Sequence[Path], rig_file: Path) -> tuple[list[Recording], Rig]:
-    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording."""
-    loaded = load_recordings(paths)
+def recordings_and_rig(
+    paths: Sequence[Path], rig_file: Path, report: Callable[[str], None]
+) -> tuple[list[Recording], Rig]:
+    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording.
+
+    `report` gets the remarks on the recordings.
+    """
+    from linkpose.recording.reader import load_recording
+
+    loaded = [load_recording(path) for path in paths]
+    for remark in (remark for recording in loaded for remark in recording.remarks):
+        report(remark)
     return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
 
 
@@ -368,13 +382,3 @@ def show_rig_written(rig_file: Path, quiet: bool, *words: object, then: Sequence
     if not quiet:
         click.echo(f"written to {rig_file}", err=True)
     show_next(quiet, *words, then=then)
-
-
-def load_recordings(paths: Sequence[Path]) -> list[Recording]:
-    """The recordings; their remarks go to stderr."""
-    from linkpose.recording.reader import load_recording
-
-    loaded = [load_recording(path) for path in paths]
-    for remark in (remark for recording in loaded for remark in recording.remarks):
-        click.echo(printable(remark), err=True)
-    return loaded
