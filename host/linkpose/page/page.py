@@ -15,6 +15,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.exclusions import Exclusions
 from linkpose.localization.surroundings import Surroundings
+from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
-# Seconds between two updates of the page. Whatever its size, an update costs 1 to 2 ms of CPU (tests/bench/page.py),
-# most of it in viser's server: twice the interval halves the cost, and a sample takes up to 0.12 s more to the screen.
+# Seconds between two updates of the page. An update costs about 1 ms of CPU (tests/bench/page.py): twice the interval
+# halves the cost, and a sample takes up to 0.12 s more to the screen.
 UPDATE_INTERVAL_S = 0.12
 CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two looks at the health, which counts over all sensors
@@ -136,8 +137,9 @@ class Page:
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         known = self._replay.values if self._replay is not None else None
-        self._drawing = Drawing(server, self._columns, rig, surroundings, known)
-        self._panel = Panel(server, self._columns, self._drawing.charted, self._redraw)
+        self._changes = Changes(server)
+        self._drawing = Drawing(server, self._changes, self._columns, rig, surroundings, known)
+        self._panel = Panel(server, self._changes, self._columns, self._drawing.charted, self._redraw)
         if self._replay is not None:
             self._build_player(self._replay)
         elif self._on_mark is not None:
@@ -178,8 +180,8 @@ class Page:
     async def _send(self) -> None:
         """The sender: everything that arrived since the last update, as one update.
 
-        It runs on the server's event loop. A thread of its own would cost half as much again: each update would wake
-        two threads, which wait for each other.
+        It runs on the server's event loop: with a thread of its own, each update would wake two threads, which wait for
+        each other.
         """
         while True:
             await asyncio.sleep(UPDATE_INTERVAL_S)
@@ -207,7 +209,7 @@ class Page:
         if last_anew is not None:
             del blocks[:last_anew]
             self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
-        rows = np.vstack([rows for rows, _ in blocks])
+        rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
         self._history.add(rows)
         self._exclusions.follow(rows)
 
@@ -228,13 +230,12 @@ class Page:
         if self._replay is not None:
             self._exclusions.follow(self._replay.newest[np.newaxis])
         name = self._panel.chosen or self._drawing.best(row)
-        with self._server.atomic():
-            if self._is_status_changed:
-                self._is_status_changed = False
-                self._draw_health(newest, status)
-            if newest is not None and name is not None:
-                self._draw_estimates(newest, row, name, status)
-        self._server.flush()  # at once: viser would wait for more
+        if self._is_status_changed:
+            self._is_status_changed = False
+            self._draw_health(newest, status)
+        if newest is not None and name is not None:
+            self._draw_estimates(newest, row, name, status)
+        self._changes.broadcast(self._clients)
         self._updates += 1
 
     def _draw_estimates(self, newest: Floats, row: Any, name: str, status: PageStatus) -> None:
