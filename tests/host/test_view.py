@@ -317,7 +317,16 @@ def test_the_final_table_lists_joint_angles_and_poses(monkeypatch: pytest.Monkey
     lines = [line.split() for line in final_table(extremes.summary(), 80)]
     assert lines[1] == ["chain", "angle", "0.0°", "+30.0°", "1.0°"]
     assert [line[:2] for line in lines[2:]] == [["mice", name] for name in ("x", "y", "heading")]
-    assert lines[4][2:] == ["0.0°", f"+{math.degrees(1 + 2 * math.pi):.1f}°", "0.5°"]
+    assert lines[2][-1] == "–" and lines[4][2:] == ["0.0°", f"+{math.degrees(1 + 2 * math.pi):.1f}°", "0.5°"]
+
+
+def test_the_final_table_has_the_median_deviation() -> None:
+    """A filter begins with a large σ; its root mean square would be that of the first second."""
+    extremes = Extremes(["time_s", "tilt_height_m", "tilt_height_std_m", "mice_heading_rad", "mice_heading_std_rad"])
+    extremes.add(np.array([[0.0, 1.0, 0.5, 0.0, 0.5]] * 20 + [[0.0, 1.0, 4e-4, 0.0, 1e-5]] * 80))
+    (_, _, height), (_, _, heading) = extremes.summary().values()
+    assert height == pytest.approx(4e-4, rel=0.03) and heading == pytest.approx(1e-5, rel=0.03)
+    assert [line.split()[-1] for line in final_table(extremes.summary(), 80)[1:]] == ["mm", "0.001°"]
 
 
 def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:

@@ -21,6 +21,7 @@ from linkpose.presentation import (
     Row,
     RowReader,
     aligned_length,
+    angle_with_std,
     best_filter,
     fault_lines,
     joint_angle,
@@ -262,16 +263,17 @@ def _curve_sections(
 
 
 def final_table(summary: Summary, width: int) -> list[str]:
-    """The lines that stay after the end: the extremes and the RMS of σ of each quantity.
+    """The lines that stay after the end: the extremes and the median σ of each quantity.
 
     The last column is left out where the lines would be wider than `width` characters.
     """
-    rows = [("filter", "lowest", "highest", "rms σ")]
+    rows = [("filter", "lowest", "highest", "median σ")]
     for (name, quantity), (low, high, std) in summary.items():
         title = name if quantity == quantities.HEIGHT else f"{name} {quantity.name.replace('_', ' ')}"
         if quantity.is_angle:
             low, high, std = (quantity.value.scale * value for value in (low, high, std))
-            shown = signed_angle(low), signed_angle(high), signed_angle(std).removeprefix("+")
+            lowest, _, bound = angle_with_std(low, std).partition(" ±")
+            shown = lowest, angle_with_std(high, std).partition(" ±")[0], bound or "–"
         else:
             shown = aligned_length(low, std), aligned_length(high, std), std_text(std)
         rows.append((title, *shown))
