@@ -36,7 +36,8 @@ class Extremes:
     """Lowest and highest value and the median of σ of heights, joint angles and poses of each filter, over all blocks.
 
     The median, not the root mean square: the σ of the first second would hide that of all others. It is that of a
-    histogram, within 3 %. A heading counts whole turns, from its first value on: −180° and +180° of a robot that turns would mean nothing.
+    histogram, within 3 %. A heading counts whole turns, from its first value on: −180° and +180° of a robot that turns
+    would mean nothing.
     """
 
     def __init__(self, columns: Sequence[str]) -> None:
@@ -93,9 +94,7 @@ class Extremes:
         if self._waiting:
             self._fold()
         return {
-            key: (low, self._high[key], self._median_std(key))
-            for key, low in self._low.items()
-            if math.isfinite(low)
+            key: (low, self._high[key], self._median_std(key)) for key, low in self._low.items() if math.isfinite(low)
         }
 
     def _median_std(self, key: tuple[str, quantities.Quantity]) -> float:

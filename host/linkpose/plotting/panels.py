@@ -50,11 +50,20 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
         if quantity is YAW and drawn:
             value = _from_start_of(drawn[0][0], track)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
-    view_values(axes, [value for _, value in drawn])
+    view_values(axes, [value for _, value in drawn] + _reference_beside(sources, quantity, drawn))
     shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
     finish(axes, quantity.axis_label)
     if legend:
         legend_above(axes, best_first=[track.label for track, _ in drawn])
+
+
+def _reference_beside(sources: Sources, quantity: Quantity, drawn: Sequence[tuple[DrawnTrack, Floats]]) -> list[Floats]:
+    """The reference's values within the time of the filters, which are in view also where no filter has a value."""
+    track = sources.reference
+    if track is None or not track.has(quantity) or quantity is YAW or not drawn:
+        return []
+    first, last = drawn[0][0].time_s[[0, -1]]
+    return [track.values[quantity][(track.time_s >= first) & (track.time_s <= last)]]
 
 
 def _from_start_of(estimate: DrawnTrack, reference: DrawnTrack) -> Floats:
