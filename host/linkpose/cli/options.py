@@ -286,7 +286,7 @@ def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
 
 def new_estimates() -> Path:
     """The file of estimates to propose: estimate.csv, or estimate-2.csv and so on where it exists."""
-    from linkpose.recording.csvfile import numbered
+    from linkpose.outputs import numbered
 
     path = Path("estimate.csv")
     return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())

@@ -13,24 +13,23 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 from linkpose.convert import c3d, mcap, parquet, text
 from linkpose.convert.motion import Motion, motion_of, only_filter
-from linkpose.errors import CannotWrite, InvalidValue
-from linkpose.recording.csvfile import create
+from linkpose.errors import InvalidValue
+from linkpose.outputs import new_file
 from linkpose.recording.table import Table, read_table
 
-_OF_MOTION: dict[str, Callable[[Path, Motion], None]] = {
+_OF_MOTION: dict[str, Callable[[BinaryIO, Path, Motion], None]] = {
     ".sto": text.write_sto,
     ".trc": text.write_trc,
     ".c3d": c3d.write,
     ".tum": text.write_tum,
 }
-_OF_TABLE: dict[str, Callable[[Path, Table], None]] = {
+_OF_TABLE: dict[str, Callable[[BinaryIO, Path, Table], None]] = {
     ".mot": text.write_mot,
     ".mcap": mcap.write,
     ".parquet": parquet.write,
@@ -55,27 +54,10 @@ def convert(
     if ending in _OF_MOTION:
         motion = motion_of(table, wanted, label)
         remarks += motion.remarks
-        _write(output, force, lambda: _OF_MOTION[ending](output, motion))
+        with new_file(output, force) as file:
+            _OF_MOTION[ending](file, output, motion)
     else:
         part = only_filter(table, wanted) if wanted else table
-        _write(output, force, lambda: _OF_TABLE[ending](output, part))
+        with new_file(output, force) as file:
+            _OF_TABLE[ending](file, output, part)
     return remarks
-
-
-def _write(output: Path, force: bool, action: Callable[[], None]) -> None:
-    """Runs `action`, which fills the new file; removes the file where that fails."""
-    os.close(create(output, force))
-    try:
-        action()
-    except OSError as error:
-        _remove(output)
-        raise CannotWrite(output, error.strerror) from error
-    except BaseException:
-        _remove(output)
-        raise
-
-
-def _remove(output: Path) -> None:
-    with contextlib.suppress(OSError):
-        if output.is_file():
-            output.unlink()

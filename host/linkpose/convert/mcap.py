@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from linkpose import __version__
 from linkpose.convert import libraries
@@ -16,21 +16,20 @@ from linkpose.recording.table import Table
 _NUMBER = {"type": "number"}
 
 
-def write(path: Path, table: Table) -> None:
+def write(file: BinaryIO, path: Path, table: Table) -> None:
     """A topic /linkpose/values with all columns, and /linkpose/pose where the table has a motion. World: Z up."""
     table.require("time_s")
     writer_module = libraries.load("mcap.writer", path)
-    with path.open("wb") as file:
-        writer = writer_module.Writer(file)
-        writer.start(profile="", library=f"linkpose {__version__}")
-        values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(table.columns))
-        names = list(table.columns)
-        for row in zip(*(column.tolist() for column in table.columns.values()), strict=True):
-            content = {name: value for name, value in zip(names, row, strict=True) if math.isfinite(value)}
-            _add(writer, values, content.get("time_s", 0.0), content)
-        if (motion := _motion(table)) is not None:
-            _add_poses(writer, motion)
-        writer.finish()
+    writer = writer_module.Writer(file)
+    writer.start(profile="", library=f"linkpose {__version__}")
+    values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(table.columns))
+    names = list(table.columns)
+    for row in zip(*(column.tolist() for column in table.columns.values()), strict=True):
+        content = {name: value for name, value in zip(names, row, strict=True) if math.isfinite(value)}
+        _add(writer, values, content.get("time_s", 0.0), content)
+    if (motion := _motion(table)) is not None:
+        _add_poses(writer, motion)
+    writer.finish()
 
 
 def _motion(table: Table) -> Motion | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
 
-def write_sto(path: Path, motion: Motion) -> None:
+def write_sto(file: BinaryIO, _path: Path, motion: Motion) -> None:
     """OpenSense's orientations: one column of quaternions w,x,y,z, which turn the sensor's axes into a world with Z up.
 
     OpenSim's own world has Y up: pass `sensor_to_opensim_rotations` = (-π/2, 0, 0) to its tools.
@@ -22,10 +23,10 @@ def write_sto(path: Path, motion: Motion) -> None:
         f"{t:.6f}\t" + ",".join(f"{part:.9f}" for part in quaternion)
         for t, quaternion in zip(motion.time_s.tolist(), motion.quaternion.tolist(), strict=True)
     )
-    _write(path, [*head, f"time\t{motion.label}"], rows)
+    _write(file, [*head, f"time\t{motion.label}"], rows)
 
 
-def write_mot(path: Path, table: Table) -> None:
+def write_mot(file: BinaryIO, path: Path, table: Table) -> None:
     """OpenSim's motion file: all columns; angles as their names state."""
     table.require("time_s")
     names = [name for name in table.columns if name != "time_s"]
@@ -33,10 +34,10 @@ def write_mot(path: Path, table: Table) -> None:
     head = [path.stem, "version=1", f"nRows={len(table)}", f"nColumns={len(names) + 1}", f"inDegrees={angles}"]
     values = np.column_stack([table.columns[name] for name in ("time_s", *names)])
     rows = ("\t".join(f"{value:.9g}" for value in row) for row in values.tolist())
-    _write(path, [*head, "endheader", "\t".join(["time", *names])], rows)
+    _write(file, [*head, "endheader", "\t".join(["time", *names])], rows)
 
 
-def write_trc(path: Path, motion: Motion) -> None:
+def write_trc(file: BinaryIO, path: Path, motion: Motion) -> None:
     """Three markers in mm at equal intervals, in OpenSim's world with Y up. An empty field is a missing marker."""
     start, rate, markers = motion.on_grid()
     names = motion.marker_names()
@@ -55,20 +56,19 @@ def write_trc(path: Path, motion: Motion) -> None:
         f"{i + 1}\t{start + i / rate:.6f}\t" + "\t".join(_cells(row)) + "\t"
         for i, row in enumerate(y_up.reshape(count, -1))
     )
-    _write(path, head, rows)
+    _write(file, head, rows)
 
 
-def write_tum(path: Path, motion: Motion) -> None:
+def write_tum(file: BinaryIO, _path: Path, motion: Motion) -> None:
     """Time (s), position (m) and quaternion x, y, z, w of each pose; the world has Z up."""
     values = np.column_stack([motion.time_s, motion.position_m, motion.quaternion[:, [1, 2, 3, 0]]])
-    _write(path, [], (" ".join(f"{value:.9f}" for value in row) for row in values.tolist()))
+    _write(file, [], (" ".join(f"{value:.9f}" for value in row) for row in values.tolist()))
 
 
 def _cells(row: Floats) -> list[str]:
     return ["" if value != value else f"{value:.4f}" for value in row.tolist()]
 
 
-def _write(path: Path, head: list[str], rows: Iterable[str]) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in head)
-        file.writelines(f"{row}\n" for row in rows)
+def _write(file: BinaryIO, head: list[str], rows: Iterable[str]) -> None:
+    file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in head)  # a file's name may be no UTF-8
+    file.writelines(f"{row}\n".encode() for row in rows)
