@@ -59,6 +59,7 @@ def estimate_live(
         report_running(estimator, request.joint, console)
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))
+        compiling.load()
         if record:
             connected.record(record, force=request.force, plain=request.plain)
         head = {"device": connected.port, "filters": names, "mag": request.mag, "rig": estimator.rig.as_dict()}

@@ -18,11 +18,11 @@ def write(output: BinaryIO, path: Path, motion: Motion) -> None:
     ezc3d writes to a name only: to one in a folder of its own, which nobody else can write.
     """
     ezc3d = libraries.load("ezc3d", path)
-    _, rate, markers = motion.on_grid()
+    markers = np.concatenate(list(motion.markers()))
     file = ezc3d.c3d()
-    file["parameters"]["POINT"]["RATE"]["value"] = [rate]
+    file["parameters"]["POINT"]["RATE"]["value"] = [motion.rate_hz]
     file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
-    file["parameters"]["POINT"]["LABELS"]["value"] = tuple(motion.marker_names())
+    file["parameters"]["POINT"]["LABELS"]["value"] = tuple(motion.marker_names)
     file.add_parameter("POINT", "X_SCREEN", "+X")
     file.add_parameter("POINT", "Y_SCREEN", "+Z")
     points = np.ones((4, 3, len(markers)))
