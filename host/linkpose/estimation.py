@@ -271,6 +271,23 @@ class Estimator:
         return ()
 
     @property
+    def mouse_causes(self) -> dict[int, str]:
+        """Why mice were excluded (1 for the first; 0: all together), by the first filter that can state it."""
+        causes: dict[int, str] = {}
+        for f in self.filters:
+            if isinstance(f, filters.ExplainsMice):
+                causes = f.mouse_causes | causes
+        return causes
+
+    @property
+    def mice_remarks(self) -> list[str]:
+        """What the mice did wrong together, by the first filter that compares them with the gyro."""
+        for f in self.filters:
+            if isinstance(f, filters.RemarksOnMice):
+                return f.mice_remarks
+        return []
+
+    @property
     def outcome(self) -> dict[str, Any]:
         """Entries of a file's closing line: rejected samples, and what the filters found of J2S, mice and field."""
         outcome: dict[str, Any] = {"rejected": {f.name: f.rejected for f in self.filters}}

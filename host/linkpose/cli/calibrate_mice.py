@@ -50,5 +50,6 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
 def _line(mouse: MouseCalibration) -> str:
     return (
         f"mouse {mouse.mouse}: {mouse.counts_per_m:.1f} ± {mouse.counts_per_m_std:.1f} counts/m, "
-        f"turned by {mouse.angle_deg:.2f} ± {mouse.angle_std_deg:.2f}°, residual {mouse.residual_mm:.2f} mm"
+        f"turned by {mouse.angle_deg:.2f} ± {mouse.angle_std_deg:.2f}°, by the turns at x_m = {mouse.x_m:.4f}, "
+        f"y_m = {mouse.y_m:.4f} (± {1e3 * mouse.position_std_m:.1f} mm), residual {mouse.residual_mm:.2f} mm"
     )
