@@ -16,7 +16,7 @@ PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 LEVELS = [
     {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
-    {"inputs"},
+    {"inputs", "outputs"},
     {"wire", "presentation", "extremes", "exclusions"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},

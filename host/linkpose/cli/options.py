@@ -314,7 +314,7 @@ def _with_motion(address: str, motion: str) -> str:
 
 def new_file(name: str) -> Path:
     """A file to propose: of this name, or estimate-2.csv and so on where estimate.csv exists."""
-    from linkpose.recording.csvfile import numbered
+    from linkpose.outputs import numbered
 
     path = Path(name)
     return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from linkpose import plotting
-from linkpose.errors import CannotWrite
 from linkpose.localization.surroundings import Surroundings
+from linkpose.outputs import new_file
 from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
@@ -51,10 +51,8 @@ def save_animation(
     plotting.check_output(path, force, FORMATS)
     columns, values = rows_of(tables, wanted)
     text = _recorded(columns, values, rig_of(tables), surroundings)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+    with new_file(path, force) as file:
+        file.write(text.encode())
 
 
 def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Surroundings) -> str:

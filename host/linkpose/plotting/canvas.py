@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import datetime
 import io
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linkpose.errors import CannotWrite, FileExists, UnknownPicture
-from linkpose.recording.csvfile import STDOUT, create, write_all
+from linkpose.outputs import STDOUT, new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,14 +123,10 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     Raises FileError as `check_output` does, and where the file cannot be written.
     """
     check_output(path, force)
-    if path == STDOUT:
-        figure.savefig(picture := io.BytesIO(), dpi=DPI, format="png")
-        with os.fdopen(create(STDOUT, force), "wb") as stream:
-            write_all(stream.fileno(), STDOUT, picture.getvalue())
-        return
+    ending = "png" if path == STDOUT else path.suffix[1:].lower()
     # Two pictures of the same data are the same file.
-    metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}
-    try:
-        figure.savefig(path, dpi=DPI, metadata=metadata.get(path.suffix.lower()))
-    except (OSError, ValueError) as error:
-        raise CannotWrite(path, str(error)) from error
+    metadata = {"pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, "svg": {"Date": None}}
+    # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
+    figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
+    with new_file(path, force) as file:
+        file.write(picture.getvalue())
