@@ -17,7 +17,7 @@ LEVELS = [
     {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
     {"inputs", "outputs"},
-    {"wire", "presentation", "extremes"},
+    {"wire", "presentation", "extremes", "exclusions"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},
     {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert"},
