@@ -274,15 +274,17 @@ def _to_wall(x_m: float, angle_deg: int) -> str:
     return f"{min(walls):.2f}"
 
 
-_CARMEN = "\n".join(
-    ["PARAM robot_length 0.5 0 host 0"]
-    + [
-        f"FLASER 37 {' '.join(map(_to_wall, [0.1 * i] * 37, range(-90, 91, 5)))} {0.1 * i:.2f} 1.0 0.0 {0.1 * i:.2f} 1.0 0.0 {i}.0 host {i}.0\n"
-        f"ODOM {0.1 * i:.2f} 1.0 0.0 0.1 0.0 0.0 {i}.5 host {i}.5"
-        for i in range(1, 8)
-    ]
-    + [""]
-)
+def _scan(x_m: float, time_s: int) -> str:
+    """A line of 37 ranges, 5° apart, and one of odometry half a second later."""
+    ranges = " ".join(_to_wall(x_m, angle) for angle in range(-90, 91, 5))
+    pose = f"{x_m:.2f} 1.0 0.0"
+    return (
+        f"FLASER 37 {ranges} {pose} {pose} {time_s}.0 host {time_s}.0\n"
+        f"ODOM {pose} 0.1 0.0 0.0 {time_s}.5 host {time_s}.5\n"
+    )
+
+
+_CARMEN = "PARAM robot_length 0.5 0 host 0\n" + "".join(_scan(0.1 * i, i) for i in range(1, 8))
 _BEACONS = "id,x_m,y_m\n1,0.0,0.0\n0xDD05,5.0,0.0\nA1,0.0,5.0\n"
 _EVENTS = "time_s,kind,a,b,c\n0,pose,1.0,1.0,0.0\n" + "".join(
     f"{0.1 * i:.1f},odometry,0.1,0.0,\n{0.1 * i:.1f},range,1,{1.4 + 0.01 * i:.3f},\n" for i in range(1, 12)
