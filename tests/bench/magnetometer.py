@@ -14,7 +14,6 @@ WORSE times the root mean square error without it, or LEAST_DEG more.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections.abc import Iterator
@@ -24,7 +23,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from _report import RECORDINGS, print_row
+from _report import print_row, recordings_parser
 from scipy.io import loadmat
 from vqf import VQF
 
@@ -67,7 +66,7 @@ def simulated(seeds: int) -> Iterator[Case]:
 
 def _calibrated(seed: int) -> Rig:
     """The rig with a calibration: the same specimen of sensors, laid on its six sides."""
-    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, rests=True)
+    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, motion="sides")
     recording = cast(Any, SimpleNamespace(measurements=turned.measurements(), path=Path("turned.csv")))
     return with_calibration(turned.rig, calibrate_mag([recording], turned.rig))
 
@@ -141,11 +140,8 @@ def _field(case: Case) -> Floats:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
+    parser = recordings_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--only", default="", help="only cases whose name contains this text")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     sources = [simulated(options.seeds), broad(options.data / "broad")]
     rows = []

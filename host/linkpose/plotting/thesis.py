@@ -84,7 +84,7 @@ def _from_above(axes: Axes) -> None:
 
 def _map_and_path(drive: DrawnDrive) -> Figure:
     """Figure 3.1."""
-    figure = new_figure(10.0, 5.2)
+    figure = new_figure(10.0, 4.8)
     _titled(figure, "3.1", "Map and path of the robot (simulated)")
     axes = figure.add_subplot()
     draw_map(axes, drive.grid)
@@ -123,6 +123,7 @@ def _errors(position: Axes, heading: Axes, path: ComparedPath, along: Floats, la
     most = np.degrees(_HEADROOM * largest[1])
     heading.set_ylim(-most, most)
     heading.sharex(position)
+    position.tick_params(labelbottom=False)
     legend_above(position)
 
 
