@@ -22,7 +22,6 @@ WORSE times the root mean square error without it, or LEAST_DEG more.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import math
 from collections.abc import Iterator
@@ -33,7 +32,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 import qmt
-from _report import RECORDINGS, print_row
+from _report import print_row, recordings_parser
 from scipy.io import loadmat
 from scipy.linalg import eig
 from vqf import VQF
@@ -189,7 +188,7 @@ def simulated(seeds: int) -> Iterator[Case]:
 
 def _calibrated(seed: int) -> Rig:
     """The rig with a calibration: the same specimen of sensors, laid on its six sides."""
-    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, rests=True)
+    turned = LinkRun(1, seed, 120.0, errors="datasheet", mag=True, motion="sides")
     recording = cast(Any, SimpleNamespace(measurements=turned.measurements(), path=Path("turned.csv")))
     return with_calibration(turned.rig, calibrate_mag([recording], turned.rig))
 
@@ -263,11 +262,8 @@ def _field(case: Case) -> Floats:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
+    parser = recordings_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--only", default="", help="only cases whose name contains this text")
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     for name in TURNINGS:
         if options.only in f"calibration {name}":

@@ -26,7 +26,7 @@ from linkpose.localization.events import Log
 from linkpose.localization.localizer import Settings, check
 from linkpose.localization.logs import read_log
 from linkpose.localization.map_check import check_map
-from linkpose.localization.maps import load_map, save_map
+from linkpose.localization.maps import load_map
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.plausibility import check_units
@@ -280,9 +280,6 @@ MORE: dict[str, dict[str, Producer]] = {
             MAP, b"P5 40000 40000 255\n"
         ),
         "… holds floating-point cells; save it with 8 or 16 bits a cell": map_file(MAP, b"Pf\n4 4\n-1.0\n" + bytes(64)),
-        "cannot write the map …: …; choose another place": lambda folder: save_map(
-            folder / "none" / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0)
-        ),
         "…, named in …, is no regular file; name a PGM or PNG file": map_file(MAP.replace("m.png", ".")),
         "… is no image that can be read; … must name a PGM or PNG file": map_file(MAP.replace("m.png", "m.yaml")),
         "cannot read the map's image …, named in …: …": map_file(MAP.replace("m.png", "none.png")),
