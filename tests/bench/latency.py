@@ -40,7 +40,7 @@ COMMAND = [sys.executable, "-m", "linkpose", "estimate", "--live", "--json", "-q
 def serve_and_listen(folder: Path) -> tuple[list[float], NDArray[Any], float]:
     """Arrival of each estimate (s, monotonic clock), the board's events, and the clock's value at its cycle 0."""
     with VirtualUno(HEX) as uno:
-        feed = RigFeed(uno, LinkRun(duration_s=None))
+        feed = RigFeed(uno, LinkRun(duration_s=None), stretch_s=2 * DURATION_S)  # none is fed while it is measured
         uno.watch([*WATCHED_BUS, "uart_tx"])
         with PtyServer(uno, folder / "port", on_slice=feed.supply) as server:
             command = [*COMMAND, "--port", str(folder / "port"), "--duration", str(DURATION_S)]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from linkpose.cli.convert import command
 from linkpose.convert import convert
 from linkpose.errors import FileExists, FileFormatError, InvalidValue, LinkposeError, MissingLibrary, UnknownFilter
+from linkpose.recording import chunks
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.table import read_table
 
@@ -151,6 +152,25 @@ def test_parquet_is_the_same_table(estimate, tmp_path):
     (tmp_path / "cut.parquet").write_bytes((tmp_path / "out.parquet").read_bytes()[:200])
     with pytest.raises(FileFormatError, match="no Parquet table"):
         read_table(tmp_path / "cut.parquet")
+
+
+def test_a_file_is_converted_in_blocks(estimate, tmp_path, monkeypatch):
+    """Blocks end before, in and after the lost samples, and after the last frame that a pose reaches."""
+    endings = (".sto", ".mot", ".trc", ".tum")
+    for ending in endings:
+        convert(estimate, tmp_path / f"whole{ending}")
+    convert(estimate, tmp_path / "whole.parquet")
+    for size in (1_000, 1_700):
+        monkeypatch.setattr(chunks, "CHUNK_BYTES", size)
+        shares: list[float] = []
+        for ending in endings:
+            convert(estimate, tmp_path / f"whole_{ending}", force=True, progress=shares.append)
+            whole = (tmp_path / f"whole{ending}").read_text().replace("whole", "whole_")
+            assert (tmp_path / f"whole_{ending}").read_text() == whole
+        assert len(shares) > 40 and max(shares) == 1
+        convert(estimate, tmp_path / "parts.parquet", force=True)
+        found, own = (read_table(tmp_path / f"{name}.parquet") for name in ("parts", "whole"))
+        assert all(np.array_equal(found.columns[name], own.columns[name], equal_nan=True) for name in own.columns)
 
 
 def test_a_damaged_parquet_file_is_named(tmp_path):

@@ -13,7 +13,7 @@ from linkpose.simulation.mice import MiceRun
 from virtual_uno import VirtualUno
 
 RATE_HZ = 1000  # rows of the tables, the MPU-6050's own sample rate
-STRETCH_S = 10  # fed at once
+STRETCH_S = 10  # fed at once, which takes 80 ms
 _OVERLAP_S = 1
 _TEMPERATURE_OFFSET, _TEMPERATURE_SCALE = 36.53, 340.0  # product specification 6.3
 _AIR_NOISE_STREAM = 100  # apart from the streams of the simulation
@@ -82,10 +82,13 @@ def mouse_rows(run: MiceRun, first: int, count: int) -> tuple[Floats, list[Float
 class RigFeed:
     """Keeps the emulated sensors supplied with a run of any length, a stretch at a time."""
 
-    def __init__(self, uno: VirtualUno, run: LinkRun | MiceRun, drive: MiceRun | None = None) -> None:
-        """`drive`: how the mice move beside a link, which has none."""
+    def __init__(
+        self, uno: VirtualUno, run: LinkRun | MiceRun, drive: MiceRun | None = None, stretch_s: int = STRETCH_S
+    ) -> None:
+        """`drive`: how the mice move beside a link, which has none. `stretch_s`: fed at once, while the board waits."""
         self._uno, self._run = uno, run
         self._drive = run if isinstance(run, MiceRun) else drive
+        self._stretch_s = stretch_s
         self.restart()
 
     def restart(self) -> None:
@@ -98,7 +101,7 @@ class RigFeed:
         if self._uno.time_s + _OVERLAP_S < self._fed_until:
             return
         first = max(0, round((self._uno.time_s - self.start_s - _OVERLAP_S) * RATE_HZ))
-        count = (STRETCH_S + 2 * _OVERLAP_S) * RATE_HZ
+        count = (self._stretch_s + 2 * _OVERLAP_S) * RATE_HZ
         self._uno.imu.feed(*imu_rows(self._run, first, count), start_s=self.start_s)
         if isinstance(self._run, LinkRun):
             self._feed_air(self._run, first, count)

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from linkpose.cli import options
-from linkpose.errors import printable
 
 
 @click.command("convert")
@@ -43,14 +42,18 @@ def command(source: Path, output: Path, wanted: str | None, label: str, force: b
     .tum a trajectory for evo, .mcap poses and values for Foxglove, .parquet all columns and the metadata.
     linkpose reads .parquet wherever it reads .csv.
     """
+    from linkpose.cli.live import Console
     from linkpose.convert import ENDINGS, convert
 
     if output.suffix.lower() not in ENDINGS:
         raise click.UsageError(f"{output} has none of the endings {', '.join(ENDINGS)}")
     if any(not 33 <= ord(character) < 127 or character in ",;" for character in label) or not label:
         raise click.UsageError(f"--label {label!r} must consist of letters, digits and _")
-    remarks = convert(source, output, wanted, label, force)
-    if not quiet:
-        for remark in remarks:
-            click.echo(printable(remark), err=True)
+    console = Console(quiet, verbose=False)
+    remarks = convert(
+        source, output, wanted, label, force, lambda share: console.progress(lambda: f"converting {share:.0%}")
+    )
+    console.clear()
+    for remark in remarks:
+        console.report(remark)
     click.echo(output)

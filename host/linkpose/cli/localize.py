@@ -373,7 +373,7 @@ def _stream(
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")
     with contextlib.suppress(KeyboardInterrupt), ending_well():
-        for line in stream.csv_lines(sys.stdin):
+        for line in stream.csv_lines(sys.stdin or ()):  # None: it was closed, which is as empty as /dev/null
             click.echo(line)
             sys.stdout.flush()
     for remark in stream.remarks():

@@ -14,23 +14,24 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 from linkpose.convert import c3d, mcap, parquet, text
-from linkpose.convert.motion import Motion, motion_of, only_filter
-from linkpose.errors import CannotWrite, InvalidValue
-from linkpose.recording.csvfile import create
-from linkpose.recording.table import Table, read_table
+from linkpose.convert.motion import Motion
+from linkpose.convert.source import Source
+from linkpose.errors import InvalidValue
+from linkpose.outputs import new_file
+from linkpose.recording.table import Progress, TableFile
 
-_OF_MOTION: dict[str, Callable[[Path, Motion], None]] = {
+_OF_MOTION: dict[str, Callable[[BinaryIO, Path, Motion], None]] = {
     ".sto": text.write_sto,
     ".trc": text.write_trc,
     ".c3d": c3d.write,
     ".tum": text.write_tum,
 }
-_OF_TABLE: dict[str, Callable[[Path, Table], None]] = {
+_OF_TABLE: dict[str, Callable[[BinaryIO, Path, Source], None]] = {
     ".mot": text.write_mot,
     ".mcap": mcap.write,
     ".parquet": parquet.write,
@@ -38,44 +39,38 @@ _OF_TABLE: dict[str, Callable[[Path, Table], None]] = {
 ENDINGS = (*_OF_MOTION, *_OF_TABLE)
 
 
+# Passes over the source: the first finds what a head states, the last of .mcap writes the poses.
+_PASSES = dict.fromkeys(ENDINGS, 2) | {".mcap": 3}
+_WITH_TIMES = (".mot", ".mcap")
+
+
 def convert(
-    source: Path, output: Path, wanted: str | None = None, label: str = "sensor_imu", force: bool = False
+    source: Path,
+    output: Path,
+    wanted: str | None = None,
+    label: str = "sensor_imu",
+    force: bool = False,
+    progress: Progress = lambda share: None,
 ) -> list[str]:
     """Writes `source`, a table that linkpose reads, in the format of the ending of `output`; gives remarks.
 
     `wanted` names the filter; without it, formats of one motion hold the first filter that fits, and formats of columns
-    hold all. `label` names the sensor in formats with names. An existing output is kept unless `force`. Raises
-    FileError, MissingLibrary, UnknownFilter, or LinkposeError where the source has no motion.
+    hold all. `label` names the sensor in formats with names. An existing output is kept unless `force`. `progress` is
+    called with the share of the work that is done. Raises FileError, MissingLibrary, UnknownFilter, or LinkposeError
+    where the source has no motion.
     """
     ending = output.suffix.lower()
     if ending not in ENDINGS:
         raise InvalidValue("output", f"ends in {ending or 'nothing'}; the formats are {', '.join(ENDINGS)}")
-    table = read_table(source)
-    remarks = list(table.remarks)
-    if ending in _OF_MOTION:
-        motion = motion_of(table, wanted, label)
-        remarks += motion.remarks
-        _write(output, force, lambda: _OF_MOTION[ending](output, motion))
-    else:
-        part = only_filter(table, wanted) if wanted else table
-        _write(output, force, lambda: _OF_TABLE[ending](output, part))
-    return remarks
-
-
-def _write(output: Path, force: bool, action: Callable[[], None]) -> None:
-    """Runs `action`, which fills the new file; removes the file where that fails."""
-    os.close(create(output, force))
-    try:
-        action()
-    except OSError as error:
-        _remove(output)
-        raise CannotWrite(output, error.strerror) from error
-    except BaseException:
-        _remove(output)
-        raise
-
-
-def _remove(output: Path) -> None:
-    with contextlib.suppress(OSError):
-        if output.is_file():
-            output.unlink()
+    with contextlib.closing(TableFile(source)) as file:
+        if ending in _WITH_TIMES:
+            file.require("time_s")
+        table = Source(file, wanted, _PASSES[ending], progress)
+        if ending not in _OF_MOTION:
+            with new_file(output, force) as written:
+                _OF_TABLE[ending](written, output, table)
+            return table.remarks
+        motion = Motion(table, wanted, label)
+        with new_file(output, force) as written:
+            _OF_MOTION[ending](written, output, motion)
+        return table.remarks + motion.remarks

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -10,17 +12,23 @@ from linkpose.convert import libraries
 from linkpose.convert.motion import Motion
 
 
-def write(path: Path, motion: Motion) -> None:
-    """Three markers in mm at equal intervals; the world has Z up. A missing marker has the residual −1."""
+def write(output: BinaryIO, path: Path, motion: Motion) -> None:
+    """Three markers in mm at equal intervals; the world has Z up. A missing marker has the residual −1.
+
+    ezc3d writes to a name only: to one in a folder of its own, which nobody else can write.
+    """
     ezc3d = libraries.load("ezc3d", path)
-    _, rate, markers = motion.on_grid()
+    markers = np.concatenate(list(motion.markers()))
     file = ezc3d.c3d()
-    file["parameters"]["POINT"]["RATE"]["value"] = [rate]
+    file["parameters"]["POINT"]["RATE"]["value"] = [motion.rate_hz]
     file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
-    file["parameters"]["POINT"]["LABELS"]["value"] = tuple(motion.marker_names())
+    file["parameters"]["POINT"]["LABELS"]["value"] = tuple(motion.marker_names)
     file.add_parameter("POINT", "X_SCREEN", "+X")
     file.add_parameter("POINT", "Y_SCREEN", "+Z")
     points = np.ones((4, 3, len(markers)))
     points[:3] = 1000 * markers.transpose(2, 1, 0)
     file["data"]["points"] = points
-    file.write(str(path))
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder) / "motion.c3d"
+        file.write(str(written))
+        output.write(written.read_bytes())

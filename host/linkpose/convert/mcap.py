@@ -5,37 +5,35 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from linkpose import __version__
 from linkpose.convert import libraries
-from linkpose.convert.motion import Motion, motion_of
+from linkpose.convert.motion import Motion
+from linkpose.convert.source import Source
 from linkpose.errors import LinkposeError
-from linkpose.recording.table import Table
 
 _NUMBER = {"type": "number"}
 
 
-def write(path: Path, table: Table) -> None:
+def write(file: BinaryIO, path: Path, source: Source) -> None:
     """A topic /linkpose/values with all columns, and /linkpose/pose where the table has a motion. World: Z up."""
-    table.require("time_s")
     writer_module = libraries.load("mcap.writer", path)
-    with path.open("wb") as file:
-        writer = writer_module.Writer(file)
-        writer.start(profile="", library=f"linkpose {__version__}")
-        values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(table.columns))
-        names = list(table.columns)
-        for row in zip(*(column.tolist() for column in table.columns.values()), strict=True):
-            content = {name: value for name, value in zip(names, row, strict=True) if math.isfinite(value)}
-            _add(writer, values, content.get("time_s", 0.0), content)
-        if (motion := _motion(table)) is not None:
-            _add_poses(writer, motion)
-        writer.finish()
+    writer = writer_module.Writer(file)
+    writer.start(profile="", library=f"linkpose {__version__}")
+    values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(source.names))
+    for block in source.blocks():
+        for row in zip(*(column.tolist() for column in block.values()), strict=True):
+            content = {name: value for name, value in zip(block, row, strict=True) if math.isfinite(value)}
+            _add(writer, values, content["time_s"], content)
+    if (motion := _motion(source)) is not None:
+        _add_poses(writer, motion)
+    writer.finish()
 
 
-def _motion(table: Table) -> Motion | None:
+def _motion(source: Source) -> Motion | None:
     try:
-        return motion_of(table, None, "sensor")
+        return Motion(source, None, "sensor")
     except LinkposeError:  # a recording, or a filter that estimates the height alone
         return None
 
@@ -46,7 +44,11 @@ def _add_poses(writer: Any, motion: Motion) -> None:
     pose = {"type": "object", "properties": parts}
     schema = {"type": "object", "properties": {"timestamp": time, "frame_id": {"type": "string"}, "pose": pose}}
     channel = _channel(writer, "/linkpose/pose", "foxglove.PoseInFrame", schema)
-    rows = zip(motion.time_s.tolist(), motion.position_m.tolist(), motion.quaternion.tolist(), strict=True)
+    rows = (
+        row
+        for poses in motion.parts()
+        for row in zip(poses.time_s.tolist(), poses.position_m.tolist(), poses.quaternion.tolist(), strict=True)
+    )
     for t, (x, y, z), (qw, qx, qy, qz) in rows:
         seconds, nanoseconds = divmod(_nanoseconds(t), 1_000_000_000)
         orientation = {"x": qx, "y": qy, "z": qz, "w": qw}

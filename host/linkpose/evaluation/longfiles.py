@@ -29,7 +29,7 @@ from linkpose.evaluation.scores import (
 )
 from linkpose.evaluation.scoring import Compared, Score, Scorer, Window, scores_of
 from linkpose.evaluation.series import SPARSER, Lag, interval, paired, strongest_lag, usual
-from linkpose.quantities import HEIGHT, by_filter, split
+from linkpose.quantities import HEIGHT, Quantity, by_filter, split
 from linkpose.recording import thinned
 from linkpose.recording.ahead import ahead
 from linkpose.recording.table import LONGEST_HOLE, Progress, Table, TableFile, Whole
@@ -248,15 +248,8 @@ class _Comparison:
 
     def evaluate(self, window: Window) -> Evaluation:
         """The scores of all filters."""
-        near = self._find_lag()
-        stamps = self._scans[0].coarse["time_s"]
-        for scan in self._scans:
-            scan.coarse.clear()
-        tables = self._stretches(stamps[np.isfinite(stamps)], near)
-        compared = pairs_of(*tables)
-        offset_s, residual = common_offset(compared.values(), near)
-        remarks = mismatches(*tables, compared.values(), offset_s, residual)
-        scores, without = self._score(compared, offset_s, window)
+        quantities, offset_s, remarks = self._compare_stretches()
+        scores, without = self._score(quantities, offset_s, window)
         return Evaluation(scores, remarks + without)
 
     def _share(self, done: int, of: int) -> Progress:
@@ -269,6 +262,18 @@ class _Comparison:
         return self._sources[0].table(ours, wholes[0]), self._sources[1].table(theirs, wholes[1])
 
     # ---- the offset between the clocks ----
+
+    def _compare_stretches(self) -> tuple[dict[str, list[Quantity]], float, list[str]]:
+        """The quantities of each filter that can be compared, the offset, and remarks; from some rows of both files."""
+        near = self._find_lag()
+        stamps = self._scans[0].coarse["time_s"]
+        for scan in self._scans:
+            scan.coarse.clear()
+        tables = self._stretches(stamps[np.isfinite(stamps)], near)
+        compared = pairs_of(*tables)
+        offset_s, residual = common_offset(compared.values(), near)
+        remarks = mismatches(*tables, compared.values(), offset_s, residual)
+        return {name: list(both.pairs) for name, both in compared.items()}, offset_s, remarks
 
     def _most_telling(self) -> tuple[list[str], list[str]]:
         """Columns of both files by which the lag is searched: of the filter with most estimates at the start."""
@@ -311,28 +316,28 @@ class _Comparison:
     # ---- scores ----
 
     def _score(
-        self, compared: Mapping[str, Compared], offset_s: float, window: Window
+        self, quantities: Mapping[str, Collection[Quantity]], offset_s: float, window: Window
     ) -> tuple[list[Score], list[str]]:
         """Scores all filters over all rows, as `scores_of`."""
-        starts = self._common_starts(compared, offset_s)
+        starts = self._common_starts(quantities, offset_s)
         present = pairs_of(*self._tables(*(scan.presence for scan in self._scans)))
         instants = self._scans[self._sparser].rows
         paths = self._sources[0].path, self._sources[1].path
         scorers = {
             name: Scorer(
                 name, paths, offset_s, window, instants, present[name].empty, starts[name],
-                Thinner(instants, 2 * len(both.pairs), _KEPT_FOR_PICTURES),
+                Thinner(instants, 2 * len(own), _KEPT_FOR_PICTURES),
             )
-            for name, both in compared.items()
+            for name, own in quantities.items()
         }  # fmt: skip
         for piece in self._pieces(offset_s, self._share(2, 3)):
             for name, both in piece.items():
                 scorers[name].add(both)
         return scores_of(scorers.values())
 
-    def _common_starts(self, compared: Mapping[str, Compared], offset_s: float) -> dict[str, CommonStart]:
+    def _common_starts(self, quantities: Mapping[str, Collection[Quantity]], offset_s: float) -> dict[str, CommonStart]:
         """Of each filter. They are near the beginning of the files as a rule."""
-        starts = {name: CommonStart(name, both.pairs) for name, both in compared.items()}
+        starts = {name: CommonStart(name, own) for name, own in quantities.items()}
         pieces = self._pieces(offset_s, lambda _: None)
         while not all(start.is_found for start in starts.values()) and (piece := next(pieces, None)) is not None:
             for name, both in piece.items():

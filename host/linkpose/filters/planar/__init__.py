@@ -23,6 +23,7 @@ import numpy as np
 from linkpose.filters import GyroJumps, MovedMouse
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
+from linkpose.filters.mice.causes import causes
 from linkpose.filters.mice.reading import BIAS_STD
 from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, sample_records
 from linkpose.filters.planar.process import process
@@ -46,6 +47,8 @@ __all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
 
+_SPREAD = 0.02  # of the share of the turns that the mice show: reported from here on
+_SNAP_READINGS = 50.0  # after so many readings, a mouse is reported as snapping to its axes
 # A mouse is reported at another place beyond so much (m), and so many standard deviations.
 _MOVED_M, _MOVED_Z = 0.008, 5.0
 
@@ -124,6 +127,47 @@ class _PlanarFilter:
             if off_m > max(_MOVED_M, _MOVED_Z * found.position_std_m):
                 moved.append(MovedMouse(found.mouse, found.x_m, found.y_m, off_m))
         return tuple(moved)
+
+    @property
+    def mouse_causes(self) -> dict[int, str]:
+        """Why mice were excluded so far (1 for the first; 0: all together)."""
+        return causes(self._mice_state[0], self._mice)
+
+    @property
+    def mice_remarks(self) -> list[str]:
+        """Faults that all mice share, as the turns have shown them."""
+        state, limit = self.state[0], float(self._mice_state[0].speed_limit)
+        remarks = []
+        if limit > 0.0:
+            remarks.append(
+                f"the mice show no speed above {limit:.2f} m/s, where the gyro shows faster turns: this is the limit "
+                "of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
+                "includes it. Drive slower, or use mice for higher speeds"
+            )
+        if state.resolution.changes:
+            remarks.append(
+                f"all mice count {state.resolution.factor:.2f} times as much since a time before "
+                f"{state.resolution.time:.1f} s, compared with the gyro: their resolution was switched, and the path "
+                "since then was corrected"
+            )
+        if snapping := self._snapping:
+            remarks.append(
+                f"{snapping}: no counts across an axis while the motion is almost along the other one (angle "
+                "snapping). In bends, the position is less accurate. Use mice without this function"
+            )
+        if state.turn_spread > _SPREAD**2:
+            remarks.append(
+                f"from turn to turn, the mice show {100 * math.sqrt(state.turn_spread):.0f} % more or less than the "
+                "gyro: they slip, or the floor changes. The σ of the position includes this share of the way"
+            )
+        return remarks
+
+    @property
+    def _snapping(self) -> str:
+        """The mice that snap to their axes, by name; empty where none does."""
+        mice = self._mice[: len(self._rig.mouse)]
+        ports = [str(i + 1) for i, m in enumerate(mice) if m["snaps"] and m["snap_readings"] > _SNAP_READINGS]
+        return f"{'mouse' if len(ports) == 1 else 'mice'} {', '.join(ports)}" if ports else ""
 
     @property
     def scale_change(self) -> tuple[float, float]:
