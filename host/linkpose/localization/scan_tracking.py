@@ -117,7 +117,8 @@ class ScanTracker:
         self.misfit2 += (fit.misfit_m**2 - self.misfit2) / RISE
         std = max(LEAST_WALL_STD_M, self.matcher.field.wall_std_m, math.sqrt(self.misfit2))
         shared = SHARED_BEAMS * fit.beams / MOST_BEAMS
-        error: Floats = np.linalg.inv(fit.walls / (shared * std**2) + np.diag(1.0 / UNBOUND**2))
+        bound = fit.walls / (shared * std**2) + np.diag(1.0 / UNBOUND**2)
+        error = np.asarray(np.linalg.inv(bound), dtype=np.float64)
         common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
         self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
 
