@@ -187,15 +187,16 @@ class Estimator:
             raise LinkposeError(f"no filter that can be smoothed ({', '.join(smoothable)}) runs{reasons}")
         self.filters = [filters.create_smoother(f.name, self._rig) if f.name in smoothable else f for f in self.filters]
 
-    def hold_heading(self) -> None:
+    def hold_heading(self, port: str | None = None) -> None:
         """Lets the magnetometer hold the yaw of each filter that estimates one; after `smooth`, before `process`.
 
+        `port` is that of the board whose stream is estimated; None for a recording.
         Raises NoMagnetometer, UncalibratedMagnetometer, and CannotRun where no filter estimates a yaw.
         """
         from linkpose.filters.magnetic_heading import MagneticHeading, has_yaw
 
         if not self._sensors & Sensors.MAG:
-            raise NoMagnetometer
+            raise NoMagnetometer(port)
         if not any(map(has_yaw, self.filters)):
             raise CannotRun("none of the filters that run estimates a yaw since the start")
         self.filters = [MagneticHeading(f, self._rig.mag) if has_yaw(f) else f for f in self.filters]

@@ -9,12 +9,11 @@ of the sensors. Yaw, x and y are relative to the first sample.
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 from typing import NamedTuple
 
 import numpy as np
+from _report import bench_parser, print_row
 
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats
@@ -66,9 +65,8 @@ def runs_of(test: int, seed: int, errors: str) -> dict[str, Run]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = bench_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     for errors in ("calibrated", "datasheet"):
         runs = [runs_of(test, seed, errors) for test, seed in itertools.product(TESTS, range(options.seeds))]
@@ -83,7 +81,7 @@ def main() -> None:
                 "nees": round(float(nees.mean()), 3),
                 "rmse": round(float(rmse.mean()), 5),
             }
-            print(json.dumps(row) if options.json else row)
+            print_row(row, options.json)
 
 
 if __name__ == "__main__":

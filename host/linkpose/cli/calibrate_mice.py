@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 
 if TYPE_CHECKING:
     from linkpose.calibration.mice import MouseCalibration
@@ -35,16 +36,15 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     from linkpose.calibration.mice import calibrate_mice, with_calibration
     from linkpose.sensors.devices import slow_mouse_remarks
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_mice(loaded, rig, length)
     with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
-    if not quiet:
-        for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
-            click.echo(remark, err=True)
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+    for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
+        console.report(remark)
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
 def _line(mouse: MouseCalibration) -> str:

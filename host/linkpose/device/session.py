@@ -7,7 +7,7 @@ import itertools
 import math
 import random
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
@@ -203,8 +203,7 @@ class Session:
             if time.perf_counter() > deadline:
                 break
             time.sleep(SETTLE_S)
-            self._connection.send(GetInfo())
-            hello = self._await(Hello, "GET_INFO")
+            hello = self._ask_hello()
         return hello
 
     def _check_versions(self, hello: Hello) -> None:
@@ -229,8 +228,7 @@ class Session:
         for _ in range(ATTEMPTS):
             self._command(settings, Command.CONFIGURE)
             time.sleep(SETTLE_S)
-            self._connection.send(GetInfo())
-            self.hello = self._await(Hello, "GET_INFO")
+            self.hello = self._ask_hello()
             if _configured(self.hello) == settings:
                 self._wanted = settings
                 return self.hello
@@ -248,8 +246,7 @@ class Session:
                 self.notify("Waiting for the mice, which are being set up or have not been found yet")
                 notified = True
             time.sleep(ASK_INTERVAL_S)
-            self._connection.send(GetInfo())
-            self.hello = self._await(Hello, "GET_INFO")
+            self.hello = self._ask_hello()
         for remark in mouse_remarks(self.hello):
             self.notify(remark)
 
@@ -260,7 +257,10 @@ class Session:
     def self_test(self, device: int = 0) -> SelfTestResult:
         """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
         with_ack = self._command(SelfTest(device), Command.SELF_TEST)
-        return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
+        result = _first(SelfTestResult, itertools.chain(with_ack.messages, self._messages(SELF_TEST_TIMEOUT_S)))
+        if result is None:
+            raise _no_answer("SELF_TEST")
+        return result
 
     def _command(self, message: Message, command: Command) -> Arrival:
         """Sends a command, again where its answer is lost; the arrival that holds the ACK, from behind the ACK on.
@@ -277,22 +277,20 @@ class Session:
                         return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
                     if isinstance(answer, Sample) and command == Command.START:
                         return Arrival(arrival.time_s, arrival.messages[at:], b"")
-        raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
+        raise _no_answer(command.name)
 
-    def _await(
-        self,
-        kind: type[Answer],
-        asked: str,
-        received: Sequence[Message | OtherProtocol] = (),
-        timeout_s: float = ANSWER_TIMEOUT_S,
-    ) -> Answer:
-        """The answer of a kind, from what was `received` already or from what arrives within the time."""
-        arrivals = self._arrivals(timeout_s)
-        for messages in itertools.chain([received], (arrival.messages for arrival in arrivals)):
-            for answer in messages:
-                if isinstance(answer, kind):
-                    return answer
-        raise LinkposeError(f"the board did not answer {asked}; unplug it, plug it in and try again")
+    def _ask_hello(self) -> Hello:
+        """The HELLO that answers GET_INFO, which is sent again where the answer is lost."""
+        for _ in range(ATTEMPTS):
+            self._connection.send(GetInfo())
+            hello = _first(Hello, self._messages(ANSWER_TIMEOUT_S))
+            if hello is not None:
+                return hello
+        raise _no_answer("GET_INFO")
+
+    def _messages(self, timeout_s: float) -> Iterator[Message | OtherProtocol]:
+        """The messages that arrive within a time."""
+        return itertools.chain.from_iterable(arrival.messages for arrival in self._arrivals(timeout_s))
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
@@ -617,6 +615,15 @@ def reset_causes(hello: Hello) -> str:
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
     return Configure(*(getattr(hello, name) for name in Configure._fields))
+
+
+def _first(kind: type[Answer], messages: Iterable[Message | OtherProtocol]) -> Answer | None:
+    """The first message of a kind."""
+    return next((message for message in messages if isinstance(message, kind)), None)
+
+
+def _no_answer(command: str) -> LinkposeError:
+    return LinkposeError(f"the board did not answer {command}; unplug it, plug it in and try again")
 
 
 def _reason(code: int) -> str:

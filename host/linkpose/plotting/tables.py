@@ -11,7 +11,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import panels, readings, robots
-from linkpose.plotting.canvas import new_figure
+from linkpose.plotting.canvas import label_time, new_figure
 from linkpose.plotting.sources import Sources, gather, is_recording, title
 from linkpose.quantities import (
     ANGLE,
@@ -113,7 +113,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         panel.draw(axes)
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
-        axes.set_xlabel("time (s)")
+        label_time(axes)
         part.align_ylabels()
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from linkpose.errors import CannotRead, FileFormatError
+from linkpose.errors import FileFormatError
 from linkpose.recording.delimited import codec_of
 
 # Twice of it doubles the memory of a run (about ten times as much) and saves no time.
@@ -26,14 +26,14 @@ class Chunk(NamedTuple):
 def read_chunks(path: Path, file: BinaryIO) -> Iterator[Chunk]:
     """The file from its start. The last piece may be empty, or end without a line end.
 
-    Raises CannotRead, and FileFormatError for a line that is longer than a piece.
+    Raises FileFormatError for a line that is longer than a piece.
     """
     file.seek(0)
-    raw = _read(path, file).removeprefix(b"\xef\xbb\xbf")
+    raw = file.read(CHUNK_BYTES).removeprefix(b"\xef\xbb\xbf")
     to_utf8 = _converter(raw)
     rest, line = b"", 1
     while True:
-        following = _read(path, file)
+        following = file.read(CHUNK_BYTES)
         data = rest + to_utf8(raw, not following)
         if not following:
             yield Chunk(data, line, True, file.tell())
@@ -46,13 +46,6 @@ def read_chunks(path: Path, file: BinaryIO) -> Iterator[Chunk]:
             yield Chunk(data[:end], line, False, file.tell() - len(following) - len(rest))
             line += data.count(b"\n") or data.count(b"\r")
         raw = following
-
-
-def _read(path: Path, file: BinaryIO) -> bytes:
-    try:
-        return file.read(CHUNK_BYTES)
-    except OSError as error:
-        raise CannotRead(path, error.strerror) from error
 
 
 def _converter(start: bytes) -> Callable[[bytes, bool], bytes]:
