@@ -15,6 +15,7 @@ from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.localizer import estimate_track
 from linkpose.localization.map_check import check_map
+from linkpose.localization.paths import localize
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
@@ -126,6 +127,17 @@ def test_without_a_start_the_pose_is_unknown_and_then_right(drive):
     assert np.isnan(track.state[0]).all()
     assert track.known.mean() > 0.6
     assert score_track(track, run.truth).position_max_m < 0.3
+
+
+def test_scans_without_odometry_are_followed_from_a_given_start(drive):
+    run, grid = drive
+    scans = [reading for reading in run.readings[:150] if reading.ranges_m is not None]
+    still = [replace(reading, odometry=(0.0, 0.0, 0.0), laser=(0.0, 0.0, 0.0)) for reading in scans]
+    paths = localize(as_log(still), map=grid, start=tuple(run.pose[0]))
+    assert "the odometry of the log is always at rest" in paths.remarks[0]
+    result = paths.score(run.truth)["scan-match"]
+    assert result.position_rmse_m < 0.1
+    assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
 
 
 def test_a_robot_that_was_carried_is_found_again(drive):

@@ -376,3 +376,13 @@ def test_an_evaluation_draws_what_matters_first(tmp_path):
     assert [axes.get_ylabel() for axes in figure.axes] == ["rotation error (°)", ""]
     cells = [cell.get_text().get_text() for cell in figure.axes[-1].tables[0].get_celld().values()]
     assert {"tilt", "chain"} <= set(cells)
+
+
+@pytest.mark.parametrize("name", ["a$\\frac$", "escape\x1b[31m", "no UTF-8 \udcff", "$(x)`"])
+def test_any_name_of_a_file_or_a_column_is_drawn_as_it_is(tmp_path, name):
+    path = tmp_path / f"{name}.csv"
+    path.write_text("time_s,$\\frac$_height_m\n0,1\n1,2\n2,3\n")
+    figure, _ = plotting.plot_tables([read_table(path)])
+    for ending in ("png", "svg"):
+        plotting.save(figure, tmp_path / f"picture.{ending}", force=False)
+    assert "$\\frac$" in drawn(figure.axes[0])

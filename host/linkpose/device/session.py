@@ -136,6 +136,7 @@ class Session:
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
         self._arrived_s = 0.0  # s, the connection's clock: of the last sample
+        self._repeats = 0  # samples since the last one with a new number
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
             0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
@@ -435,6 +436,8 @@ class Session:
                 self._arrived_s = arrival.time_s
                 place = timeline.place(message, self._clock, arrival.time_s)
                 self._report_clock_fault(timeline)
+                self._repeats = 0 if place else self._repeats + 1
+                self._report_repeats(timeline)
                 if place is not None:
                     placements.append(Placement(message, place))
             elif placements and isinstance(message, Hello | OtherProtocol):
@@ -462,6 +465,14 @@ class Session:
             self.notify(
                 f"{timeline.duration_s:.2f} s: the board's clock {fault}; its count of ticks gives the times from here "
                 "on. Replace the board if it happens again"
+            )
+
+    def _report_repeats(self, timeline: Timeline) -> None:
+        """Report a board that sends the number of one sample again and again: only the first is part of the stream."""
+        if self._repeats == round(SILENCE_S * self.hello.sample_rate_hz) and not timeline.is_over:
+            self.notify(
+                f"{timeline.duration_s:.2f} s: {self._repeats} samples came with numbers that came before, and are "
+                "left out; reset the board, and replace it if it happens again"
             )
 
     def _ask_when_silent(self) -> None:

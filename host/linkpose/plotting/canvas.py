@@ -110,6 +110,15 @@ def _by_rows(labels: list[str], columns: int) -> list[str]:
     return [label for column in range(columns) for label in labels[column::columns]]
 
 
+def without_formulas(figure: Figure) -> Figure:
+    """The figure, with each `$` as it is: in the names of files and columns, it does not begin a formula."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    return figure
+
+
 def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMATS) -> None:
     """Raises FileError where a picture of this name cannot be written: better before the work than after it."""
     if path is None or path == STDOUT:

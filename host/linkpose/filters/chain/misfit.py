@@ -16,9 +16,12 @@ from linkpose.filters.chain.state import BA, BG, OF_SENSOR, Floats, R, Record
 # Accelerometer bias: ten times the data sheet's 0.5 m/s². The largest of the recordings [D] and [O] is 1.0 m/s²; with
 # accelerations of one sensor in g it is 8 m/s² and more.
 _MOST_BIAS_M_S2 = 5.0
-# Residual of the joint as a share of ‖ω‖ ‖r‖: at most 0.05 in [D] and [O]; with rates in °/s 0.2 to 1. It counts where
-# the root mean square of ‖ω‖ ‖r‖ exceeds the second figure (m/s): below, noise and play are as large.
-_MOST_RESIDUAL, _LEAST_REACH_M_S = 0.15, 0.1
+# Residual of the joint as a share of ‖ω‖ ‖r‖: at most 0.05 in [D] and [O], and 0.2 for some seconds while a simulated
+# hinge follows a wrong heading; with rates of one sensor in °/s 0.3 to 1.2. It counts where the root mean square of
+# ‖ω‖ ‖r‖ exceeds the second figure (m/s): below, noise and play are as large.
+_MOST_RESIDUAL, _LEAST_REACH_M_S = 0.3, 0.1
+# Mean norm of the rate (rad/s): a runner's shank has 5; a leg whose rates are in °/s has 50.
+MOST_MEAN_RATE_RAD_S = 20.0
 # Mean square of the joint's lasting innovations, in multiples of its value for a right σ: 6 at most in [D] and [O]; a
 # gyro that repeats one value makes it 23, a sensor mounted anew 11 to 20.
 _MOST_LASTING = 10.0
@@ -41,6 +44,7 @@ def follow_misfit(bank: Record, best: Record, h: float, q: Record) -> None:
     fits = fits and not (reaches and best.residual_share > _MOST_RESIDUAL**2)
     for k in range(2):
         fits = fits and square(best.accel_bias[k]) < _MOST_BIAS_M_S2**2
+        fits = fits and bank.rate_sum[k] < MOST_MEAN_RATE_RAD_S * max(bank.readings[k], 1)
     bank.misfit_s = max(bank.misfit_s - _RECOVERY * h, 0.0) if fits else bank.misfit_s + h
     if fits:
         bank.probation_s = max(bank.probation_s - h, 0.0)

@@ -250,7 +250,8 @@ BANK = np.dtype(
         ("forgotten", "i8"),  # how often the mounting was forgotten
         ("samples", "i8"),
         ("force_sum", "f8", 2),  # of the norms of their specific forces (m/s²)
-        ("forces", "i8", 2),  # how many these are
+        ("rate_sum", "f8", 2),  # and of their rates (rad/s)
+        ("readings", "i8", 2),  # how many these are
         ("restarts", "i8"),
         # Angles of a ball joint: axes of flexion, abduction and length of link 1 as columns, in sensor 1's axes;
         # whether the rig states the first and the last; the neutral rotation that it states.
