@@ -517,8 +517,8 @@ def estimate(
         mag: correct the yaw with the magnetometer. The rig must contain the magnetometer's calibration.
 
     Warns:
-        UserWarning where values contradict their unit (g in place of m/s², milliseconds), where the recording is faulty,
-        and where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
+        UserWarning where values contradict their unit (g in place of m/s², milliseconds), where the recording is
+        faulty, and where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
 
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
@@ -530,7 +530,9 @@ def estimate(
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)
     in_force = with_chain_joint(in_force, joint)
-    estimator = Estimator.for_measurements([filters] if isinstance(filters, str) else filters or (), in_force, measurements)
+    estimator = Estimator.for_measurements(
+        [filters] if isinstance(filters, str) else filters or (), in_force, measurements
+    )
     if smooth:
         estimator.smooth()
     if mag:

@@ -96,7 +96,7 @@ def test_a_masked_reading_is_missing() -> None:
 def test_values_of_another_unit_are_remarked_on(swing: Path, factors: tuple[float, ...], remark: str | None) -> None:
     """The same for arrays as for a file, whose own remarks reach the estimates."""
     own = lp.load(swing).measurements
-    gyro = own.gyro_rad_s + [1.0, 0.0, 0.0]
+    gyro = own.gyro_rad_s + np.array([1.0, 0.0, 0.0])
     arrays = (own.time_s, own.accel_m_s2, gyro)
     measurements = lp.Measurements.from_imu(*(a * factor for a, factor in zip(arrays, factors, strict=True)))
     if remark is None:

@@ -235,7 +235,7 @@ def _why_not(name: str, error: Exception) -> PortError:
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return PortBusy(name)
     if "no handler" in text or "invalid url" in text:
-        return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3")
+        return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
         return NotASerialPort(name)
     return PortError(name, f"cannot open {name}: {error}")
