@@ -7,6 +7,7 @@ import decimal
 import io
 import itertools
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
