@@ -72,8 +72,10 @@ def new_file(path: Path, force: bool) -> Iterator[BinaryIO]:
         with contextlib.suppress(OSError):
             if path != STDOUT and path.is_file():
                 path.unlink()
+        if isinstance(error, OSError) and error.errno == errno.EPIPE:
+            raise _without_reader(path) from error
         if isinstance(error, OSError):
-            raise CannotWrite("the standard output" if path == STDOUT else path, error.strerror) from error
+            raise CannotWrite(_shown(path), error.strerror) from error
         raise
 
 
@@ -132,14 +134,22 @@ def write_all(fd: int, path: Path, data: bytes) -> None:
     except OSError as error:
         if written:
             _cut_back(fd, data[:written])
-        name = "the standard output" if path == STDOUT else path
         if error.errno == errno.EPIPE:
-            raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
+            raise _without_reader(path) from error
         raise FileError(
             path,
-            f"cannot write to {name} any more: {error.strerror}; what was written so far is whole, "
+            f"cannot write to {_shown(path)} any more: {error.strerror}; what was written so far is whole, "
             "make room or name a file on another disk",
         ) from error
+
+
+def _shown(path: Path) -> str:
+    """The name of an output in a message."""
+    return "the standard output" if path == STDOUT else str(path)
+
+
+def _without_reader(path: Path) -> FileError:
+    return FileError(path, f"the reader of {_shown(path)} has gone; nothing more can be written to it")
 
 
 def synchronise(fd: int) -> None:

@@ -148,7 +148,10 @@ def length_with_std(value_m: float, std_m: float) -> str:
 
 def length_text(value_m: float, std_m: float) -> str:
     """A length to the last digit of its standard deviation (m); a dash where it is not finite."""
-    return minus(f"{value_m:.{_digits(std_m).of_value}f} m") if math.isfinite(value_m) else "–"
+    if not math.isfinite(value_m):
+        return "–"
+    decimals = _digits(std_m).of_value
+    return minus(f"{round(value_m, decimals) + 0.0:.{decimals}f} m")  # + 0.0: no "−0.00"
 
 
 def aligned_length(value_m: float, std_m: float) -> str:

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 PRELOADED = [
     "linkpose.cli", "linkpose.estimation", "linkpose.plotting", "linkpose.cli.live", "linkpose.localization.paths",
     "linkpose.simulation.export", "linkpose.device.session", "linkpose.evaluation.longfiles", "matplotlib.figure",
+    "matplotlib.backends.backend_agg", "linkpose.plotting.tables", "linkpose.localization.localizer",
+    "linkpose.localization.tuning", "linkpose.calibration.joint", "linkpose.filters.tilt", "scipy.optimize",
 ]  # fmt: skip
 LONGEST_S = 60  # for a command that hangs, on a loaded machine
 

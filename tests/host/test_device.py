@@ -470,6 +470,16 @@ def test_a_board_clock_that_stands_still_or_jumps_is_reported_once(tmp_path, cha
     assert sum(words in line for line in messages) == 1
 
 
+def test_a_board_that_repeats_the_number_of_a_sample_is_reported_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_module, "SILENCE_S", 0.2)
+    frozen = SpoiledSamples(20, lambda sample, count: encode(sample._replace(seq=20)))
+    messages = []
+    with PtyBoard(tmp_path / "port", spoil=frozen), Session(str(tmp_path / "port"), messages.append) as session:
+        samples = sum(map(len, session.stream(1.0)))
+        assert samples + session.health().lost == 100
+    assert sum("20 samples came with numbers that came before, and are left out" in line for line in messages) == 1
+
+
 def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
     from linkpose.simulation import board as simulated
 

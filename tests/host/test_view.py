@@ -302,8 +302,11 @@ def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> Non
 def test_the_final_table_fits() -> None:
     height = quantities.HEIGHT
     summary = {("joint-inertial", height): (1.2, 1.65, 0.001), ("baro", height): (0.9, 2.0, 0.3)}
-    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
+    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [36, 46]
     assert final_table({}, 80) == []
+    robot = {("planar-ekf", quantities.X): (-1e-6, 1.0, 1e-4), ("planar-ekf", quantities.HEADING): (-3.0, 1.0, 1e-3)}
+    lines = final_table(robot, 40)
+    assert max(map(len, lines)) <= 40 and lines[1].split()[2] == "0.0000"
 
 
 def test_the_final_table_lists_joint_angles_and_poses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,6 +70,8 @@ def _report_excluded(estimator: Estimator, console: Console) -> None:
     excluded = estimator.excluded
     long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
     causes = estimator.mouse_causes
+    if 0 in causes and len(long) == len(estimator.rig.mouse):  # together: each beside the others means nothing
+        causes = {0: causes[0]}
     for name in long:
         still = "; it is still left out" if name in excluded.now else ""
         mouse = int(name.removeprefix("mouse"))

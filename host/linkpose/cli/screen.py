@@ -277,11 +277,15 @@ def final_table(summary: Summary, width: int) -> list[str]:
         else:
             shown = aligned_length(low, std), aligned_length(high, std), std_text(std)
         rows.append((title, *shown))
-    first = max(16, *(len(row[0]) for row in rows))
-    lines = [f"  {title:<{first}} {low:>10} {high:>10}" for title, low, high, _ in rows]
-    if len(lines[0]) + 10 <= width:
-        lines = [f"{line} {row[3]:>9}" for line, row in zip(lines, rows, strict=True)]
-    return lines if summary else []
+    if not summary:
+        return []
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    columns = 4 if sum(widths) + 2 * len(widths) <= width else 3
+    return [
+        f"  {title:<{widths[0]}}"
+        + "".join(f"  {value:>{w}}" for value, w in zip(values, widths[1:columns], strict=False))
+        for title, *values in rows
+    ]
 
 
 def _signed_length(metres: float) -> str:

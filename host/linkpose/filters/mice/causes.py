@@ -13,6 +13,7 @@ from typing import Any
 _LEAST_M2 = 1e-5  # Σ|p|² for a verdict: 1 s at 0.03 m/s
 _OBSERVABLE = 0.05  # of Σ|p|²: without motion in two directions, mirroring is not observable
 _NOTHING, _ALMOST, _TURNED_DEG = 0.2, 0.15, 6.0  # of g and h: taken for 0, for the expected value; a turned mouse
+_SILENT_SHARE = 0.25  # of Σ|p|² without counts: lifted, asleep or unplugged; it is excluded until it agrees again
 
 
 def _ratios(sums: Any) -> tuple[complex, complex] | None:
@@ -43,10 +44,10 @@ def _likely_cause(sums: Any, is_all: bool) -> str | None:
         return None
     g, h = found
     it, its, is_ = ("they", "their", "are") if is_all else ("it", "its", "is")
-    if abs(g) < _NOTHING and abs(h) < _NOTHING:
-        return f"{it} counted nothing"
     if abs(abs(g) - 0.5) < _ALMOST and abs(abs(h) - 0.5) < _ALMOST:
         return f"one of {its} axes counted nothing"
+    if sums["without_counts"] > _SILENT_SHARE * sums["by_others"]:
+        return f"{it} counted nothing while the {'gyro showed a turn' if is_all else 'others moved'}"
     if abs(g) < _NOTHING and abs(abs(h) - 1.0) < _ALMOST:
         return f"{its} x and y are exchanged, or one of them is reversed"
     if abs(h) > _NOTHING:

@@ -28,6 +28,7 @@ _DEAD_S, _DEAD_RATES = 0.4, 40
 # A mouse that gives the same counts for so many readings is stuck, if another one has been silent for so long (s), or
 # has changed its counts by so much in about the same time. Doubled: it spoils the path for twice as long.
 _STUCK_REPEATS, _STUCK_SILENT_S, _STUCK_CHANGE, _VARYING_REPEATS = 50, 0.3, 12.0, 10
+_STUCK_COUNTS = 2.0  # by which it differs from the motion of all. Doubled: slow stuck mice stay
 # A mouse that exceeds the speed limit by this factor has none. Doubled distance to 1: a wrong limit stays for longer.
 _NO_LIMIT = 1.15
 _CHANGE_KEPT = 0.98  # of the changes, from reading to reading
@@ -101,6 +102,7 @@ def _is_missing_report(state: Record, m: Record, moved: complex) -> bool:
     if expected < _EXPECTED_COUNTS * m.metres_per_count:
         return False
     m.held_s += state.interval
+    m.missing += 1
     return True
 
 
@@ -112,6 +114,7 @@ def _spread_report(state: Record, m: Record, moved: complex) -> None:
         m.share = state.interval / (state.interval + m.held_s)
         m.held_s = 0.0
     m.moved = scaled(m.share, moved)
+    m.reports += square(moved) > 0.0
 
 
 @inner
@@ -146,11 +149,22 @@ def _watch_repeats(m: Record, counts: complex) -> None:
 
 
 @inner
+def _moves_as_expected(state: Record, m: Record) -> bool:
+    """Whether a mouse repeats the counts of a robot at constant speed."""
+    if not state.interval > 0.0:
+        return False
+    off = m.moved - scaled(state.interval, state.velocity + scaled(state.turn_rate, m.arm))
+    return bool(square(off) < (_STUCK_COUNTS * m.metres_per_count) ** 2)
+
+
+@inner
 def _exclude_stuck(state: Record, mice: Records) -> None:
     """Exclude mice that repeat one count while another mouse rests or changes its counts."""
     for i in range(state.count):
         m = mice[i]
         if not (state.sound >> i & 1 and m.repeats >= _STUCK_REPEATS and square(m.counts) > 0.0):
+            continue
+        if _moves_as_expected(state, m):
             continue
         for k in range(state.count):
             other = mice[k]
@@ -261,6 +275,8 @@ def _compare_with_gyro(state: Record, mice: Records) -> None:
 @inner
 def _compare(sums: Record, shown: complex, expected: complex) -> None:
     sums.by_others += square(expected)
+    if square(shown) == 0.0:
+        sums.without_counts += square(expected)
     sums.by_others_double += turned(expected, expected)
     sums.direct += turned(shown, complex(expected.real, -expected.imag))
     sums.mirrored += turned(shown, expected)

@@ -47,6 +47,7 @@ SAMPLE = np.dtype(
 _COMPARISON = np.dtype(
     [
         ("by_others", "f8"),  # Σ|p|² (m²)
+        ("without_counts", "f8"),  # part of it in which s was 0 (m²)
         ("by_others_double", "c16"),  # Σp²
         ("direct", "c16"),  # Σ s p*
         ("mirrored", "c16"),  # Σ s p
@@ -68,6 +69,10 @@ MOUSE = np.dtype(
         ("change", "f8"),  # of the counts over about half a second: a forgetting sum
         ("silent_s", "f8"),  # time without a count (s)
         ("held_s", "f8"),  # time for which readings without counts have been taken for missing reports (s)
+        ("reports", "i8"),  # readings with counts
+        ("missing", "i8"),  # readings taken for missing reports
+        ("creeps", "i8"),  # single counts at rest
+        ("is_lone", "?"),  # whether the last count came alone after a silence
         ("share", "f8"),  # of the last counts that belongs to the last step
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)

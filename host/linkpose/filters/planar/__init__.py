@@ -16,6 +16,7 @@ Source: [Thesis], equations (1)-(17); [Mice], (6), (7).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,9 +49,17 @@ _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
 
 _SPREAD = 0.02  # of the share of the turns that the mice show: reported from here on
-_SNAP_READINGS = 50.0  # after so many readings, a mouse is reported as snapping to its axes
+# A mouse is reported as snapping to its axes after so many readings, as creeping after so many counts at rest, and as
+# slow from this share of missing reports on.
+_SNAP_READINGS, _CREEPS, _MISSING = 50.0, 5, 0.15
 # A mouse is reported at another place beyond so much (m), and so many standard deviations.
 _MOVED_M, _MOVED_Z = 0.008, 5.0
+
+
+def _names(indices: Iterable[int]) -> str:
+    """Mice by their ports, such as "mice 1, 3"; empty for none."""
+    ports = [str(i + 1) for i in indices]
+    return f"{'mouse' if len(ports) == 1 else 'mice'} {', '.join(ports)}" if ports else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +117,11 @@ class _PlanarFilter:
         return int(self._mice_state[0].excluded)
 
     @property
+    def gyro_bias_rad_s(self) -> float:
+        """Bias of the gyro about the vertical so far, beyond the rig's."""
+        return float(self.state[0].at.bias)
+
+    @property
     def gyro_jumps(self) -> GyroJumps:
         """Jumps of the gyro's bias so far."""
         state = self.state[0]
@@ -135,39 +149,45 @@ class _PlanarFilter:
 
     @property
     def mice_remarks(self) -> list[str]:
-        """Faults that all mice share, as the turns have shown them."""
+        """Faults that all mice share, as the turns have shown them, and mice that count in an unusual way."""
+        return [*self._remarks_on_all(), *self._remarks_on_each()]
+
+    def _remarks_on_all(self) -> Iterator[str]:
         state, limit = self.state[0], float(self._mice_state[0].speed_limit)
-        remarks = []
         if limit > 0.0:
-            remarks.append(
+            yield (
                 f"the mice show no speed above {limit:.2f} m/s, where the gyro shows faster turns: this is the limit "
                 "of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
                 "includes it. Drive slower, or use mice for higher speeds"
             )
         if state.resolution.changes:
-            remarks.append(
+            yield (
                 f"all mice count {state.resolution.factor:.2f} times as much since a time before "
                 f"{state.resolution.time:.1f} s, compared with the gyro: their resolution was switched, and the path "
                 "since then was corrected"
             )
-        if snapping := self._snapping:
-            remarks.append(
-                f"{snapping}: no counts across an axis while the motion is almost along the other one (angle "
-                "snapping). In bends, the position is less accurate. Use mice without this function"
-            )
         if state.turn_spread > _SPREAD**2:
-            remarks.append(
+            yield (
                 f"from turn to turn, the mice show {100 * math.sqrt(state.turn_spread):.0f} % more or less than the "
                 "gyro: they slip, or the floor changes. The σ of the position includes this share of the way"
             )
-        return remarks
 
-    @property
-    def _snapping(self) -> str:
-        """The mice that snap to their axes, by name; empty where none does."""
-        mice = self._mice[: len(self._rig.mouse)]
-        ports = [str(i + 1) for i, m in enumerate(mice) if m["snaps"] and m["snap_readings"] > _SNAP_READINGS]
-        return f"{'mouse' if len(ports) == 1 else 'mice'} {', '.join(ports)}" if ports else ""
+    def _remarks_on_each(self) -> Iterator[str]:
+        mice, causes = self._mice[: len(self._rig.mouse)], self.mouse_causes
+        slow = (i for i, m in enumerate(mice) if m["missing"] > _MISSING * m["reports"])
+        if names := _names(i for i in slow if i + 1 not in causes):
+            yield (
+                f"{names}: readings without counts during motion; the report rate is lower than the sample rate. The "
+                "motion between two reports is interpolated"
+            )
+        if names := _names(i for i, m in enumerate(mice) if m["creeps"] > _CREEPS):
+            yield f"{names}: single counts while the robot rests. They are not taken for motion. Check the surface"
+        snapping = (i for i, m in enumerate(mice) if m["snaps"] and m["snap_readings"] > _SNAP_READINGS)
+        if names := _names(i for i in snapping if i + 1 not in causes):
+            yield (
+                f"{names}: no counts across an axis while the motion is almost along the other one (angle "
+                "snapping). In bends, the position is less accurate. Use mice without this function"
+            )
 
     @property
     def scale_change(self) -> tuple[float, float]:

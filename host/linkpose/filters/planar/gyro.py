@@ -48,7 +48,7 @@ _LOST_STD, _VEERING_STD = 0.25, 0.1
 # much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
 # (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
 _RESOLVED_TURN, _RESOLVED_EQUAL, _RESOLVED_OFF, _STRAIGHT_RAD_S, _RESOLVED_STD = 0.3, 0.02, 0.2, 0.1, 0.01
-_RESOLVED_LEAST = 0.15  # a smaller share is a lift
+_RESOLVED_LEAST = 0.15  # a smaller share: mice that are lifted or mounted the other way round show no jump of the gyro
 # A mouse that a jump of the gyro has excluded differs from the expected motion by less than this share, and velocity
 # (m/s). Doubled: with two mice, one that slips passes for a jump of the gyro.
 _NEARLY_SHARE, _NEARLY_M_S = 0.15, 0.02
@@ -310,6 +310,7 @@ def _decide(state: Record, m: Record) -> None:
     by_mice = _cost_of_mice(dispute)
     variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
     is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
+    is_jump = is_jump and state.resolution.share > _RESOLVED_LEAST
     if is_jump and abs(jump) < _MOST_RAD_S and jump * jump > _JUMP_Z**2 * (variance + state.covariance[BIAS, BIAS]):
         _accept_jump(state, m, jump, variance)
     elif by_jump - by_mice > _BETTER or (
@@ -385,6 +386,7 @@ def restart_turns(state: Record) -> None:
     """Begin again to compare the turns of gyro and mice."""
     state.turn_square = state.turn_product = state.turn_variance = 0.0
     state.recent_square = state.recent_product = state.recent_variance = 0.0
+    state.resolution.square = state.resolution.product = 0.0
     state.off_of_turn = state.off_of_turn_before = 0.0
     for i in range(len(state.lever_of_each)):
         state.lever_of_each[i] = 0j

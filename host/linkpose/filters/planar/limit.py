@@ -24,7 +24,9 @@ _LEAST_M_S = 0.1  # no mouse has a lower limit (m/s); the data sheets of office 
 # this velocity (m/s) for rounding. Doubled: a limit is found in sharper bends only.
 _LEAST_RAD_S, _SHARE, _NOISE_M_S = 0.15, 0.25, 0.02
 _TOO_SLOW = 1.05  # expected speed of the mouse at the limit over the one that it shows
-_EVIDENCE_S = 0.3  # contradiction for so long (s). Doubled: a limit is found one bend later
+# Contradiction for so long (s), less the time, with this weight, of contradictions that a limit does not explain.
+# Doubled time: a limit is found one bend later.
+_EVIDENCE_S, _OTHERWISE = 0.3, 0.5
 _LIMITED_SHARE = 0.5  # of the way driven at the limit, as in the saturation of counters: its σ
 _MARGIN = 0.95  # of the largest speed seen: from here on, counts are a lower bound
 
@@ -48,8 +50,9 @@ def watch_limit(state: Record, m: Record, mice: Records) -> None:
         way = scaled(m.step, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
         state.limited_x += abs(way.real)
         state.limited_y += abs(way.imag)
-    if top > _AT_LIMIT * state.fastest and _contradict(state, m, mice):
-        state.limit_s += m.step
+    verdict = _compare(state, m, mice)
+    if verdict != 0:
+        state.limit_s += m.step if verdict > 0 else -_OTHERWISE * m.step
         if state.limit_s > _EVIDENCE_S:
             m.speed_limit = _MARGIN * state.fastest
             state.covariance[X, X] += (_LIMITED_SHARE * state.limited_x) ** 2
@@ -57,12 +60,12 @@ def watch_limit(state: Record, m: Record, mice: Records) -> None:
 
 
 @inner
-def _contradict(state: Record, m: Record, mice: Records) -> bool:
-    """Whether mice contradict the gyro, and all that do so are explained by a mouse at the limit."""
+def _compare(state: Record, m: Record, mice: Records) -> int:
+    """1 if mice contradict the gyro and mice at the limit explain it, −1 if they do not, 0 without a contradiction."""
     rate = m.window_turn / m.window_s - state.at.bias
-    is_limited = False
+    verdict = 0
     if not abs(rate) > _LEAST_RAD_S or not math.isfinite(m.mean_rate):
-        return is_limited
+        return verdict
     for i in range(m.count):
         for k in range(i):
             if not m.sound >> i & m.sound >> k & 1:
@@ -73,9 +76,9 @@ def _contradict(state: Record, m: Record, mice: Records) -> bool:
             if square(one - other - apart) < limit * limit:
                 continue
             if not (_is_too_slow(state, one, other + apart) or _is_too_slow(state, other, one - apart)):
-                return False
-            is_limited = True
-    return is_limited
+                return -1
+            verdict = 1
+    return verdict
 
 
 @inner

@@ -64,6 +64,11 @@ _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
 # spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
 _SPOILT_Z = 2.0
+_UNKNOWN_SHARE = 0.25  # of the variance to begin with: above it, nothing is lost. Doubled: a mouse wrong from the start
+# turns the others by a degree.
+# A single count of a mouse that has hardly changed its counts for half a second, with silence of so long (s) after it,
+# is creeping. After so many, one does not end a rest. Doubled: the gyro's bias is measured later.
+_CREEPING_CHANGE, _CREEPING_S, _KNOWN_CREEPS = 1.4, 0.3, 2
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -113,6 +118,8 @@ def _collect(state: Record, m: Record, mice: Records, rig: Records, sample: Reco
             speed2 = squared_speed(place, velocity, state.at.wz)
             seen.velocity = scaled(per_s * mouse.share, turned(place.axis, sample.counts[i]))
             seen.variance = reading.variance(mouse, m.step, speed2, p.scatter, p.noise_m_s)
+            if m.is_saturated:  # a lower bound shows no turn
+                seen.variance += _SATURATED_SHARE * _SATURATED_SHARE * speed2
             is_snapped = state.snapped >> i & 1
             seen.across = scaled(per_s, snapped_std(place, sample.counts[i])) if is_snapped else 0j
             state.rows += 2
@@ -287,16 +294,18 @@ def _compare_turns(state: Record, off: float, by_scales: float) -> None:
         state.turn_spread += (0.5 * excess - state.turn_spread) / min(float(state.turns), _TURNS)
         widen_way(state, math.sqrt(max(excess, state.turn_spread)), position - state.turn_end)
     state.turn_end = position
+    if abs(off) < _FLOOR_SHARE:
+        state.floor_start = position
 
 
 @inner
 def _correct_way(state: Record, off: float) -> None:
-    """The mice count by the share `off` too much; probably since the start when this is the first floor found."""
-    x, y = state.at.x, state.at.y
-    if state.floors == 0:
-        state.at.x -= off * x
-        state.at.y -= off * y
-    widen_way(state, off, complex(x, y))
+    """The mice count by the share `off` too much; probably since the last turn in which they did not."""
+    way = complex(state.at.x, state.at.y) - state.floor_start
+    state.at.x -= off * way.real
+    state.at.y -= off * way.imag
+    widen_way(state, off, way)
+    state.floor_start = complex(state.at.x, state.at.y)
 
 
 @inner
@@ -346,12 +355,14 @@ def _restart(state: Record, first: int, end: int, keep: float) -> None:
 @inner
 def _restart_spoilt(state: Record, excluded: int) -> None:
     """Start the calibration anew where the mice in `excluded`, found at fault just now, have been taken for sound mice
-    of another scale or angle: the error would be shared among all mice.
+    of another scale or angle: the error would be shared among all mice. A calibration that has hardly begun starts anew
+    in any case.
     """
     for i in range((state.size - MICE) // OF_MOUSE):
         if excluded >> i & 1:
             for at in range(MICE + OF_MOUSE * i, MICE + OF_MOUSE * i + POSITION):
-                if state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
+                is_unknown = state.covariance[at, at] > _UNKNOWN_SHARE * state.fresh[at, at]
+                if is_unknown or state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
                     _restart(state, MICE, state.size, 0.0)
                     return
 
@@ -493,13 +504,43 @@ def _add_systematic(state: Record, way: complex, before_m: float) -> float:
 
 
 @inner
-def _scatter_way(state: Record, p: Record, dt: float, missed: float) -> None:
-    """Noise that mice do not show: common to all of them, and what a robot does while samples are lost."""
+def _scatter_way(state: Record, p: Record, q: Record, dt: float, missed: float) -> None:
+    """Noise that mice do not show: common to all of them, light slips, and what a robot does while samples are lost."""
     speed2 = state.at.vx**2 + state.at.vy**2
     unseen = 0.25 * _ACCEL_M_S2 * missed * missed
     variance = p.floor * p.floor * speed2 * dt * _NOISE_S + unseen * unseen
     state.covariance[X, X] += variance
     state.covariance[Y, Y] += variance
+    if speed2 > 0.0:
+        length = dt * math.sqrt(speed2)
+        way = scaled(dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+        widen_way(state, q.slip * math.sqrt(q.slip_m / length), way)
+
+
+@inner
+def _are_silent(m: Record, mice: Records) -> bool:
+    """Whether no mouse counts, but for single counts of a mouse that creeps at rest."""
+    judges = trusted(m) or m.sound
+    is_silent = judges != 0
+    for i in range(m.count):
+        if judges >> i & 1:
+            is_silent = is_silent & (_is_lone_count(mice[i]) or mice[i].silent_s > 0.0)
+    return bool(is_silent)
+
+
+@inner
+def _is_lone_count(mouse: Record) -> bool:
+    """Whether a mouse that is known to creep gives a single count after long silence; counts such counts.
+
+    A robot that starts gives a single count too, but more after it.
+    """
+    is_lone = square(mouse.counts) == 1.0 and mouse.change < _CREEPING_CHANGE
+    if is_lone or mouse.silent_s >= _CREEPING_S:
+        mouse.creeps += mouse.is_lone and mouse.silent_s >= _CREEPING_S
+        mouse.is_lone = is_lone
+    elif square(mouse.counts) > 0.0:
+        mouse.is_lone = False
+    return bool(is_lone and mouse.creeps >= _KNOWN_CREEPS)
 
 
 @inner
@@ -515,10 +556,7 @@ def _step(
     watch_snapping(state, m, mice, sample)
     if reading.correct(m, mice, p, False):
         m.known_time = sample.time
-    judges = trusted(m) or m.sound
-    is_silent = judges != 0
-    for i in range(m.count):
-        is_silent = is_silent and (not judges >> i & 1 or mice[i].silent_s > 0.0)
+    is_silent = _are_silent(m, mice)
     _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt, sample.time)
     is_good = half == 0.0 or _advance(state, tangent, points, half)
@@ -530,7 +568,7 @@ def _step(
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
         agree(state)
-    _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
+    _scatter_way(state, p, q, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
     _add_saturated_way(state, m, dt)
     watch_limit(state, m, mice)

@@ -137,6 +137,7 @@ _FIELDS = [
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
     ("jump_time", "f8"),  # and when it was found (s)
+    ("floor_start", "c16"),  # position after the last turn in which the mice showed the gyro's turn, in n (m)
     ("floors", "i8"),  # how often the floor has changed
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
@@ -162,6 +163,7 @@ _FIELDS = [
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
     ("seen_by", "i8"),  # bit mask
+    ("has_snapping", "?"),  # whether a mouse has been found that snaps to its axes
     ("snapped", "i8"),  # bit mask of mice whose last counts were snapped to an axis
     ("rate_variance", "f8"),  # of the gyro's mean rate ((rad/s)²)
     ("seen", _SEEN, (MOST,)),
@@ -255,6 +257,10 @@ class PlanarParameters(NamedTuple):
     position_m: float = 0.0006
     scale_walk: float = 1e-4
     angle_walk: float = 1e-4
+    # Share of the way that all mice lose or add unnoticed, constant over so much way (m): light slips and a floor that
+    # varies. A slip of 10 % over 2 m of a drive of 24 m is 2.4 σ. Doubled: σ of the position on sound floors doubles.
+    slip: float = 0.01
+    slip_m: float = 3.0
     # Another floor: change of the common scale once the gyro has shown one.
     floor_scale: float = 0.05
 
