@@ -536,7 +536,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
             _many_turns
         ),
         "… turns by …°, so it is neither a straight line nor full turns; drive it anew": mice("half a turn"),
-        "…: a mouse counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
+        "…: mouse … counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
         "…: mouse … is away at … s, while the robot moves; drive it anew": mice("a mouse away"),
         "…: samples were lost before … s, and their counts with them; drive it anew": mice("lost samples"),
         "… holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring": mice("no gyro"),
