@@ -146,7 +146,7 @@ def _others(size: int, accel2: ArrayLike | None, gyro2: ArrayLike | None, mag: A
 def _numbers(name: str, values: ArrayLike) -> Floats:
     """The values as float64; a masked one is missing. Raises InvalidValue for dates, complex numbers and text."""
     if isinstance(values, np.ma.MaskedArray):
-        values = values.astype(np.float64).filled(np.nan)
+        values = np.where(np.ma.getmaskarray(values), np.nan, values.data)
     try:
         array = np.asarray(values)
         if array.dtype.kind in "mM":
