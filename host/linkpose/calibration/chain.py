@@ -416,6 +416,7 @@ class _Rotations(NamedTuple):
     two: Floats  # (N, 3, 3) R C_2
     rates: Floats  # (2, N, 3) rad/s, each in its sensor's axes
     information: Floats  # (3, 3) of R's error, 1/rad²
+    common: float  # share of that error's variance that all pieces may have in common
 
 
 def _relative_motion(chosen: Sequence[_Piece], fit: _Fit) -> HingeMotion:
@@ -452,9 +453,10 @@ def _rotations(piece: _Piece, fit: _Fit) -> _Rotations:
     rates = np.stack([_rate(piece.first, of[0]), _rate(piece.second, of[1])])
     one, two = (attitudes(piece.first.time_s, rate) for rate in rates)
     every = slice(None, None, max(1, round(_AXIS_STEP_S / float(np.median(np.diff(piece.first.time_s))))))
-    coherent = len(turned.residual) * (_COHERENT_SHARE * fit.residual_m_s2 / fit.scale_m_s2) ** 2
-    information = turned.information / (fit.worth + coherent)
-    return _Rotations(one[every], turned.rotation @ two[every], rates[:, every], information)
+    square_m_s2 = (_COHERENT_SHARE * fit.residual_m_s2) ** 2 + 2 * _ACCEL_ERROR_M_S2**2  # errors of two accelerometers
+    coherent = len(turned.residual) * square_m_s2 / fit.scale_m_s2**2
+    information, common = turned.information / (fit.worth + coherent), coherent / (fit.worth + coherent)
+    return _Rotations(one[every], turned.rotation @ two[every], rates[:, every], information, common)
 
 
 def _rate(stretch: Stretch, unknowns: Floats) -> Floats:
@@ -537,7 +539,7 @@ def _fit_hinge(parts: Sequence[_Rotations], axes: Floats) -> tuple[float, HingeM
         axes = axes + change.reshape(2, 3)
         axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     pulls = np.array([step.gradient for step in steps])
-    covariance = inverse @ (pulls.T @ pulls) @ inverse + inverse
+    covariance = inverse @ (pulls.T @ pulls) @ inverse + inverse + _common_turns(parts, steps, inverse)
     sense = 1.0 if axes[1] @ _SIDE >= 0 else -1.0
     found = HingeMotion(sense * axes, covariance, *_turn_and_play(parts, turns, axes))
     return sum(step.cost for step in steps), found
@@ -562,6 +564,21 @@ def _hinge_step(part: _Rotations, turn: Floats, axes: Floats) -> _Step:
         solved[:, 6],
         weight * float(np.sum(play**2)) + float(away @ part.information @ away),
     )
+
+
+def _common_turns(parts: Sequence[_Rotations], steps: Sequence[_Step], inverse: Floats) -> Floats:
+    """What the covariance (6, 6) of the axes lacks if the common errors of all R have the worst signs.
+
+    `inverse` counts the errors of the pieces' R as independent. An accelerometer's error stays the same over the
+    recording and may turn every R to the same side, about the direction that the forces show least: the vertical.
+    """
+    shifts = np.empty((len(parts), 6))
+    for shift, part, step in zip(shifts, parts, steps, strict=True):
+        values, vectors = np.linalg.eigh(part.information)
+        shift[:] = np.sqrt(part.common * values[0]) * (inverse @ step.mixed.T @ vectors[:, 0])
+    squares = shifts.T @ shifts
+    total = np.sign(shifts @ np.linalg.eigh(squares)[1][:, -1]) @ shifts
+    return np.asarray(np.outer(total, total) - squares)
 
 
 def _turn_and_play(parts: Sequence[_Rotations], turns: Sequence[Floats], axes: Floats) -> tuple[float, float]:
