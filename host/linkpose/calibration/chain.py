@@ -64,7 +64,10 @@ _HUBER_SIGMAS = 3.0
 # Prior standard deviations: r_k of people and robots (m); data sheet of [MPU-6050]: ±20 °/s, ±50 mg, 3 %, 2 %.
 LEVER_STD_M = 0.5
 _PRIOR_STD = {J2S: LEVER_STD_M, GYRO_BIAS: 0.35, ACCEL_BIAS: 0.3, ACCEL_MATRIX: 0.017, GYRO_MATRIX: 0.017}
-_ACCEL_ERROR_M_S2 = 0.1  # slow, by scale and cross-axis errors: as in the filter `chain`
+# Slow, by scale and cross-axis errors: as in the filter `chain`. An axis of a slow robot arm that depends on the
+# relative heading is wrong by 20° to 29° at σ of 26° to 35°. Doubled, this σ is 36° to 40°; σ of axes that the gyros
+# give stays.
+_ACCEL_ERROR_M_S2 = 0.1
 # A gyro bias from rests: its drift until the motion, and the largest rate that is not a slow turn (rad/s).
 _REST_STD_RAD_S, _MOST_REST_RAD_S = 0.003, 0.1
 _ACCEL_SCALES = np.concatenate([first + ACCEL_MATRIX + np.arange(0, 9, 4) for first in (0, UNKNOWNS)])
@@ -247,7 +250,7 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
     levers = fit.unknowns[_LEVERS].reshape(2, 3)
     covariance = fit.covariance[np.ix_(_LEVERS, _LEVERS)] + _coherent_errors(chosen, fit)
     if kind == "hinge" and motion.std_deg.max() < WEAK_AXIS_DEG:
-        levers, covariance = _nearest_on_axis(levers, covariance, motion.axes)
+        levers, covariance = _nearest_on_axis(levers, covariance, motion)
     return ChainCalibration(kind, motion, levers, covariance, fit.residual_m_s2, samples, turning)
 
 
@@ -610,11 +613,13 @@ def _kind(motion: HingeMotion) -> Kind | None:
     return "hinge" if ratio < _HINGE_RATIO else "ball" if ratio > _BALL_RATIO else None
 
 
-def _nearest_on_axis(levers: Floats, covariance: Floats, axes: Floats) -> tuple[Floats, Floats]:
+def _nearest_on_axis(levers: Floats, covariance: Floats, motion: HingeMotion) -> tuple[Floats, Floats]:
     """r_1 and r_2 from the point of a hinge's axis that lies nearest to both sensors, as [Seel2014] (3.3) chooses it.
 
     Every point of the axis stays in its place relative to both links, so the motion cannot show which one is meant.
+    An error of the axes shifts the point across the axis, by as much as it lies away from the one found at first.
     """
-    along = np.concatenate(list(axes)) / np.sqrt(2.0)
+    along = np.concatenate(list(motion.axes)) / np.sqrt(2.0)
     across = np.eye(6) - np.outer(along, along)
-    return (across @ levers.ravel()).reshape(2, 3), across @ covariance @ across.T
+    by_axes = 0.5 * float(along @ levers.ravel()) ** 2 * motion.covariance
+    return (across @ levers.ravel()).reshape(2, 3), across @ (covariance + by_axes) @ across.T
