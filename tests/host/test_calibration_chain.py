@@ -107,6 +107,13 @@ def test_the_axis_is_no_surer_than_the_heading_that_weak_accelerations_give(seed
     assert found.joint == "hinge" and found.axes is None and found.as_dict()["axis2"] is None
 
 
+def test_play_that_an_unknown_gyro_bias_explains_shows_no_ball_joint() -> None:
+    without_rest = slow_arm(4)[125:]
+    found = calibrate_chain([recording(without_rest)], Rig())
+    assert found.motion.play_deg > 10.0 and found.joint is None
+    assert calibrate_chain([recording(without_rest)], Rig(), "hinge").axes is None
+
+
 def test_a_rest_and_a_single_sensor_are_refused() -> None:
     measured = one_link_in_motion()
     with pytest.raises(LinkposeError, match=r"only 0\.0 s show motion; move both links"):

@@ -89,6 +89,7 @@ WEAK_M = 0.03  # σ of r_k along a direction from which on it counts as not obse
 LEAST_TURN_DEG = 5.0  # smaller motion shows nothing
 _HINGE_RATIO = 0.15  # of play to rotation: the hinges of diodem_chain have up to 0.08, with soft parts
 _BALL_RATIO = 0.3  # from which on it is no play of a hinge
+_DRIFT_SIGMAS = 2.0  # of the play that wrong gyro biases cause: less play does not show a ball joint
 _PLAY_STD_RAD, _PLAY_CORRELATION_S = 0.05, 0.5  # assumed of a hinge while its axis is fitted
 _AXIS_STEP_S = 0.1  # between two instants of that fit
 _AXIS_PRIOR_STD_RAD = 1.0  # of each component of an axis: no knowledge
@@ -106,6 +107,7 @@ class HingeMotion(NamedTuple):
     covariance: Floats  # (6, 6) of both, rad²
     turn_deg: float  # rms rotation about the axis
     play_deg: float  # rms angle between R_1 j_1 and R_2 j_2
+    drift_deg: float = 0.0  # σ of the play that wrong gyro biases cause
 
     @property
     def std_deg(self) -> Floats:
@@ -238,7 +240,8 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
     chosen = _pieces(parts, _PIECE_S)
     if not chosen:
         raise LinkposeError(f"{names}: nowhere is a second with {1 / LONGEST_STEP_S:.0f} samples or more; record again")
-    fit = _fit(chosen, _prior(parts))
+    known = _prior(parts)
+    fit = _fit(chosen, known)
     samples, turning = _in_motion(parts, fit.unknowns)
     if fit.residual_m_s2 > _NO_JOINT_M_S2:
         raise LinkposeError(
@@ -246,6 +249,7 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
             "each sensor firmly on its own link, on either side of one joint"
         )
     motion = _with_common_errors(_relative_motion(chosen, fit), fit, turning)
+    motion = motion._replace(drift_deg=_drift_deg(chosen, fit, known))
     kind = joint or _kind(motion)
     levers = fit.unknowns[_LEVERS].reshape(2, 3)
     covariance = fit.covariance[np.ix_(_LEVERS, _LEVERS)] + _coherent_errors(chosen, fit)
@@ -386,6 +390,23 @@ def _coherent_errors(chosen: Sequence[_Piece], fit: _Fit) -> Floats:
     coherent = (_COHERENT_SHARE * fit.residual_m_s2) ** 2
     values, vectors = np.linalg.eigh(squares / (3 * count))
     return np.asarray(vectors @ np.diag(coherent / np.maximum(values, coherent / LEVER_STD_M**2)) @ vectors.T)
+
+
+def _drift_deg(chosen: Sequence[_Piece], fit: _Fit, known: _Prior) -> float:
+    """σ (degrees rms over a piece) of the drift between both sensors that errors of the accelerometers leave possible.
+
+    Where the joint hardly accelerates, these errors pass for a gyro bias about the vertical, unless a rest gives it.
+    """
+    squares, count, seconds = np.zeros((2 * UNKNOWNS, 2 * UNKNOWNS)), 0, 0.0
+    for piece in chosen:
+        jacobian = _turned(piece, fit.unknowns, fit.scale_m_s2).jacobian
+        squares += np.einsum("nip,niq->pq", jacobian, jacobian)
+        count += len(jacobian)
+        seconds += float(piece.first.time_s[-1] - piece.first.time_s[0]) / len(chosen)
+    information = squares / (3 * count) / (2 * _ACCEL_ERROR_M_S2**2) + np.diag(known.information)
+    of_gyro = (slice(at + GYRO_BIAS, at + ACCEL_BIAS) for at in (0, UNKNOWNS))
+    least = min(float(np.linalg.eigvalsh(information[at, at])[0]) for at in of_gyro)
+    return float(np.degrees(seconds / np.sqrt(12 * least)))
 
 
 def _in_motion(parts: Sequence[tuple[Stretch, Stretch]], unknowns: Floats) -> tuple[int, tuple[float, float]]:
@@ -610,7 +631,9 @@ def _kind(motion: HingeMotion) -> Kind | None:
     if np.hypot(motion.turn_deg, motion.play_deg) < LEAST_TURN_DEG:
         return None
     ratio = motion.play_deg / max(motion.turn_deg, 1e-9)
-    return "hinge" if ratio < _HINGE_RATIO else "ball" if ratio > _BALL_RATIO else None
+    if ratio < _HINGE_RATIO:
+        return "hinge"
+    return "ball" if ratio > _BALL_RATIO and motion.play_deg > _DRIFT_SIGMAS * motion.drift_deg else None
 
 
 def _nearest_on_axis(levers: Floats, covariance: Floats, motion: HingeMotion) -> tuple[Floats, Floats]:
