@@ -263,15 +263,18 @@ class UncalibratedMagnetometer(CannotRun):
 
 
 class NoMagnetometer(CannotRun):
-    """The heading is to be held by a magnetometer, and none gives a value. `simulated` is a simulated board's port."""
+    """The heading is to be held by a magnetometer, and none gives a value.
 
-    def __init__(self, simulated: str | None = None) -> None:
+    `port` is the board's, None of a recording; `is_simulated` is True of a simulated board.
+    """
+
+    def __init__(self, port: str | None = None) -> None:
+        self.port, self.is_simulated = port, port is not None and port.startswith("sim://")
         super().__init__(
-            f"{simulated} simulates no magnetometer"
-            if simulated
+            f"{port} simulates no magnetometer"
+            if self.is_simulated
             else "no magnetometer gives a value: check its wiring, or leave it out"
         )
-        self.simulated = simulated
 
 
 class FilterCannotRun(LinkposeError):

@@ -1,4 +1,4 @@
-"""The lowest and highest values of a run, and the RMS of their standard deviation, as the run goes on."""
+"""The lowest and highest values of a run, and the median of their standard deviation, as the run goes on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 ROWS = 1000  # of estimates that wait until their extremes are found at once; live blocks have a few rows
 _OF_A_ROBOT = (quantities.X, quantities.Y)  # a link's filter has them too, where its yaw is known to a constant alone
-# What the end of a run lists. A heading turns on past every bound, so its lowest and highest value are meaningless.
 _LISTED = (
     quantities.HEIGHT,
     quantities.ANGLE,
@@ -23,14 +22,23 @@ _LISTED = (
     quantities.HEIGHT1,
     quantities.HEIGHT2,
     *_OF_A_ROBOT,
+    quantities.HEADING,
 )
 
-# (filter, quantity) -> (lowest, highest, RMS of σ), in the unit of the quantity's column.
+# Bounds of the bins in which standard deviations are counted, in the unit of the column: 40 a decade.
+_STD_EDGES = np.logspace(-9, 6, 601)
+
+# (filter, quantity) -> (lowest, highest, median of σ), in the unit of the quantity's column.
 Summary = dict[tuple[str, quantities.Quantity], tuple[float, float, float]]
 
 
 class Extremes:
-    """Lowest and highest value and the RMS of σ of heights, joint angles and places of each filter, over all blocks."""
+    """Lowest and highest value and the median of σ of heights, joint angles and poses of each filter, over all blocks.
+
+    The median, not the root mean square: the σ of the first second would hide that of all others. It is that of a
+    histogram, within 3 %. A heading counts whole turns, from its first value on: −180° and +180° of a robot that turns
+    would mean nothing.
+    """
 
     def __init__(self, columns: Sequence[str]) -> None:
         at = {column: index for index, column in enumerate(columns)}
@@ -42,8 +50,8 @@ class Extremes:
         }
         self._low = dict.fromkeys(self._of, math.inf)
         self._high = dict.fromkeys(self._of, -math.inf)
-        self._squares = dict.fromkeys(self._of, 0.0)
-        self._count = dict.fromkeys(self._of, 0)
+        self._std_counts = {key: np.zeros(len(_STD_EDGES) + 1, np.int64) for key in self._of}
+        self._last = dict.fromkeys(self._of, math.nan)
         self._waiting: list[Floats] = []  # blocks not yet in these
         self._waiting_rows = 0
 
@@ -63,22 +71,36 @@ class Extremes:
             known = np.isfinite(estimates[:, value_at])
             if not known.any():
                 continue
-            self._low[key] = min(self._low[key], float(estimates[known, value_at].min()))
-            self._high[key] = max(self._high[key], float(estimates[known, value_at].max()))
+            values = self._continued(key, estimates[known, value_at])
+            self._low[key] = min(self._low[key], float(values.min()))
+            self._high[key] = max(self._high[key], float(values.max()))
             if std_at >= 0:
-                self._squares[key] += float(np.nansum(estimates[known, std_at] ** 2))
-                self._count[key] += int(known.sum())
+                std = estimates[known, std_at]
+                places = np.searchsorted(_STD_EDGES, std[np.isfinite(std)])
+                self._std_counts[key] += np.bincount(places, minlength=len(_STD_EDGES) + 1)
+
+    def _continued(self, key: tuple[str, quantities.Quantity], values: Floats) -> Floats:
+        """The values (N ≥ 1,), those of a heading without jumps by a whole turn, from the last one before on."""
+        period = key[1].period
+        if key[1] != quantities.HEADING or period is None:
+            return values
+        before = values[:1] if math.isnan(self._last[key]) else np.array([self._last[key]])
+        unwrapped: Floats = np.unwrap(np.concatenate([before, values]), period=period)[1:]
+        self._last[key] = float(unwrapped[-1])
+        return unwrapped
 
     def summary(self) -> Summary:
         """The extremes of the quantities that had a value."""
         if self._waiting:
             self._fold()
         return {
-            key: (
-                low,
-                self._high[key],
-                math.sqrt(self._squares[key] / self._count[key]) if self._count[key] else math.nan,
-            )
-            for key, low in self._low.items()
-            if math.isfinite(low)
+            key: (low, self._high[key], self._median_std(key)) for key, low in self._low.items() if math.isfinite(low)
         }
+
+    def _median_std(self, key: tuple[str, quantities.Quantity]) -> float:
+        """NaN without any σ."""
+        total = np.cumsum(self._std_counts[key])
+        if not total[-1]:
+            return math.nan
+        at = int(np.searchsorted(total, 0.5 * total[-1]))
+        return float(np.sqrt(_STD_EDGES[max(at - 1, 0)] * _STD_EDGES[min(at, len(_STD_EDGES) - 1)]))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import stat
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from linkpose.errors import CannotRead
 
@@ -34,18 +36,38 @@ def open_binary(path: Path, what: str = "") -> BinaryIO:
             return io.BytesIO(_pipe(path, what))
         if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
             raise CannotRead(path, "it is a device, not a file", what)
-        return path.open("rb")
+        return io.BufferedReader(_File(path, what))
     except OSError as error:
         raise CannotRead(path, error.strerror, what) from error
+
+
+class _File(io.FileIO):
+    """A file whose failures while it is read are CannotRead: a disk that fails, a network file system that has gone."""
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__(path)
+        self._path, self._what = path, what
+
+    def readinto(self, buffer: Any) -> int | None:
+        with self._failing_well():
+            return super().readinto(buffer)
+
+    def readall(self) -> bytes:
+        with self._failing_well():
+            return super().readall()
+
+    @contextlib.contextmanager
+    def _failing_well(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise CannotRead(self._path, error.strerror, self._what) from error
 
 
 def read_bytes(path: Path, what: str = "") -> bytes:
     """All bytes of a file. Raises CannotRead, also for one that is larger than MOST_BYTES."""
-    try:
-        with open_binary(path, what) as file:
-            data = file.read(MOST_BYTES + 1)
-    except OSError as error:
-        raise CannotRead(path, error.strerror, what) from error
+    with open_binary(path, what) as file:
+        data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
         raise CannotRead(path, f"it is larger than {MOST_BYTES // 10**6} MB, and files of its kind are not", what)
     return data

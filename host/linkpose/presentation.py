@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from linkpose import quantities
 from linkpose.quantities import Quantity
 
 if TYPE_CHECKING:
     from linkpose.device.session import Health
+    from linkpose.exclusions import Exclusions
+    from linkpose.sensors.measurements import Floats
 
 # A row of estimates by filter: filter -> quantity -> (value, σ) in the column's unit; NaN where there is none.
 Row = dict[str, dict[Quantity, tuple[float, float]]]
+Value = TypeVar("Value")  # of a quantity: a value with its σ, or a series of values
 
 _JOINT_ANGLES = (quantities.ANGLE, *quantities.BALL_ANGLES)
 
@@ -57,6 +60,12 @@ class RowReader:
         """The filters in the order of their columns, the best first."""
         return list(self._of_filter)
 
+    def series(self, rows: Floats) -> dict[str, dict[Quantity, Floats]]:
+        """The values (N,) of each quantity in rows (N, columns) of estimates, by filter."""
+        return {
+            name: {quantity: rows[:, value] for quantity, value, _ in found} for name, found in self._of_filter.items()
+        }
+
     def read(self, estimates: Sequence[float]) -> Row:
         """One row of estimates (columns,)."""
         known = [*estimates, math.nan]
@@ -71,33 +80,6 @@ def best_filter(row: Row, filters: Iterable[str], quantity: Quantity) -> str | N
     able = [name for name in filters if quantity in row.get(name, {})]
     known = [name for name in able if math.isfinite(row[name][quantity][0])]
     return next(iter(known or able), None)
-
-
-class Exclusions:
-    """The mice that a filter leaves out, and since when."""
-
-    def __init__(self) -> None:
-        self._since_s: dict[int, float] = {}
-
-    def follow(self, time_s: float, row: Row) -> None:
-        """Takes the next row."""
-        now = set()
-        for values in row.values():
-            mask = values.get(quantities.EXCLUDED, (math.nan, 0.0))[0]
-            if math.isfinite(mask):
-                now |= {mouse for mouse in range(1, 9) if int(mask) >> (mouse - 1) & 1}
-        self._since_s = {mouse: self._since_s.get(mouse, time_s) for mouse in now}
-
-    @property
-    def names(self) -> set[str]:
-        """The sensors that are left out: mouse1, ..."""
-        return {f"mouse{mouse}" for mouse in self._since_s}
-
-    def lines(self) -> list[str]:
-        """One line for each mouse that is left out."""
-        return [
-            f"mouse {mouse} LEFT OUT since {since:.1f} s (disagrees)" for mouse, since in sorted(self._since_s.items())
-        ]
 
 
 def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
@@ -137,8 +119,8 @@ def angle_with_std(value_deg: float, std_deg: float) -> str:
     return f"{signed_angle(value_deg, decimals)} ±{bound:.{decimals}f}°"
 
 
-def joint_angle(values: Mapping[Quantity, tuple[float, float]]) -> tuple[float, float] | None:
-    """The first angle (°) of a chain's joint and its σ; None of a filter that estimates no chain."""
+def joint_angle(values: Mapping[Quantity, Value]) -> Value | None:
+    """The first angle (°) of a chain's joint; None of a filter that estimates no chain."""
     return next((values[q] for q in _JOINT_ANGLES if q in values), None)
 
 
@@ -166,7 +148,10 @@ def length_with_std(value_m: float, std_m: float) -> str:
 
 def length_text(value_m: float, std_m: float) -> str:
     """A length to the last digit of its standard deviation (m); a dash where it is not finite."""
-    return minus(f"{value_m:.{_digits(std_m).of_value}f} m") if math.isfinite(value_m) else "–"
+    if not math.isfinite(value_m):
+        return "–"
+    decimals = _digits(std_m).of_value
+    return minus(f"{round(value_m, decimals) + 0.0:.{decimals}f} m")  # + 0.0: no "−0.00"
 
 
 def aligned_length(value_m: float, std_m: float) -> str:

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 from linkpose.device.session import Placement, Session
 from linkpose.errors import FileChanged, InvalidValue, LinkposeError
-from linkpose.recording.csvfile import check_unchanged, create
+from linkpose.outputs import check_unchanged, create
 from linkpose.recording.writer import RecordingWriter, closing, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.devices import MOUSE_VALID, slow_mouse_remarks

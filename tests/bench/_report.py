@@ -43,13 +43,26 @@ def report(rows: Iterable[Row]) -> None:
             print(f"{row.bench:20} {row.ours_us:12.3f} us   {row.peer:12} {row.peer_us:12.3f} us   ratio {ratio:.4f}")
 
 
-def arguments(description: str) -> argparse.Namespace:
-    """The command line of the benches on recordings."""
-    parser = argparse.ArgumentParser(description=description.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
-    parser.add_argument("--only", default="", help="only cases whose name contains this text")
-    parser.add_argument("--json", action="store_true")
-    return parser.parse_args()
+def bench_parser(description: str) -> argparse.ArgumentParser:
+    """--json, which every bench has."""
+    made = argparse.ArgumentParser(description=description.splitlines()[0])
+    made.add_argument("--json", action="store_true", help="one object a line")
+    return made
+
+
+def recordings_parser(description: str) -> argparse.ArgumentParser:
+    """--json, --data and --only of the benches on recordings."""
+    made = bench_parser(description)
+    made.add_argument("--data", type=Path, default=RECORDINGS, help="folder of the recordings")
+    made.add_argument("--only", default="", help="only cases whose name contains this text")
+    return made
+
+
+def is_there(folder: Path) -> bool:
+    """Whether recordings are there; the bench leaves out those that are not."""
+    if not folder.is_dir():
+        print(f"{folder} is missing: skipped", file=sys.stderr)
+    return folder.is_dir()
 
 
 def print_rows(
@@ -59,10 +72,7 @@ def print_rows(
 ) -> Iterator[dict[str, object]]:
     """The rows of all cases of the sets that are there, each printed as soon as it is known."""
     for name, read in sets.items():
-        if not (options.data / name).is_dir():
-            print(f"{options.data / name} is missing: skipped", file=sys.stderr)
-            continue
-        for case in read(options.data / name):
+        for case in read(options.data / name) if is_there(options.data / name) else ():
             for row in rows_of(case) if options.only in case.name else ():
                 print_row(row, options.json)
                 yield row

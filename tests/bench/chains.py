@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 import qmt
-from _report import arguments, print_rows
+from _report import print_rows, recordings_parser
 from real_data import ENCODER_DELAY_S, OMC_LATE_S, Pair, matrices, read_encoder, read_robot
 from vqf import VQF
 
@@ -279,7 +279,7 @@ def rows(case: Case) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    options = arguments(__doc__)
+    options = recordings_parser(__doc__).parse_args()
     filters.warm_up(["chain"])
     list(print_rows(SETS, rows, options))
 

@@ -7,13 +7,11 @@ Every row is a ratio of two times taken in turn on this machine: {"bench", "ours
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
+from _report import Row, best_of, report
 from filterpy.kalman import UnscentedKalmanFilter
 
 from linkpose.localization import models
@@ -69,17 +67,6 @@ def look(state: np.ndarray, grid: GridMap, steps: np.ndarray) -> np.ndarray:
     return ranges + state[5:]
 
 
-def seconds(step: Callable[[], object], repeats: int) -> float:
-    """The best of five means: the machine's speed when it runs nothing else."""
-    best = np.inf
-    for _ in range(5):
-        start = time.perf_counter()
-        for _ in range(repeats):
-            step()
-        best = min(best, (time.perf_counter() - start) / repeats)
-    return best
-
-
 def beams_measurement(grid: GridMap) -> Measurement:
     table = np.zeros((BEAMS, 5))
     table[:, 0], table[:, 4] = BEAM_ANGLES_RAD, FLASER_MAX_RANGE_M
@@ -120,27 +107,16 @@ def peer_step(grid: GridMap, measurement: Measurement) -> Callable[[], object]:
     return step
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", action="store_true", help="one object a line")
-    options = parser.parse_args()
+def rows() -> Iterator[Row]:
     grid = office_map()
     measurement = beams_measurement(grid)
-    peer = peer_step(grid, measurement)
-    peer()
-    peer_us = 1e6 * seconds(peer, 3)
+    peer_us = best_of(peer_step(grid, measurement), 15)
     for bench, name in (("ukf-49-points-19-beams", "ukf"), ("ekf-19-beams", "ekf")):
-        ours = our_step(name, grid, measurement)
-        ours()
-        ours_us = 1e6 * seconds(ours, 300)
-        row = {
-            "bench": bench,
-            "ours_us": ours_us,
-            "peer": "filterpy UKF",
-            "peer_us": peer_us,
-            "ratio": ours_us / peer_us,
-        }
-        print(json.dumps(row) if options.json else "  ".join(f"{key} {value}" for key, value in row.items()))
+        yield Row(bench, best_of(our_step(name, grid, measurement), 1500), "filterpy UKF", peer_us)
+
+
+def main() -> None:
+    report(rows())
 
 
 if __name__ == "__main__":

@@ -5,11 +5,11 @@ python tests/bench/mice.py [--json] [--seeds FIRST-LAST]
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 
 import numpy as np
+from _report import bench_parser
 
 from linkpose import filters
 from linkpose.experiments.planar import CASES, PoseError, baseline, pose_error
@@ -18,8 +18,7 @@ FILTERS = ("planar-ekf", "planar-ukf")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--json", action="store_true")
+    parser = bench_parser(__doc__)
     parser.add_argument("--seeds", default="0-4")
     parser.add_argument("--case", default="", help="only the cases whose names contain this text")
     parser.add_argument("--filter", choices=FILTERS, action="append")

@@ -9,9 +9,6 @@ density, and the bias instability (least deviation / 0.664).
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +16,7 @@ from typing import Any
 import allantools
 import h5py
 import numpy as np
-from _report import RECORDINGS
+from _report import is_there, print_row, recordings_parser
 
 from linkpose.calibration.allan import FLICKER
 from linkpose.calibration.noise import calibrate_noise
@@ -71,15 +68,9 @@ def rows(recording: Recording) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=RECORDINGS)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args()
-    folder = options.data / FOLDER
-    if not folder.exists():
-        sys.exit(f"{folder} is missing")
-    for row in rows(load(folder)):
-        print(json.dumps(row) if options.json else row)
+    options = recordings_parser(__doc__).parse_args()
+    for row in rows(load(options.data / FOLDER)) if is_there(options.data / FOLDER) else ():
+        print_row(row, options.json)
 
 
 if __name__ == "__main__":

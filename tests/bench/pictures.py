@@ -5,34 +5,27 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
+from _views import HEALTH, ROOT, Browser
 from rich.console import Console
 
 import linkpose as lp
 from linkpose.cli.screen import Screen
 from linkpose.estimation import Estimates
 from linkpose.page import Page, PageStatus
-from linkpose.presentation import RowReader
 from linkpose.simulation.link import PAPER_J2S_M, simulate
 
-ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "host" / "docs" / "img"
 FILTERS = ["joint-inertial", "joint", "tilt"]
 TITLE = "sim://link  J2S 1.653 m"
-HEALTH: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": "ok"}, "baro": {"state": "ok"}})
 
 
 def draw_terminal(estimates: Estimates) -> None:
     """The terminal view at 80 × 24 after the last row."""
-    rows = RowReader(estimates.columns)
-    screen = Screen(TITLE, rows.filters)
-    for row in estimates.values.tolist():
-        screen.add(row[0], rows.read(row))
+    screen = Screen(TITLE, estimates.columns)
+    screen.add(estimates.values)
     with Path("/dev/null").open("w") as nowhere:
         console = Console(record=True, width=80, file=nowhere)
         console.print(screen.render(HEALTH, 80, 24))
@@ -41,9 +34,6 @@ def draw_terminal(estimates: Estimates) -> None:
 
 def draw_page(estimates: Estimates) -> None:
     """The page after the last row, without viser's remark on a computer without a graphics card."""
-    sys.path.insert(0, str(ROOT / "tests" / "host"))
-    from browser import Browser
-
     with Page(estimates.columns, estimates.rig, "sim://link", on_mark=print) as page, Browser(1120, 720, 1) as browser:
         page.show(estimates.values[::5], lambda: PageStatus(HEALTH))
         browser.open(page.url)

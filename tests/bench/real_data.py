@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from _report import arguments, print_row, print_rows
+from _report import print_row, print_rows, recordings_parser
 from scipy.io import loadmat
 from vqf import VQF, offlineVQF
 
@@ -339,7 +339,7 @@ def summary(found: list[dict[str, object]]) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    options = arguments(__doc__)
+    options = recordings_parser(__doc__).parse_args()
     for row in summary(list(print_rows(SETS, rows, options))):
         print_row(row, options.json)
 

@@ -15,7 +15,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from _report import arguments, print_rows
+from _report import print_rows, recordings_parser
 from numpy.typing import NDArray
 from real_data import SETS, Case, block_of, tilt_from, vqf_tilt
 
@@ -165,7 +165,7 @@ def rows(case: Case) -> Iterator[dict[str, object]]:
 
 
 def main() -> None:
-    list(print_rows(SETS, rows, arguments(__doc__)))
+    list(print_rows(SETS, rows, recordings_parser(__doc__).parse_args()))
 
 
 if __name__ == "__main__":

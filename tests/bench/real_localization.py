@@ -10,7 +10,6 @@ options from the sensors' data sheets. Beside them run filterpy's extended Kalma
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import json
 import math
@@ -23,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from _localization_peers import filterpy_path, gtsam_path, problem_of
-from _report import RECORDINGS
+from _report import is_there, print_row, recordings_parser
 
 from linkpose.localization.carmen import Reading, flaser_angles, format_reading
 from linkpose.localization.events import Event
@@ -295,9 +294,7 @@ def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=RECORDINGS, help="folder of the recordings")
-    parser.add_argument("--json", action="store_true", help="one object a line")
+    parser = recordings_parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="leave out the batch optimum of GTSAM")
     options = parser.parse_args()
     sources: dict[str, Callable[[Path, Path], Iterable[dict[str, object]]]] = {
@@ -312,14 +309,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as out:
         for name, source in sources.items():
             folder = options.data / name
-            if not folder.is_dir():
-                print(f"{folder} is not there: left out", file=sys.stderr)
-                continue
-            for row in source(folder, Path(out)):
-                print(
-                    json.dumps(row) if options.json else "  ".join(f"{key} {value}" for key, value in row.items()),
-                    flush=True,
-                )
+            for row in source(folder, Path(out)) if options.only in name and is_there(folder) else ():
+                print_row(row, options.json)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from _report import arguments, print_row
+from _report import print_row, recordings_parser
 from real_data import SETS, Case, block_of, tilt_from, vqf_tilt
 
 from linkpose.filters.inertial.state import SensorErrors
@@ -67,7 +67,7 @@ def left_out(ratios: Floats) -> Floats:
 
 
 def main() -> None:
-    options = arguments(__doc__)
+    options = recordings_parser(__doc__).parse_args()
     for name, read in SETS.items():
         cases = [case for case in read(options.data / name) if options.only in case.name]
         if not cases:

@@ -1,26 +1,27 @@
 """Whether σ is right: Tests 1 to 3 of the link paper, simulated, twenty seeds, pooled.
 
-    python tests/bench/sigma.py [--seeds N] [--json]
+    python tests/bench/sigma.py [--seeds N] [--first-seed N] [--json]
 
-For calibrated sensors and for sensors within the data sheet, the share of errors within 2σ of each quantity over all
-runs, the worst run, the runs below 85 %, NEES and root mean square error. `joint-inertial` has J2S, but no calibration
-of the sensors. Yaw, x and y are relative to the first sample.
+For calibrated sensors and for sensors within the data sheet, with a known and with an unknown J2S (the vector from the
+joint centre to the sensor), the share of errors within 2σ of each quantity over all runs, the worst run, the runs below
+85 %, NEES and root mean square error. `joint-inertial` has no calibration of the sensors. Yaw, x and y are relative to
+the first sample.
 """
 
 from __future__ import annotations
 
-import argparse
 import itertools
-import json
 from typing import NamedTuple
 
 import numpy as np
+from _report import bench_parser, print_row
 
 from linkpose.filters.joint_inertial import JointInertialFilter
 from linkpose.sensors.measurements import Floats
-from linkpose.sensors.rig import Rig
+from linkpose.sensors.rig import UNKNOWN_JOINT, Rig
 from linkpose.simulation.link import PAPER_J2S_M, TESTS, LinkRun, LinkTruth
 
+RIGS = {"known": Rig().with_j2s(PAPER_J2S_M), "unknown": Rig(joint=UNKNOWN_JOINT)}
 QUANTITIES = ("height_m", "roll_deg", "pitch_deg", "yaw_deg", "x_m", "y_m")
 
 
@@ -45,10 +46,10 @@ def truth_since_start(truth: LinkTruth, yaw_deg: float) -> dict[str, Floats]:
     }
 
 
-def runs_of(test: int, seed: int, errors: str) -> dict[str, Run]:
-    """Quantity -> its figures."""
+def runs_of(test: int, seed: int, errors: str, j2s: str) -> dict[str, Run]:
+    """Quantity -> its figures, over the samples with an estimate. `j2s`: key of RIGS."""
     run = LinkRun(test, seed, errors=errors)
-    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    f = JointInertialFilter(RIGS[j2s])
     values = f.process(run.measurements())
     table = dict(zip((name.removeprefix("joint_inertial_") for name in f.columns), values.T, strict=True))
     true = truth_since_start(run.truth(), float(table["yaw_deg"][0]))
@@ -58,6 +59,8 @@ def runs_of(test: int, seed: int, errors: str) -> dict[str, Run]:
         error, std = table[column] - true[column], np.maximum(table[f"{name}_std_{unit}"], 1e-9)
         if unit == "deg":
             error = (error + 180.0) % 360.0 - 180.0
+        estimated = np.isfinite(error)
+        error, std = error[estimated], std[estimated]
         found[column] = Run(
             float(np.mean(np.abs(error) < 2 * std)), float(np.mean((error / std) ** 2)),
             float(np.sqrt(np.mean(error**2))),
@@ -66,16 +69,17 @@ def runs_of(test: int, seed: int, errors: str) -> dict[str, Run]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = bench_parser(__doc__)
     parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--first-seed", type=int, default=0)
     options = parser.parse_args()
-    for errors in ("calibrated", "datasheet"):
-        runs = [runs_of(test, seed, errors) for test, seed in itertools.product(TESTS, range(options.seeds))]
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    for errors, j2s in itertools.product(("calibrated", "datasheet"), RIGS):
+        runs = [runs_of(test, seed, errors, j2s) for test, seed in itertools.product(TESTS, seeds)]
         for column in QUANTITIES:
             share, nees, rmse = np.array([run[column] for run in runs]).T
             row = {
-                "bench": f"sigma {errors} {column}",
+                "bench": f"sigma {errors}, {j2s} J2S: {column}",
                 "within_2sigma": round(float(share.mean()), 4),
                 "worst_run": round(float(share.min()), 4),
                 "runs_below_85": int((share < 0.85).sum()),
@@ -83,7 +87,7 @@ def main() -> None:
                 "nees": round(float(nees.mean()), 3),
                 "rmse": round(float(rmse.mean()), 5),
             }
-            print(json.dumps(row) if options.json else row)
+            print_row(row, options.json)
 
 
 if __name__ == "__main__":

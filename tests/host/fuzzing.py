@@ -231,11 +231,14 @@ def _survey(path: Path) -> None:
     load_recording(path)
 
 
-def _command(*words: str) -> Callable[[Path], object]:
-    def run(path: Path) -> None:
+def _command(*words: str) -> Callable[[Path], int]:
+    """A command on a file; its exit status. Raises as the command does."""
+
+    def run(path: Path) -> int:
         result = CliRunner().invoke(group, [word.format(path) if word == "{}" else word for word in words])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
+        return result.exit_code
 
     return run
 
@@ -259,20 +262,31 @@ delay_s = 0.004
 [[mouse]]
 x_m = 0.1
 y_m = 0.0
-heading_rad = 0.5
+angle_deg = 28.0
 counts_per_m = 8000
 """
-_CARMEN = "\n".join(
-    ["PARAM robot_length 0.5 0 host 0"]
-    + [
-        f"FLASER 8 {' '.join(['2.5'] * 8)} {0.1 * i:.2f} 1.0 0.0 {0.1 * i:.2f} 1.0 0.0 {i}.0 host {i}.0\n"
-        f"ODOM {0.1 * i:.2f} 1.0 0.0 0.1 0.0 0.0 {i}.5 host {i}.5"
-        for i in range(1, 8)
-    ]
-    + [""]
-)
+
+
+def _to_wall(x_m: float, angle_deg: int) -> str:
+    """The range from (x, 1) to the wall of `_Files.map`, whose inside reaches from -0.5 to 6.5 and from -0.5 to 4.5."""
+    along, across = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    walls = [(6.5 - x_m) / max(along, 1e-9), (3.5 if across > 0 else 1.5) / max(abs(across), 1e-9)]
+    return f"{min(walls):.2f}"
+
+
+def _scan(x_m: float, time_s: int) -> str:
+    """A line of 37 ranges, 5° apart, and one of odometry half a second later."""
+    ranges = " ".join(_to_wall(x_m, angle) for angle in range(-90, 91, 5))
+    pose = f"{x_m:.2f} 1.0 0.0"
+    return (
+        f"FLASER 37 {ranges} {pose} {pose} {time_s}.0 host {time_s}.0\n"
+        f"ODOM {pose} 0.1 0.0 0.0 {time_s}.5 host {time_s}.5\n"
+    )
+
+
+_CARMEN = "PARAM robot_length 0.5 0 host 0\n" + "".join(_scan(0.1 * i, i) for i in range(1, 8))
 _BEACONS = "id,x_m,y_m\n1,0.0,0.0\n0xDD05,5.0,0.0\nA1,0.0,5.0\n"
-_EVENTS = "time_s,kind,a,b,c\n0,start,1.0,1.0,0.0\n" + "".join(
+_EVENTS = "time_s,kind,a,b,c\n0,pose,1.0,1.0,0.0\n" + "".join(
     f"{0.1 * i:.1f},odometry,0.1,0.0,\n{0.1 * i:.1f},range,1,{1.4 + 0.01 * i:.3f},\n" for i in range(1, 12)
 )
 _ROBOT = "time_s,x_m,y_m,heading_rad\n" + "".join(f"{0.1 * i:.1f},{i},0,0.1\n" for i in range(12))

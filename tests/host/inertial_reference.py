@@ -283,23 +283,32 @@ def check_the_alignment_to_gravity(rng):
     np.testing.assert_allclose(s.covariance[V:BG, V:BG], 0.5 * np.eye(3), rtol=0, atol=1e-9)
 
 
-def check_the_level_of_the_sensor_errors(rng):
+def check_the_levels_of_the_sensor_errors(rng):
     """Errors drawn as their prior says have a level of 1 in the mean, whatever share of them the motion resolves."""
     _, s = random_state(rng)
     prior, share = s.prior[BA:D], rng.uniform(0.3, 1.0, D - BA)
     s.covariance[range(BA, D), range(BA, D)] = (1 - share) * prior
-    levels, row = [], empty_row()
+    levels = []
     for _ in range(400):
         s.nominal[BA:D] = np.sqrt(share * prior) * rng.standard_normal(D - BA)
         process._judge_parameters(s)
-        row.distance, row.resolved = s.distance, s.resolved
-        levels.append(hypotheses._level(row, 0.0))
-    np.testing.assert_allclose(s.resolved, share.sum(), rtol=1e-9)
-    assert abs(np.mean(levels) - 1) < 0.1
-    s.nominal[BA:D] = 0
+        levels.append((s.tilt_level, s.heading_level))
+    assert np.abs(np.mean(levels, axis=0) - 1).max() < 0.1
+    known = process._LEVEL_PRIOR
+    s.nominal[BA:MG], s.nominal[MG:D] = 0.0, 3.0 * np.sqrt(s.prior[MG:D])
     process._judge_parameters(s)
-    row.distance, row.resolved = s.distance, s.resolved
-    assert hypotheses._level(row, 0.0) == 1 / (1 + s.resolved)
+    np.testing.assert_allclose(s.tilt_level, known / (known + share[: MG - BA].sum()), rtol=1e-9)
+    np.testing.assert_allclose(s.heading_level, (known + 81.0) / (known + share[MG - BA :].sum()), rtol=1e-9)
+    np.testing.assert_allclose(s.distance, 0.5 * 81.0, rtol=1e-9)
+
+
+def check_which_sensor_decides_the_level_of_a_value(rng):
+    row = empty_row()
+    row.tilt_level, row.heading_level = rng.uniform(0.3, 3.0, 2)
+    of_height, of_x, of_y, of_roll, of_pitch, of_yaw = (hypotheses._level(row, k, 0.0) for k in range(6))
+    assert of_height == of_roll == of_pitch == row.tilt_level and of_yaw == row.heading_level
+    assert of_x == of_y == 0.5 * (row.tilt_level + row.heading_level)
+    assert hypotheses._level(row, 0, 5.0) == hypotheses._MOST_LEVEL
 
 
 def empty_row():

@@ -3,6 +3,7 @@
 # ruff: noqa: E501  (a message stands in one line)
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,13 +19,14 @@ from linkpose.calibration.joint import calibrate_joint
 from linkpose.calibration.mag import calibrate_mag
 from linkpose.calibration.mice import calibrate_mice
 from linkpose.calibration.noise import calibrate_noise
+from linkpose.cli import calibrate_mag as mag_command
 from linkpose.evaluation.references import read_any
 from linkpose.flashing.image import MARK, read_image
 from linkpose.localization.events import Log
 from linkpose.localization.localizer import Settings, check
 from linkpose.localization.logs import read_log
 from linkpose.localization.map_check import check_map
-from linkpose.localization.maps import load_map, save_map
+from linkpose.localization.maps import load_map
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.plausibility import check_units
@@ -32,6 +34,7 @@ from linkpose.localization.stream import Stream
 from linkpose.localization.tables import Truth, read_beacons, read_truth, score
 from linkpose.localization.ukf import Transform
 from linkpose.recording.reader import Recording, load_recording
+from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 from linkpose.simulation.link import LinkRun
 from linkpose.simulation.mice import Fault, MiceRun
@@ -147,10 +150,43 @@ def imu(motion: float, then: Callable[[list[Recording]], object], seconds: float
     return reading(lambda path: then([load_recording(path)]), text)
 
 
+def spread(count: int, height: float) -> Floats:
+    """Unit vectors (count, 3), even over the part of the sphere between z = 1 and 1 − height."""
+    at = np.arange(count)
+    z, around = 1 - height * (at + 0.5) / count, math.pi * (1 + math.sqrt(5)) * at
+    return np.column_stack([np.sqrt(1 - z**2) * np.cos(around), np.sqrt(1 - z**2) * np.sin(around), z])
+
+
+def magnetometer(directions: Floats) -> Producer:
+    """`calibrate mag` of readings (N, 3) in multiples of 50 µT, with noise, at 100 Hz."""
+
+    def run(folder: Path) -> None:
+        n = len(directions)
+        still = np.column_stack([np.arange(n) / 100, np.zeros((n, 2)), np.full(n, 9.81), np.zeros((n, 3))])
+        field = 50 * directions + np.random.default_rng(1).normal(0, 0.2, (n, 3))
+        names = IMU.strip() + ",mag_x_uT,mag_y_uT,mag_z_uT,mag_fresh"
+        rows = np.column_stack([still, field, np.ones(n)])
+        np.savetxt(folder / "a.csv", rows, "%.6f", delimiter=",", header=names, comments="")
+        mag_command.command.main([str(folder / "a.csv"), "--rig", str(folder / "rig.toml")], standalone_mode=False)
+
+    return run
+
+
+def two_sensors(step_s: float, motion: float = 1.0) -> Producer:
+    """`calibrate chain` of two sensors that move without a common joint, at this share of 3 rad/s and 3 m/s²."""
+    t, rng = np.arange(0, 20, step_s), np.random.default_rng(1)
+    accel, gyro, gyro2 = (3 * motion * np.sin(5 * t[:, None] + rng.uniform(0, 6, 3)) for _ in range(3))
+    accel[:, 2] += 9.81
+    accel2 = 10 * motion * rng.standard_normal(accel.shape)
+    block = lp.Measurements.from_imu(t, accel, gyro, accel2_m_s2=accel2, gyro2_rad_s=gyro2)
+    return raises(lambda: calibrate_chain([Recording(Path("a.csv"), block, None, 1 / step_s, {}, [])], Rig()))
+
+
 def joint(**given: object) -> Producer:
     return lambda folder: estimate(LinkRun(duration_s=1.0).measurements(), ["tilt"], **given)  # type: ignore[arg-type]
 
 
+TOO_LITTLE = ", too little to calibrate the magnetometer: turn the sensor by hand through all attitudes, …"
 # In the order of the page. Text -> what produces it.
 MORE: dict[str, dict[str, Producer]] = {
     "Localization": {
@@ -244,9 +280,6 @@ MORE: dict[str, dict[str, Producer]] = {
             MAP, b"P5 40000 40000 255\n"
         ),
         "… holds floating-point cells; save it with 8 or 16 bits a cell": map_file(MAP, b"Pf\n4 4\n-1.0\n" + bytes(64)),
-        "cannot write the map …: …; choose another place": lambda folder: save_map(
-            folder / "none" / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0)
-        ),
         "…, named in …, is no regular file; name a PGM or PNG file": map_file(MAP.replace("m.png", ".")),
         "… is no image that can be read; … must name a PGM or PNG file": map_file(MAP.replace("m.png", "m.yaml")),
         "cannot read the map's image …, named in …: …": map_file(MAP.replace("m.png", "none.png")),
@@ -281,8 +314,26 @@ MORE: dict[str, dict[str, Producer]] = {
         "…: there is no magnetometer; check its wiring, and record again": imu(
             0.0, lambda found: calibrate_mag(found, Rig())
         ),
+        "…: … magnetometer readings are too few; record half a minute or more": magnetometer(np.eye(3)),
+        f"the readings hardly change{TOO_LITTLE}": magnetometer(np.tile([0.0, 0.0, 1.0], (500, 1))),
+        f"the attitudes of the recording do not determine the hard iron{TOO_LITTLE}": magnetometer(
+            spread(500, 2.0) * [1.0, 1.0, 0.0]
+        ),
+        f"the recording covers … % of all attitudes{TOO_LITTLE}": magnetometer(
+            np.concatenate([spread(1000, 0.1), -spread(1000, 0.1)])
+        ),
+        "the field of … µT is not the earth's (… to … µT): a magnet or iron is near the sensor. … is unchanged; record elsewhere, or add --force": magnetometer(
+            2.0 * spread(500, 2.0)
+        ),
         "…: a chain needs a second inertial sensor, and a recording has none": imu(
             0.0, lambda found: calibrate_chain(found, Rig())
+        ),
+        "…: nowhere is a second with … samples or more; record again": two_sensors(1.0),
+        "only … s show motion; move both links for half a minute or more, in all directions that the joint allows": two_sensors(
+            0.01, 0.0
+        ),
+        "the readings fit no joint between the two sensors (… m/s² rms are left over): fix each sensor firmly on its own link, on either side of one joint": two_sensors(
+            0.01
         ),
         "the rig file lacks the positions of the mice; add one [[mouse]] table with x_m and y_m for each port": imu(
             0.0, lambda found: calibrate_mice(found, Rig(), 1.0)

@@ -1,20 +1,14 @@
 """A board written from protocol/README.md alone, without linkpose's own code: an MPU-6050, a BMP180 and one mouse.
 
-It serves a pseudo terminal at a path, in real time. What it needed and the page did not state is in the page now.
+What it needed and the page did not state is in the page now.
 """
 
 from __future__ import annotations
 
 import binascii
 import math
-import os
 import random
-import select
 import struct
-import threading
-import time
-import tty
-from pathlib import Path
 
 HELLO, SAMPLE, STATUS, PONG, ACK, NAK, SELF_TEST_RESULT = range(1, 8)
 GET_INFO, CONFIGURE, START, STOP, PING, RESET_MICE, SELF_TEST = range(0x81, 0x88)
@@ -50,15 +44,12 @@ class PageBoard:
     """The state between power-on and power-off."""
 
     def __init__(self) -> None:
-        self._began = time.perf_counter()
+        self._now_us = 0  # since power-on
         self._settings = (100, 8, 1000, 3, 1, 8, 400)
         self._streams = False
         self._seq = self._ticks = self._corrupt = self._next_us = self._status_us = 0
-        self._received = b""
+        self._received, self._unsent = b"", b"\0" + self.hello()
         self._noise = random.Random(1)
-
-    def _now_us(self) -> int:
-        return int((time.perf_counter() - self._began) * 1e6)
 
     def hello(self) -> bytes:
         counts_per_mm = self._settings[5]
@@ -68,17 +59,16 @@ class PageBoard:
         body += b"".join(map(bytes, devices)) + struct.pack("<12h", *CALIBRATION)
         return frame(HELLO, body + bytes((2, 0, 0x60, counts_per_mm, 200, 0)))
 
-    def poll(self) -> bytes:
-        """What is due since the last call."""
-        out = b""
-        while self._streams and self._now_us() >= self._next_us:
+    def advance(self, now_us: int) -> bytes:
+        """What is due up to `now_us`."""
+        self._now_us = now_us
+        out, self._unsent = self._unsent, b""
+        while self._streams and now_us >= self._next_us:
             out += self._sample(self._next_us)
             self._next_us += 1_000_000 // self._settings[0]
-        if self._streams and self._now_us() >= self._status_us:
+        if self._streams and now_us >= self._status_us:
             self._status_us += 1_000_000
-            body = struct.pack(
-                "<IIIIHHIHHHHH", self._now_us(), self._ticks, 0, 0, self._corrupt, 0, 0, 0, 9, 9, 3, 5000
-            )
+            body = struct.pack("<IIIIHHIHHHHH", now_us, self._ticks, 0, 0, self._corrupt, 0, 0, 0, 9, 9, 3, 5000)
             out += frame(STATUS, body + bytes(40) + struct.pack("<4H", 0, 0, 0, 900))
         return out
 
@@ -96,8 +86,9 @@ class PageBoard:
         self._ticks += 1
         return frame(SAMPLE, body + struct.pack("<2h", 3, 1))
 
-    def receive(self, data: bytes) -> bytes:
-        """Answers to what arrived."""
+    def receive(self, data: bytes, now_us: int) -> bytes:
+        """Answers to what arrived at `now_us`."""
+        self._now_us = now_us
         *frames, self._received = (self._received + data).split(b"\0")
         return b"".join(self._answer(each) for each in frames if each)
 
@@ -117,7 +108,7 @@ class PageBoard:
         if kind == GET_INFO:
             return self.hello()
         if kind == PING:
-            return frame(PONG, body + struct.pack("<I", self._now_us()))
+            return frame(PONG, body + struct.pack("<I", self._now_us))
         if reason := self._refuses(kind, body):
             return frame(NAK, bytes((kind, reason)))
         return frame(ACK, bytes((kind,))) + self._do(kind, body)
@@ -145,40 +136,10 @@ class PageBoard:
             self._settings = struct.unpack("<HBHBBBH", body)
         elif kind == START and not self._streams:
             self._streams, self._seq = True, 0
-            self._next_us = self._status_us = self._now_us() + 1000
+            self._next_us = self._status_us = self._now_us + 1000
             self._status_us += 1_000_000
         elif kind == STOP:
             self._streams = False
         elif kind == SELF_TEST:
             return frame(SELF_TEST_RESULT, bytes((0, 1)) + bytes(30))
         return b""
-
-
-class Serving:
-    """Serves a board at the symlink `path` within the context."""
-
-    def __init__(self, path: Path) -> None:
-        self._path, self._stop = path, threading.Event()
-
-    def __enter__(self) -> None:
-        self._master, self._slave = os.openpty()
-        for end in (self._master, self._slave):
-            tty.setraw(end)
-        self._path.symlink_to(os.ttyname(self._slave))
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        self._thread.join()
-        os.close(self._slave)
-        os.close(self._master)
-
-    def _serve(self) -> None:
-        board = PageBoard()
-        out = b"\0" + board.hello()
-        while not self._stop.is_set():
-            if out:
-                os.write(self._master, out)
-            arrived = select.select([self._master], [], [], 0.003)[0]
-            out = (board.receive(os.read(self._master, 4096)) if arrived else b"") + board.poll()

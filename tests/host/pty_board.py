@@ -1,4 +1,4 @@
-"""A simulated board at a pseudo terminal that can be pulled, reset, silenced and made to talk nonsense."""
+"""A board at a pseudo terminal that can be pulled, reset, silenced and made to talk nonsense."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 import tty
 from collections.abc import Callable
 from pathlib import Path
+from typing import Protocol
 
 from linkpose.simulation.board import SimulatedBoard
 from linkpose.simulation.link import LinkRun
@@ -28,11 +29,31 @@ def link_run(settings: Configure) -> LinkRun:
     )
 
 
+class Board(Protocol):
+    """A board by the bytes on its line. Times are microseconds since power-on."""
+
+    def advance(self, now_us: int) -> bytes:
+        """What it sends by itself up to `now_us`."""
+
+    def receive(self, data: bytes, now_us: int) -> bytes:
+        """Its answers to bytes that arrive at `now_us`."""
+
+
+def simulated_link() -> Board:
+    return SimulatedBoard(link_run)
+
+
 class PtyBoard:
     """Serves a board at the symlink `path`. `spoil` may change what the board sends; `chatter` is sent all the time."""
 
-    def __init__(self, path: Path, spoil: Callable[[bytes], bytes] = lambda data: data, chatter: bytes = b"") -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        spoil: Callable[[bytes], bytes] = lambda data: data,
+        chatter: bytes = b"",
+        make: Callable[[], Board] = simulated_link,
+    ) -> None:
+        self.path, self._make = path, make
         self.spoil = spoil
         self.chatter = chatter
         self.received = threading.Event()  # the host has sent something
@@ -56,7 +77,7 @@ class PtyBoard:
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self._unsent = b""
-        self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
+        self._board, self._began = self._make(), time.perf_counter()
         self.path.symlink_to(os.ttyname(self._slave))
         self._stop.clear()
         self._thread = threading.Thread(target=self._serve, daemon=True)
@@ -78,7 +99,7 @@ class PtyBoard:
         from linkpose.simulation import board as simulated
         from linkpose.wire.frames import encode
 
-        self._board, self._began = SimulatedBoard(link_run), time.perf_counter()
+        self._board, self._began = self._make(), time.perf_counter()
         if says_hello:
             self._send(encode(simulated.hello(simulated.DEFAULTS)))
 

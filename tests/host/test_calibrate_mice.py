@@ -96,12 +96,22 @@ def broken() -> dict[str, tuple[list[Recording], Rig, str]]:
     moving = replace(line, measurements=line.measurements[300:])
     _, away = driven("line", faults=(Fault("unplug", 2, 5.0, 6.0),))
     still = replace(line, measurements=line.measurements[:100])
+    counts = line.measurements.mice_counts.copy()
+    counts[:, 2] = 0.0
+    dead = cut(line, "dead.csv", mice_counts=counts)
+    counts = turn.measurements.mice_counts.copy()
+    counts[600:, 1] = 0.0
+    dies = cut(turn, "dies.csv", mice_counts=counts)
+    slid = cut(line, "slid.csv", mice_counts=np.round(1.04 * line.measurements.mice_counts))
     return {
         "no turn": ([line], run.rig, "no recording is of a full turn"),
         "no line": ([turn], run.rig, "no recording is of a straight line; drive one of 2 m"),
         "half a turn": ([line, half], run.rig, "neither a straight line nor full turns"),
         "no rest": ([moving, turn], run.rig, "line.csv begins in motion"),
         "no motion": ([still, turn], run.rig, "line.csv: no mouse moves in it"),
+        "a dead mouse": ([dead, turn], run.rig, "mouse 3 counts 0 while another counts 1"),
+        "a mouse that died in the turn": ([line, dies], run.rig, "mice contradict one another .* mouse 2 most of all"),
+        "a slippery floor": ([slid, turn], run.rig, "line and turn contradict each other.* 3.7 % fewer per metre"),
         "a mouse away": ([away, turn], run.rig, "mouse 2 is away at 5.00 s"),
         "lost samples": ([cut(line, "lost.csv", flags=flags), turn], run.rig, "samples were lost before 6.00"),
         "no gyro": ([cut(line, "blind.csv", gyro_rad_s=no_gyro), turn], run.rig, "blind.csv holds no gyro"),
@@ -134,14 +144,37 @@ def test_the_command_completes_the_rig_file(linkpose, tmp_path):
         assert mouse.angle_deg == pytest.approx(row["angle_deg"], abs=1e-4)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_ten_turns_with_an_uncalibrated_gyro_are_counted(seed):
-    run, line = driven("line", seed)
-    ten = MiceRun(seed, 44.0, errors="datasheet", drive=Move((0.0, 0.0, 20 * np.pi), 44.0))
-    turns = Recording(Path("turns.csv"), ten.measurements(), ten.rig, 100.0, {}, [])
-    for i, mouse in enumerate(calibrate_mice([line, turns], run.rig, LENGTH_M)):
-        assert mouse.counts_per_m == pytest.approx(run.true_counts_per_m[i], rel=0.003)
-        assert mouse.angle_deg == pytest.approx(run.true_angle_deg[i], abs=0.2)
+def turned(turns: float, seed: int, duration_s: float, rig: Rig | None = None, **more) -> Recording:
+    run = MiceRun(seed, duration_s, errors="datasheet", drive=Move((0.0, 0.0, 2 * np.pi * turns), duration_s), **more)
+    return Recording(Path("turns.csv"), run.measurements(), rig or run.rig, 100.0, {}, [])
+
+
+@pytest.mark.parametrize(("turns", "closing_deg"), [(10, 1.0), (-10, 0.5), (1, 1.0)])
+def test_scale_angle_and_position_are_within_their_standard_deviations(turns, closing_deg):
+    """Mice a millimetre from their places, turns that do not close, and a gyro that was never calibrated."""
+    z = []
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 7])
+        exact, ruler = ring(3), rng.normal(0, 1e-3, (3, 2)).tolist()
+        stated = Rig(
+            mouse=tuple(replace(m, x_m=m.x_m + x, y_m=m.y_m + y) for m, (x, y) in zip(exact, ruler, strict=True))
+        )
+        run, line = driven("line", seed)
+        whole = turns + np.radians(closing_deg) * rng.standard_normal() / (2 * np.pi)
+        found = calibrate_mice([line, turned(whole, seed, 4.0 * abs(turns) + 8.0)], stated, LENGTH_M)
+        off_x, off_y = (np.array([getattr(m, name) for m in found]) for name in ("x_m", "y_m"))
+        off_x, off_y = off_x - [m.x_m for m in exact], off_y - [m.y_m for m in exact]
+        for i, mouse in enumerate(found):
+            z += [
+                (mouse.counts_per_m - run.true_counts_per_m[i]) / mouse.counts_per_m_std,
+                (mouse.angle_deg - run.true_angle_deg[i]) / mouse.angle_std_deg,
+                (off_x - off_x.mean())[i] / mouse.position_std_m,
+                (off_y - off_y.mean())[i] / mouse.position_std_m,
+            ]
+            assert mouse.counts_per_m == pytest.approx(run.true_counts_per_m[i], rel=0.003)
+            assert mouse.angle_deg == pytest.approx(run.true_angle_deg[i], abs=0.2)
+    z = np.abs(z).reshape(-1, 4)
+    assert (np.mean(z < 2.0, axis=0) > 0.9).all() and z.max() < 4.0
 
 
 def test_more_turns_than_such_a_gyro_can_count_are_refused():

@@ -171,9 +171,14 @@ def test_the_command_and_a_simulation_of_the_same_sensor(tmp_path):
     shown = CliRunner().invoke(noise_command.command, [str(path), "--rig", str(rig)])
     assert "bias instability ≤" in shown.stdout and "too short" in shown.stdout
     assert f"next: linkpose record rests.csv\nthen: linkpose calibrate imu rests.csv --rig {rig}" in shown.stderr
-    outputs = ["-o", str(tmp_path / "sim.csv"), "--truth", str(tmp_path / "truth.csv"), "--duration", "2"]
+    still = tmp_path / "still.csv"
+    outputs = ["-o", str(still), "--truth", str(tmp_path / "truth.csv"), "--still", "--duration", "70"]
     simulated = CliRunner().invoke(simulate_link.command, [*outputs, "--errors", str(rig)])
-    assert simulated.exit_code == 0
+    assert f"next: linkpose calibrate noise {still} --rig rig.toml" in simulated.stderr
+    again = CliRunner().invoke(noise_command.command, [str(still), "--rig", str(tmp_path / "again.toml")])
+    assert again.exit_code == 0 and "99 % of the recording" in again.stdout
+    assert "--port 'sim://link?test=1&seed=0&errors=calibrated&motion=sides'" in again.stderr
+    assert Rig.load(tmp_path / "again.toml").noise.gyro_density_rad_s_sqrtHz == pytest.approx([GYRO] * 3, rel=0.1)
     run = LinkRun(duration_s=2.0, noise_of=Rig.load(rig))
     assert run.imu_errors.gyro_noise_rad_s == pytest.approx(np.full(3, GYRO * 10), rel=0.08)
     assert CliRunner().invoke(simulate_link.command, [*outputs, "--errors", "best"]).exit_code == 2

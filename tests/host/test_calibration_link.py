@@ -378,12 +378,13 @@ def test_the_six_rests_of_a_simulated_sensor_calibrate_it(tmp_path):
         imu_command.command, [str(rec), "--rig", str(rig_file), "--json"], catch_exceptions=False
     )
     assert json.loads(found.stdout)["attitudes"] == 6
-    assert f"next: linkpose record swing.csv\nthen: linkpose calibrate joint swing.csv --rig {rig_file}" in found.stderr
-    errors = LinkRun(1, 0, 40.0, errors="datasheet", rests=True).imu_errors
+    port = "'sim://link?test=1&seed=0&errors=datasheet'"  # the same simulated sensor, on a link that swings
+    assert f"next: linkpose record swing.csv --port {port}\nthen: linkpose calibrate joint swing.csv" in found.stderr
+    errors = LinkRun(1, 0, 40.0, errors="datasheet", motion="sides").imu_errors
     assert Rig.load(rig_file).imu.gyro_bias_rad_s == pytest.approx(errors.gyro_bias_rad_s, abs=1e-3)
     assert Rig.load(rig_file).imu.accel_offset_m_s2 == pytest.approx(errors.accel_bias_m_s2, abs=0.05)
     with pytest.raises(LinkposeError, match="six rests do not fit 10 s: simulate 23 s or more"):
-        LinkRun(1, 0, 10.0, rests=True)
+        LinkRun(1, 0, 10.0, motion="sides")
 
 
 def test_the_sigma_of_bias_and_offset_reach_the_filters(tmp_path):

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pty_board import PtyBoard, link_run
+from scripted_board import install
 from serial.tools import list_ports_common
 from terminal import HOST
 
@@ -469,6 +470,16 @@ def test_a_board_clock_that_stands_still_or_jumps_is_reported_once(tmp_path, cha
     assert sum(words in line for line in messages) == 1
 
 
+def test_a_board_that_repeats_the_number_of_a_sample_is_reported_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(session_module, "SILENCE_S", 0.2)
+    frozen = SpoiledSamples(20, lambda sample, count: encode(sample._replace(seq=20)))
+    messages = []
+    with PtyBoard(tmp_path / "port", spoil=frozen), Session(str(tmp_path / "port"), messages.append) as session:
+        samples = sum(map(len, session.stream(1.0)))
+        assert samples + session.health().lost == 100
+    assert sum("20 samples came with numbers that came before, and are left out" in line for line in messages) == 1
+
+
 def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
     from linkpose.simulation import board as simulated
 
@@ -486,6 +497,21 @@ def test_another_board_behind_the_same_port_ends_the_recording(tmp_path):
             if session.timeline.samples > 10 and not changed.is_set():
                 changed.set()
                 board.reset(says_hello=False)
+
+
+def test_a_barometer_with_other_words_is_another_board(monkeypatch):
+    board = install(monkeypatch)
+    board.resets = [20]
+
+    def other(hello: Hello) -> Hello:
+        return hello if board.resets else hello._replace(baro_words=(1, *hello.baro_words[1:]))
+
+    board.hello = other
+    refusal = pytest.raises(
+        session_module.AnotherBoard, match=r"another board answers at .* now; record it into a file"
+    )
+    with Session("sim://link?speed=0", print) as session, refusal:
+        list(session.stream(2.0))
 
 
 def test_a_board_that_starts_and_sends_no_sample_is_a_failure(tmp_path):
@@ -542,6 +568,12 @@ def test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence(tmp_
     with raw_capture(raw) as file, Session("sim://link?speed=0", print, file) as session, refusal:
         for _ in session.stream(2):
             raw.unlink(missing_ok=True)
+
+
+def test_a_raw_capture_on_a_full_disk_ends_with_a_sentence():
+    refusal = pytest.raises(session_module.LinkposeError, match="cannot write the raw capture any more: No space left")
+    with raw_capture(Path("/dev/full")) as file, refusal, Session("sim://link?speed=0", print, file):
+        pass
 
 
 def test_a_raw_capture_is_added_to_what_the_standard_output_has(tmp_path):

@@ -260,7 +260,7 @@ def _changed(measured: lp.Measurements, **changes: np.ndarray) -> lp.Measurement
 @pytest.mark.parametrize(
     ("name", "change", "remark"),
     [
-        ("gyro2_rad_s", lambda rates: np.degrees(rates), "units are m/s² and rad/s"),
+        ("gyro2_rad_s", lambda rates: np.degrees(rates), "mean rate of sensor 2 is"),
         (
             "gyro2_rad_s",
             lambda rates: np.where(np.arange(len(rates))[:, None] < 1000, rates, rates[1000]),
@@ -306,6 +306,12 @@ def test_a_sensor_that_is_mounted_anew_is_found_again() -> None:
     assert np.sqrt(np.mean(error[end] ** 2)) < 1.0  # NaN, which fails, where it is not known
     known = np.isfinite(error)
     assert np.mean(error[known] < 2 * estimates["chain_rotation_std_deg"][known]) > 0.9
+
+
+@pytest.mark.parametrize("seed", [0, 2])  # which follow a wrong heading for some seconds
+def test_a_wrong_heading_of_the_start_is_no_misfit(seed: int) -> None:
+    run = ChainRun("hinge", seed, 15.0)
+    assert not lp.estimate(run.measurements(), filters=["chain"], rig=run.rig).remarks
 
 
 def test_readings_in_order_give_no_remark() -> None:

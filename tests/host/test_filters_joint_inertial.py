@@ -110,19 +110,35 @@ def test_sigma_at_rest_does_not_assume_a_calibration():
     assert np.mean(shares) > 0.75
 
 
-def test_what_the_constraint_cannot_observe_keeps_its_prior():
-    """Both sensors turned alike about J2S: its variance shrank to a tenth, and it walked to 1°."""
+@pytest.mark.parametrize(("rig", "unknown"), [(Rig().with_j2s(PAPER_J2S_M), 1), (UNKNOWN, 3)], ids=["known", "auto"])
+def test_what_the_constraint_cannot_observe_keeps_its_prior(rig, unknown):
+    """Both sensors turned alike about J2S, and about any axis where J2S is unknown: σ shrank to a third in a minute."""
     block, _ = recorded(3, 0, "datasheet")
-    f = JointInertialFilter(Rig().with_j2s(PAPER_J2S_M))
+    f = JointInertialFilter(rig)
     f.process(block)
     state, d = f.states[1], np.array(PAPER_J2S_M) / np.linalg.norm(PAPER_J2S_M)
-    turned = np.zeros((3, 3))
-    for i in range(3):
-        turned[(i + 1) % 3, (i + 2) % 3], turned[(i + 2) % 3, (i + 1) % 3] = d[i], -d[i]
-    u = np.concatenate([turned.ravel(), turned.ravel()]) / 4
-    std = np.sqrt(u @ state.covariance[MA:D, MA:D] @ u)
-    assert std == pytest.approx(0.012 / 2, rel=0.1)  # four elements of 0.012 in either matrix
-    assert abs(u @ state.nominal[MA:D]) < 0.2 * std
+    across = np.cross(d, [1.0, 0.0, 0.0]) / np.linalg.norm(np.cross(d, [1.0, 0.0, 0.0]))
+    for axis in (d, across, np.cross(d, across))[:unknown]:
+        turned = np.cross(np.eye(3), axis)
+        u = np.concatenate([turned.ravel(), turned.ravel()]) / 4
+        std = np.sqrt(u @ state.covariance[MA:D, MA:D] @ u)
+        assert std == pytest.approx(0.012 / 2, rel=0.1)  # four elements of 0.012 in either matrix
+        assert abs(u @ state.nominal[MA:D]) < 0.2 * std
+
+
+def test_sigma_of_the_angles_where_j2s_is_unknown():
+    """Sensors within the data sheet.
+
+    Both sensors turned alike are an error of J2S too, and 58 to 63 % of the errors of roll and pitch were within 2σ. A
+    bias of 20 °/s at switch-on misled the filter that assumes a calibration, and heights were wrong by decimetres.
+    """
+    shares, heights = [], []
+    for test, seed in ((1, 102), (2, 100), (2, 109), (3, 101), (3, 102), (3, 106)):
+        block, truth = recorded(test, seed, "datasheet")
+        shares.append(within_2sigma(JointInertialFilter(UNKNOWN), block, truth)[1:3])
+        heights.append(rmse_cm(JointInertialFilter(UNKNOWN).process(block)[500:], truth.height_m[500:]))
+    assert np.mean(shares) > 0.9
+    assert max(heights) < 1
 
 
 def test_a_declared_gyro_bias_does_not_widen():
@@ -203,7 +219,7 @@ def test_a_steady_turn_is_no_rest():
     f = JointInertialFilter(Rig().with_j2s((0.0, 0.0, 0.6)))
     estimate = f.process(block)
     assert f.restarts == 0
-    assert np.abs(f.gyro_bias_rad_s).max() < 0.02
+    assert np.abs(f.gyro_bias_rad_s).max() < 0.1  # the turn is 1.5 rad/s; about the vertical no reading shows a bias
     assert 100 * np.abs(estimate[500:, 0] - tilt @ d).max() < 1
 
 

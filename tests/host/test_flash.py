@@ -15,9 +15,11 @@ from pathlib import Path
 
 import pytest
 import serial
+from pty_board import PtyBoard
 from serial.tools import list_ports_common
 
 from linkpose.device import ports
+from linkpose.device import session as session_module
 from linkpose.errors import LinkposeError
 from linkpose.flashing import build as build_module
 from linkpose.flashing.image import MARK, PREBUILT, Image, read_image
@@ -181,6 +183,9 @@ def test_a_port_that_cannot_be_opened_is_said_before_anything_is_built(
 ) -> None:
     assert "there is no port /dev/ttyNONE" in refused("flash", "--port", "/dev/ttyNONE")
     assert "sim://link is not a board that can be flashed" in refused("flash", "--port", "sim://link")
+    with monkeypatch.context() as patch:
+        patch.setenv("LINKPOSE_PORT", "sim://mice")
+        assert "sim://mice is not a board that can be flashed" in refused("flash", "--prebuilt")
     with serial.Serial(port, exclusive=True):
         assert "is in use by another program. Close it" in refused("flash", "--port", port)
     monkeypatch.setattr(ports, "holder", lambda name: "screen (process 123)")
@@ -305,3 +310,21 @@ def test_both_bit_rates_are_tried(port: str) -> None:
     with pytest.raises(LinkposeError, match="No UNO bootloader answers"):
         upload(read_image(PREBUILT), port, lambda _: None, open_silent)
     assert rates == [115_200, 57_600, 115_200, 57_600]
+
+
+@pytest.mark.parametrize(
+    ("answers", "sentence"),
+    [
+        (True, "reports source revision .*, but .* was written. Check that .* is the board that was flashed"),
+        (False, "The firmware was written and verified, but the handshake failed: .*the board is silent"),
+    ],
+    ids=["another firmware", "silence"],
+)
+def test_what_answers_after_the_upload_is_checked(
+    refused: Refused, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, answers: bool, sentence: str
+) -> None:
+    """A simulated board, whose firmware is not the one that was written, or a port at which nothing answers."""
+    monkeypatch.setattr(session_module, "HANDSHAKE_TIMEOUT_S", 0.4)
+    monkeypatch.setattr("linkpose.flashing.upload.upload", lambda *_: None)
+    with PtyBoard(tmp_path / "port", spoil=lambda data: data if answers else b""):
+        assert re.search(sentence, refused("flash", "--prebuilt", "--port", tmp_path / "port"))

@@ -19,7 +19,7 @@ from linkpose.flashing.image import read_image
 from linkpose.localization.logs import read_log
 from linkpose.localization.maps import load_map
 from linkpose.localization.tables import read_beacons, read_truth
-from linkpose.recording.csvfile import STDOUT, create, write_all
+from linkpose.outputs import STDOUT, create, write_all
 from linkpose.recording.reader import RecordingFile
 from linkpose.recording.table import read_table
 from linkpose.sensors.rig import Rig

@@ -18,7 +18,7 @@ from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.settings import Settings
 from linkpose.localization.stream import Stream
 from linkpose.localization.tables import Truth, score_track
-from linkpose.localization.tuning import LEAST_TURN_RAD_S, TUNABLE, correlation_time, tune, warm_up
+from linkpose.localization.tuning import LEAST_TURN_RAD_S, TUNABLE, correlation_time, described, tune, warm_up
 
 BEACONS = {"1": (0.0, 0.0, 0.0), "2": (20.0, 0.0, 0.0), "3": (20.0, 20.0, 0.0), "4": (0.0, 20.0, 0.0)}
 STEP_S = 0.1
@@ -38,11 +38,12 @@ def drive(
     bearings: bool = False,
     persists_s: float = 0.0,
     offsets: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
+    is_common: bool = False,
 ) -> tuple[Log, Truth]:
     """Odometry at 10 Hz (0.02 m/s, 0.02 rad/s) and ranges at 2 Hz, beacon after beacon.
 
     From `carried` = (time, so much s) on, the robot goes on from where it would be that much later. `persists_s` is the
-    time constant of the ranges' error.
+    time constant of the ranges' error, one of each beacon or, with `is_common`, one of all with white noise of a third.
     """
     rng = np.random.default_rng(seed)
     log: Log = [Event(0.0, "pose", circle(0.0))]
@@ -57,8 +58,10 @@ def drive(
             for name in list(BEACONS) if persists_s else [str(1 + (k // 5) % 4)]:
                 x, y, _ = BEACONS[name]
                 keep = math.exp(-0.5 / persists_s) if persists_s else 0.0
-                errors[name] = keep * errors[name] + math.sqrt(1 - keep**2) * rng.normal(0, range_std)
-                distance = math.hypot(x - pose[0], y - pose[1]) + errors[name] + offsets[int(name) - 1]
+                if not is_common or name == "1":
+                    errors[name] = keep * errors[name] + math.sqrt(1 - keep**2) * rng.normal(0, range_std)
+                error = errors["1"] + rng.normal(0, range_std / 3) if is_common else errors[name]
+                distance = math.hypot(x - pose[0], y - pose[1]) + error + offsets[int(name) - 1]
                 bearing = math.remainder(math.atan2(y - pose[1], x - pose[0]) - pose[2] + rng.normal(0, 0.02), math.tau)
                 if bearings:
                     log.append(Event(time, "bearing_range", (distance, bearing), name))
@@ -107,6 +110,17 @@ def test_errors_that_persist_become_states_or_count_less() -> None:
         shares = [score_track(track, truth).within_2_sigma or 0.0 for track in tracks]
         assert shares[0] > 0.93
         assert min(shares[:2]) > shares[2] + 0.15
+
+
+def test_an_error_that_all_beacons_share_is_one_state() -> None:
+    """As in Table 2.8 of the thesis. It hardly moves the path, and σ of the path shows that."""
+    log, truth = drive(3, 100.0, range_std=0.3, persists_s=2.0, is_common=True)
+    found = tune(log, settings(), BEACONS, TUNABLE)
+    assert found.drift_is_shared and "in common" in described(found, log)
+    assert (found.drift_std_m, found.drift_time_s) == pytest.approx((0.3, 2.0), rel=0.4)
+    score = score_track(estimate_track(log, "ekf", found, None, BEACONS), truth)
+    assert score.position_rmse_m < 0.1
+    assert score.within_2_sigma is not None and score.within_2_sigma > 0.9
 
 
 def test_the_correlation_time_of_white_errors_is_zero_and_of_a_gauss_markov_process_twice_its_time_constant() -> None:

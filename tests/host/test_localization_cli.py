@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import linkpose as lp
+from linkpose.cli.localize import command
 from linkpose.errors import InvalidValue
 from linkpose.localization.ekf import ekf_step
 from linkpose.localization.events import Event
@@ -51,6 +52,14 @@ def test_the_help_shows_ranges_without_an_open_end(linkpose):
     text = linkpose("localize", "--help").out
     assert "None" not in text
     assert ">0]" in text and ">=0]" in text
+
+
+def test_the_help_has_each_option_once_and_the_ordinary_case_first(linkpose):
+    text = linkpose("localize", "--help").out
+    flags = [line.split()[0] for line in text.splitlines() if line.startswith("  -")]
+    assert len(flags) == len(set(flags)) == len(command.params)  # less the argument, and with --help
+    firsts = [text.index(flag) for flag in ("--map", "--output", "--help", "--filter", "--range-std", "--noise")]
+    assert firsts == sorted(firsts)
 
 
 def test_indoor_from_log_to_path(indoor, linkpose, tmp_path):

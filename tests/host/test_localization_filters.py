@@ -463,6 +463,8 @@ def test_the_figures_of_a_verdict_are_those_it_is_decided_by():
     assert re.fullmatch(r"median NIS [01]\.\d\d, 1 is consistent; outliers raise the mean to 3\.\d+", verdict.figures())
     (clean,) = Consistency({"range": found.nis["range"][:1000]}, {"range": 1}).verdicts()
     assert re.fullmatch(r"median NIS [01]\.\d\d, 1 is consistent", clean.figures())
+    (few,) = Consistency({"pose": [0.0]}, {"pose": 3}).verdicts()
+    assert (few.sentence(), few.figures()) == ("pose noise: only 1 measurement, no verdict", "")
 
 
 def test_smoothing_lowers_the_error_in_a_silence_of_the_beacons():

@@ -120,6 +120,22 @@ def test_beams_of_180_readings_and_beams_without_echo():
     assert np.isfinite(scan.ranges_m[chosen]).sum() == 17
 
 
+def test_scans_of_which_every_nth_beam_was_kept_and_beams_written_as_infinity(tmp_path):
+    """180 readings of 1 degree, every third kept, have steps of 3 degrees; 181 readings, too."""
+    for count, step, last in (
+        (60, 3.0, 87.0),
+        (61, 3.0, 90.0),
+        (90, 2.0, 88.0),
+        (720, 0.25, 89.75),
+        (271, 2 / 3, 90.0),
+    ):
+        angles = np.degrees(flaser_angles(count))
+        assert (angles[0], angles[1] - angles[0], angles[-1]) == pytest.approx((-90.0, step, last))
+    text = FLASER.replace("FLASER 181 1.00 1.01", "FLASER 181 inf nan")
+    scan = read_log(written(tmp_path, f"{ODOM}\n{text}\n", "run.log")).events[-1]
+    assert np.flatnonzero(np.isnan(scan.ranges_m)).tolist() == [0, 1]
+
+
 def test_odometry_between_two_poses_is_the_arc_that_joins_them():
     """A quarter of a circle of 2 m radius in 4 s, over the half turn."""
     start = (0.0, 0.0, math.radians(170))
@@ -139,6 +155,7 @@ def test_odometry_between_two_poses_is_the_arc_that_joins_them():
         (f"{ODOM}\nODOM 1 2\n", "line 2: ODOM is cut short"),
         (f"{ODOM}\n{ROBOTLASER[:300]}\n", "line 2: ROBOTLASER1 is cut short"),
         (f"{ODOM.replace('2.0', 'nan')}\n", "line 1: 'nan' is not a number"),
+        (f"{FLASER.replace('1.00', '1.0O')}\n{ODOM}\n", "line 1: '1.0O' is not a number"),
         (f"{FLASER.replace('181', '18.5')}\n", "line 1: '18.5' is no number of readings"),
     ],
 )

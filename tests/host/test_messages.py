@@ -9,14 +9,16 @@ import re
 import socket
 import sys
 from binascii import crc_hqx
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 import serial
 from cobs import cobs
+from further_producers import FURTHER
 from message_producers import MORE
 from pty_board import PtyBoard
 
@@ -28,8 +30,9 @@ from linkpose.device.ports import PortInfo
 from linkpose.errors import LinkposeError
 from linkpose.estimation import Estimator, estimate
 from linkpose.evaluation.scores import evaluate
+from linkpose.outputs import create, write_all
 from linkpose.recording import chunks
-from linkpose.recording.csvfile import CsvFile, create, write_all
+from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.reader import load_recording
 from linkpose.recording.table import read_table
 from linkpose.sensors.devices import Sensors
@@ -214,6 +217,7 @@ PRODUCERS: list[Producer] = [
     table("0,1\n2,3\n"),
     table("time_s;a;a\n0;1;2\n"),
     parquet(["a", "a"]),
+    recording(b"PK\x03\x04\n1\n"),
     table("[joint]\nj2s_m = [1, 2, 3]\n"),
     table("time_s;a\n0;1\n1;2;3\n"),
     table("time_s,a\n0,5,1,5\n"),
@@ -305,24 +309,46 @@ def pattern(message: str) -> str:
 
 
 def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    more = {message: produce for section in MORE.values() for message, produce in section.items()}
+    more = {message: produce for section in (*MORE.values(), *FURTHER.values()) for message, produce in section.items()}
     shown = messages()
     first = len(shown) - len(more)
     assert shown[first:] == list(more)
     assert first == len(PRODUCERS)
-    producers = [*PRODUCERS, *(lambda folder, _, produce=produce: produce(folder) for produce in more.values())]
+    producers = [*PRODUCERS, *(alone(produce) for produce in more.values())]
     found, kinds = [], set()
     for number, (message, produce) in enumerate(zip(shown, producers, strict=True)):
+        if isinstance(produce, str):
+            check_asserted(message, produce)
+            found.append(message)
+            continue
         (folder := tmp_path / str(number)).mkdir()
-        with monkeypatch.context() as patch, pytest.raises(LinkposeError) as raised:
+        with monkeypatch.context() as patch, pytest.raises((LinkposeError, click.ClickException)) as raised:
             produce(folder, patch)
             pytest.fail(f"nothing was raised for {message!r}")
-        text = sentence(raised.value)
+        error = raised.value
+        text = error.message if isinstance(error, click.ClickException) else sentence(error)
         assert re.fullmatch(pattern(message), text.replace("`", "")), f"{text!r} is not {message!r}"
-        found.append(text)
-        kinds |= {type(raised.value), type(getattr(raised.value, "reason", None))}
-    assert not [of for of in sentences() if not any(re.search(pattern(of), text) for text in found)]
-    assert {kind.__name__ for kind in CURES} - ELSEWHERE <= {kind.__name__ for kind in kinds}
+        found.append(text.replace("`", ""))
+        kinds |= {type(error), type(getattr(error, "reason", None))}
+    missing = {of: where for of, where in sentences() if not any(re.search(pattern(of), text) for text in found)}
+    assert not missing, f"host/docs/messages.md has no row for {missing}"
+    assert {kind.__name__ for kind in CURES} <= {kind.__name__ for kind in kinds}
+
+
+def alone(produce: Callable[[Path], object] | str) -> Producer | str:
+    return produce if isinstance(produce, str) else lambda folder, _: produce(folder)
+
+
+def check_asserted(message: str, test: str) -> None:
+    """Fails unless that test exists, and its file holds a part of the message with which it compares."""
+    file, function = test.split("::")
+    source = (Path(__file__).parent / file).read_text(encoding="utf-8")
+    assert f"def {function}(" in source, f"there is no test {test}"
+    source = re.sub(r"[\\`]", "", source)
+    words = [part for piece in message.split("…") for part in re.findall(r"[^;:]{10,}", piece)]
+    assert any(words_of[at : at + 12] in source for words_of in words for at in range(max(1, len(words_of) - 12))), (
+        f"{test} does not compare with {message!r}"
+    )
 
 
 # The promises of the page, and the tests that prove each. A computer that loses its power has none.
@@ -386,27 +412,53 @@ def test_each_promise_of_the_page_has_its_tests() -> None:
         assert f"def {function}(" in source, f"there is no test {name}"
 
 
-# With a cure, and produced by the tests of localization and of the magnetometer.
-ELSEWHERE = {
-    "MissingMap", "MissingBeacons", "MissingStart", "NothingToEstimate", "NeedsScans", "NotPositiveDefinite",
-    "UncalibratedMagnetometer", "NoMagnetometer",
-}  # fmt: skip
+SHORTEST = 16  # characters of a sentence; shorter texts are the names of arguments
+WRONG_USAGE = {"UsageError", "BadParameter", "fail"}
 
 
-RAISED = ("FileFormatError", "LinkposeError", "FileError")
-# Parts of the program of which the page has all sentences.
-COMPLETE = [
-    "recording/*.py", "streams.py", "convert/*.py", "flashing/image.py",
-    *(f"localization/{name}.py" for name in ("carmen", "events", "maps", "noise", "plausibility", "tables", "ukf")),
-]  # fmt: skip
+def sentences() -> Iterator[tuple[str, str]]:
+    """The sentences of all errors in the program, `…` for what is put in, and where they are."""
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+    kinds = error_classes(trees.values())
+    for path, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef) and node.name in kinds:
+                calls = [each for each in ast.walk(node) if isinstance(each, ast.Call) and is_of_base(each)]
+            elif isinstance(node, ast.Call) and name_of(node.func) in kinds | WRONG_USAGE:
+                calls = [node]
+            else:
+                continue
+            for text in (text_of(argument) for call in calls for argument in call.args):
+                if len(text) >= SHORTEST and " " in text:
+                    yield text.replace("`", ""), f"{path.relative_to(PACKAGE)}:{node.lineno}"
 
 
-def sentences() -> Iterator[str]:
-    """The sentences of the errors in these parts of the program, `…` for what is put in."""
-    for path in [path for part in COMPLETE for path in PACKAGE.glob(part)]:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in RAISED:
-                yield from (text for argument in node.args if len(text := text_of(argument)) > 20)
+def error_classes(trees: Iterable[ast.Module]) -> set[str]:
+    """The names of LinkposeError and of all classes below it."""
+    bases = {
+        node.name: {name_of(base) for base in node.bases}
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    }
+    found = {"LinkposeError"}
+    while more := {name for name, above in bases.items() if above & found} - found:
+        found |= more
+    return found
+
+
+def name_of(node: ast.expr) -> str:
+    return getattr(node, "id", "") or getattr(node, "attr", "")
+
+
+def is_of_base(call: ast.Call) -> bool:
+    """Whether it is `super().__init__(…)`."""
+    return (
+        isinstance(call.func, ast.Attribute)
+        and call.func.attr == "__init__"
+        and isinstance(call.func.value, ast.Call)
+        and name_of(call.func.value.func) == "super"
+    )
 
 
 def text_of(node: ast.expr) -> str:
@@ -415,3 +467,15 @@ def text_of(node: ast.expr) -> str:
     if isinstance(node, ast.JoinedStr):
         return "".join(text_of(part) for part in node.values)
     return "…"
+
+
+def test_every_form_of_a_sentence_is_found() -> None:
+    """A sentence in an error of any class, in the class itself, and in an error of click."""
+    tree = ast.parse(
+        "class Own(LinkposeError):\n def __init__(self): super().__init__(f'{self} is of its own')\n"
+        "class Further(Own): pass\n"
+    )
+    assert error_classes([tree]) == {"LinkposeError", "Own", "Further"}
+    (call,) = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and is_of_base(node)]
+    assert [text_of(argument) for argument in call.args] == ["… is of its own"]
+    assert len({where.split(":")[0] for _, where in sentences()}) > 50

@@ -79,7 +79,7 @@ def fast_remarks(change: Callable[[dict[str, np.ndarray]], object]) -> str:
     change(table)
     time_s, *values = table.values()
     accel, gyro = np.split(np.stack(values, axis=1), 2, axis=1)
-    return "\n".join(suspicions(Path("r.csv"), Measurements.from_imu(time_s, accel, gyro)))
+    return "\n".join(suspicions(Measurements.from_imu(time_s, accel, gyro)))
 
 
 def exchange(one: str, other: str) -> Callable[[dict[str, np.ndarray]], None]:
@@ -107,6 +107,10 @@ FAST = [
     (exchange("gyro_y_rad_s", "gyro_z_rad_s"), "do not have the same axes (gyro x, y, z fit as x, z, y)"),
     (scale(-1.0, "gyro_z"), "do not have the same axes (gyro x, y, z fit as x, y, -z)"),
     (scale(-1.0, "accel_z"), "do not have the same axes (accel x, y, z fit as x, y, -z)"),
+    (scale(2.0, "accel_x"), "accel_x is 2 times what the motion in the other columns shows"),
+    (scale(0.5, "accel_y"), "accel_y is 0.5 times what the motion in the other columns shows"),
+    (scale(2.0, "gyro_x"), "gyro_x is 2 times what the motion in the other columns shows"),
+    (scale(0.5, "gyro_y"), "multiply it by 2"),
 ]
 
 
@@ -116,6 +120,7 @@ FAST = [
     ids=[
         "right", "°/s", "°/s slowly", "rad/s twice", "twice", "half", "backwards", "one axis", "time x 10",
         "milliseconds", "accel exchanged", "gyro exchanged", "one axis of the gyro", "one axis backwards",
+        "one axis twice", "one axis half", "one axis of the gyro twice", "one axis of the gyro half",
     ],
 )  # fmt: skip
 def test_a_fast_swing_shows_whether_gyro_and_accelerometer_agree(change, sentence: str | None) -> None:

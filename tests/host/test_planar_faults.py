@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 
 import numpy as np
@@ -101,7 +102,133 @@ def test_counters_that_run_over_without_a_flag_widen_the_position():
     assert filter_.gyro_jumps.times == 0
 
 
+def in_reports(mice_counts: np.ndarray, samples: float, mice: tuple[int, ...]) -> np.ndarray:
+    """Counts that a mouse gives only every so many samples."""
+    out = mice_counts.copy()
+    number = np.floor(np.arange(len(out)) / samples)
+    last = np.append(np.diff(number) > 0, True)
+    for i in mice:
+        total = np.cumsum(out[:, i], axis=0)
+        out[:, i] = 0.0
+        out[last, i] = np.diff(total[last], axis=0, prepend=0.0)
+    return out
+
+
+@pytest.mark.parametrize("mice", [(1,), (0, 1, 2)])
+def test_mice_that_report_at_40_hz_are_used(mice):
+    """Before, all samples between two reports passed for lifts, and the path was 400 times as wrong."""
+    run = robot(5)
+    filter_, out, ratio = estimated(run, rig(), measurements(run, in_reports(counts(run), 2.5, mice), gyro(run)))
+    assert ratio < 1.5 and min(share_within(run, out)) > 0.95 and filter_.distrusted == 0
+    assert any("report rate" in remark for remark in filter_.mice_remarks)
+
+
+def limited(run: Robot, limit_m_s: float) -> np.ndarray:
+    """The share that mice see that count no speed above the limit."""
+    speed = [np.hypot(run.speed - run.turn_rate * y, run.turn_rate * x) for x, y in TRIANGLE]
+    return np.minimum(1.0, limit_m_s / np.maximum(np.array(speed).T, 1e-9))
+
+
+def test_a_speed_limit_of_all_mice_shows_in_bends_and_widens_the_position():
+    fast = tuple((seconds, 1.6 * speed, turn) for seconds, speed, turn in LEGS)
+    run = robot(6, fast)
+    filter_, out, ratio = estimated(run, rig(), measurements(run, counts(run, seen=limited(run, 0.35)), gyro(run)))
+    assert ratio < 1.4
+    assert any("no speed above 0.3" in remark for remark in filter_.mice_remarks)
+    off = np.hypot(*(out[:, :2] - run.pose[:, :2]).T)
+    late = run.time_s > 20.0
+    assert off[-1] > 0.5 and np.mean(off[late] < 2.0 * np.hypot(out[late, 6], out[late, 7])) > 0.9
+    assert math.degrees(heading_errors(run, out).max()) < 1.0
+    assert not PlanarEkf(rig()).mice_remarks
+
+
+def test_another_resolution_of_all_mice_is_found_in_two_turns():
+    run = robot(7)
+    whole = counts(run)
+    total = np.floor(0.5 * np.cumsum(whole[run.time_s >= 12.0], axis=0))
+    whole[run.time_s >= 12.0] = np.diff(total, axis=0, prepend=0.0)
+    filter_, out, ratio = estimated(run, rig(), measurements(run, whole, gyro(run)))
+    assert ratio < 0.9 and any("0.50 times as much" in remark for remark in filter_.mice_remarks)
+    factor, std = filter_.scale_change
+    assert abs(factor - 0.5) < 3 * std < 0.06
+    assert min(share_within(run, out, 2.5)) > 0.9
+
+
+def test_mice_that_snap_to_their_axes_do_not_spoil_the_path():
+    run, narrow = robot(8), ((0.12, 0.0), (-0.08, 0.11), (-0.08, -0.11))
+    snapped = counts(run, narrow)
+    snapped[np.abs(snapped[:, :, 1]) < 0.12 * np.abs(snapped[:, :, 0]), 1] = 0.0
+    filter_, out, ratio = estimated(run, rig(narrow), measurements(run, snapped, gyro(run)))
+    assert ratio < 1.5 and min(share_within(run, out)) > 0.95
+    assert any("angle snapping" in remark for remark in filter_.mice_remarks)
+    assert filter_.gyro_jumps.times == 0
+
+
+def test_mice_that_sleep_at_each_start_widen_the_position():
+    run = robot(9)
+    asleep = counts(run)
+    resting = np.convolve(np.abs(asleep).sum(axis=(1, 2)) > 0, np.ones(60))[: len(asleep)] == 0
+    for start in np.flatnonzero(np.diff(resting.astype(int)) == -1):
+        asleep[start : start + 40] = 0.0
+    _, out, _ = estimated(run, rig(), measurements(run, asleep, gyro(run)))
+    assert share_within(run, out)[0] > 0.95 and np.hypot(*out[-1, 6:8]) < 0.6
+
+
+def test_slips_in_some_turns_widen_the_position():
+    run = robot(10)
+    filter_, out, _ = estimated(
+        run, rig(), measurements(run, counts(run, seen=slips(0.85, 15.0, 22.0)(run)), gyro(run))
+    )
+    assert share_within(run, out)[0] > 0.8 and np.hypot(*out[-1, 6:8]) < 1.0
+    assert any("they slip" in remark for remark in filter_.mice_remarks)
+
+
+def test_one_count_in_a_second_does_not_end_a_rest():
+    run = robot(11, ((6.0, 0.0, 0.0), *LEGS))
+    creeping = counts(run)
+    creeping[50::100, 1, 0] += np.all(creeping[50::100] == 0, axis=(1, 2))
+    _, out, _ = estimated(run, rig(), measurements(run, creeping, gyro(run)))
+    sound = estimated(run, rig(), measurements(run, counts(run), gyro(run)))[1]
+    assert heading_errors(run, out).max() < 1.5 * heading_errors(run, sound).max()
+
+
+def test_a_rest_that_begins_with_a_slow_turn_keeps_the_bias():
+    """A robot settles by less than a count: the gyro's rate is no bias yet. Before, the bias moved by 0.3 °/s."""
+    run = robot(12)
+    settling = np.zeros(len(run.time_s))
+    stop = 15.0
+    settling[run.time_s >= stop] = 0.6 * DEG * np.exp(-(run.time_s[run.time_s >= stop] - stop) / 0.1)
+    filter_ = PlanarEkf(rig())
+    block = measurements(run, counts(run), gyro(run) + settling)
+    filter_.process(block[run.time_s < stop + 1.2])
+    assert math.degrees(filter_.gyro_bias_rad_s) == pytest.approx(0.4, abs=0.02)
+
+
 # ---- what is reported ----
+
+
+def dead_axis(c: np.ndarray) -> np.ndarray:
+    return c * [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda c: -c, "turned by -?180°"),
+        (lambda c: c[:, ::-1], "exchanged"),
+        (lambda c: c * [-1.0, 1.0], "exchanged, or one of them is reversed"),
+        (dead_axis, "one of its axes counted nothing"),
+        (lambda c: 2.0 * c, r"counted (1.99|2.00) times as much"),
+        (lambda c: 0.0 * c, "counted nothing while the others moved"),
+    ],
+)
+def test_the_cause_of_an_exclusion_is_named(change, cause):
+    run = robot(4)
+    wrong = counts(run)
+    wrong[:, 1] = change(wrong[:, 1])
+    filter_, _, ratio = estimated(run, rig(), measurements(run, wrong, gyro(run)))
+    assert ratio < 0.3 and filter_.distrusted & 2
+    assert re.search(cause, filter_.mouse_causes[2])
 
 
 def test_estimate_reports_the_gyro_s_jump_and_the_mouse_that_is_left_out(linkpose, tmp_path):

@@ -16,7 +16,7 @@ from linkpose.evaluation.scores import evaluate
 from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import lines
-from linkpose.plotting.canvas import COLOURS, legend_above
+from linkpose.plotting.canvas import COLOURS, label_time, legend_above
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -102,9 +102,41 @@ def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
     labels = [axes.get_ylabel() for axes in figure.axes]
     # The best filter's ±2σ has a panel of its own, where the others differ so much that it would look like a line.
-    assert labels == ["height over the joint\n(m)", "from best (cm)", "from best (cm)", "roll (°)"]
-    assert drawn(figure.axes[1]) == ["joint-inertial (best)", "±2σ joint-inertial"]
+    assert labels == ["height over the joint\n(m)", "±2σ (cm)", "from best (cm)", "roll (°)"]
+    assert drawn(figure.axes[1]) == ["joint-inertial", "±2σ joint-inertial"]
     assert drawn(figure.axes[2])[:2] == ["joint-inertial (best)", "joint 0.639 cm rms from it"]
+
+
+def test_a_single_filter_without_a_truth_shows_its_deviation(tmp_path):
+    t = np.arange(300) / 100
+    path = write(tmp_path / "e.csv", {"time_s": t, "joint_height_m": np.sin(t), "joint_height_std_m": 0.01 + 0 * t})
+    figure, _ = plotting.plot_tables([read_table(Path(path))])
+    assert [axes.get_ylabel() for axes in figure.axes] == ["height over the joint\n(m)", "±2σ (cm)"]
+    assert drawn(figure.axes[1]) == ["joint", "±2σ joint"]
+
+
+def test_the_truth_is_in_view_where_no_filter_has_a_value(tmp_path):
+    estimate, truth = link_files(tmp_path)
+    for name, values in estimate.columns.items():
+        if name != "time_s":
+            values[np.abs(truth.columns["height_m"] - 1.5) > 0.05] = np.nan
+    axes = plotting.plot_tables([estimate, truth])[0].axes[0]
+    assert axes.get_ylim()[0] < truth.columns["height_m"].min() and axes.get_ylim()[1] > 1.6 - 1e-3
+
+
+@pytest.mark.parametrize(
+    ("length_s", "unit", "last"), [(65.0, "s", "60"), (3600.0, "min", "60"), (86400.0, "h", "20"), (700.0, "min", "10")]
+)
+def test_the_time_of_long_runs_is_in_minutes_or_hours(length_s, unit, last):
+    figure = plotting.new_figure(10.0, 3.0)
+    axes = figure.add_subplot()
+    axes.plot([0.0, length_s], [0.0, 1.0])
+    axes.margins(x=0.0)
+    label_time(axes)
+    figure.draw_without_rendering()
+    assert axes.get_xlabel() == f"time ({unit})"
+    shown = [label.get_text() for label in axes.get_xticklabels() if 0 <= label.get_position()[0] <= length_s]
+    assert shown[0] == "0" and shown[-1] == last
 
 
 def test_gaps_and_unknown_values_are_shaded(tmp_path):
@@ -344,3 +376,13 @@ def test_an_evaluation_draws_what_matters_first(tmp_path):
     assert [axes.get_ylabel() for axes in figure.axes] == ["rotation error (°)", ""]
     cells = [cell.get_text().get_text() for cell in figure.axes[-1].tables[0].get_celld().values()]
     assert {"tilt", "chain"} <= set(cells)
+
+
+@pytest.mark.parametrize("name", ["a$\\frac$", "escape\x1b[31m", "no UTF-8 \udcff", "$(x)`"])
+def test_any_name_of_a_file_or_a_column_is_drawn_as_it_is(tmp_path, name):
+    path = tmp_path / f"{name}.csv"
+    path.write_text("time_s,$\\frac$_height_m\n0,1\n1,2\n2,3\n")
+    figure, _ = plotting.plot_tables([read_table(path)])
+    for ending in ("png", "svg"):
+        plotting.save(figure, tmp_path / f"picture.{ending}", force=False)
+    assert "$\\frac$" in drawn(figure.axes[0])

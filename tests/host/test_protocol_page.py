@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page_board import SCHEMA_CRC, Serving
+from page_board import SCHEMA_CRC, PageBoard
+from pty_board import PtyBoard
 
 import linkpose as lp
 from linkpose.device.session import Session
@@ -25,7 +26,7 @@ def test_the_page_states_the_schema_of_the_board() -> None:
 
 def test_a_board_written_from_the_page_is_recorded_and_estimated(tmp_path: Path, linkpose: Callable) -> None:
     port, out = tmp_path / "port", tmp_path / "r.csv"
-    with Serving(port):
+    with PtyBoard(port, make=PageBoard):
         done = linkpose("record", out, "--port", port, "--duration", "1.2", "--rate", "200", "--accel-range", "4")
         assert done.status == 0 and "0 lost, 0 corrupt" in done.err, done
         with Session(str(port), print) as session, pytest.raises(LinkposeError, match="refused CONFIGURE: dlpf"):

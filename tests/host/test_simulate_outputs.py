@@ -74,8 +74,11 @@ def test_the_proposed_file_of_estimates_is_new(linkpose, tmp_path, monkeypatch):
 def test_a_recording_named_as_the_proposed_file_keeps_its_name(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("estimate.csv").touch()
-    options.show_next(False, "estimate", "estimate.csv", "-o", options.new_estimates())
+    options.show_next(False, *options.estimate_command(Path("estimate.csv")))
     assert capsys.readouterr().err == "next: linkpose estimate estimate.csv -o estimate-2.csv\n"
+    Path("estimate.png").touch()
+    options.show_next(False, *options.plot_command(Path("estimate.csv")))
+    assert capsys.readouterr().err == "next: linkpose plot estimate.csv -o estimate-2.png\n"
 
 
 def test_the_truth_of_a_link_has_its_yaw_and_position(linkpose, tmp_path):

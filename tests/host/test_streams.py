@@ -9,7 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import child
 import pytest
+from hostile import check, valid_files, words
 
 from linkpose.recording.table import read_table
 
@@ -63,7 +65,8 @@ def test_a_picture_that_cannot_be_written_is_one_sentence(tmp_path: Path, shell:
     (tmp_path / "e.csv").write_text("time_s,tilt_height_m\n0,1\n1,2\n")
     done = run(tmp_path, "plot", "e.csv", "-o", "-", shell=shell)
     assert done.returncode == 1
-    assert re.match("linkpose: cannot write (to )?the standard output", done.stderr.splitlines()[-1])
+    reason = "the standard output: No space left" if "full" in shell else "the output: stdout is closed"
+    assert done.stderr.splitlines()[-1].startswith(f"linkpose: cannot write {reason}")
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="Windows has no SIGHUP")
@@ -89,3 +92,74 @@ def test_sighup_ends_a_recording_with_its_closing_line_unless_it_is_ignored(tmp_
     assert process.wait(timeout=60) == 0
     closing = read_table(path, "recording").closing
     assert closing is not None and closing["ended"] == "interrupted"
+
+
+# ---- every command, with each fault of a standard stream and each signal ----
+
+SIM = "sim://link?speed=0"
+# A command, and where its results go: "out" is the standard output, also beside files.
+COMMANDS = {
+    "estimate --help": "out",
+    "ports": "out",
+    f"info --port {SIM} --json": "out",
+    "info {recording}": "out",
+    f"record out.csv --port {SIM} --duration 0.2 --force": "file",
+    f"record - --port {SIM} --duration 0.2": "out",
+    "estimate {recording} --filter tilt": "out",
+    "estimate {recording} --filter tilt -o out.csv --force": "file",
+    f"estimate --live --port {SIM} --duration 0.2 --filter tilt --json": "out",
+    "convert {estimate} -o out.tum --force": "out",
+    "evaluate {estimate} {truth}": "out",
+    "plot {estimate} -o -": "out",
+    "localize {events} --beacons {beacons} -o out.csv --force": "out",
+    "calibrate imu {rests} --rig out.toml": "out",
+    "calibrate joint {swing} --rig out.toml --json": "out",
+    "simulate link --duration 2 -o out.csv --truth truth.csv --force": "file",
+    "simulate chain --duration 2 -o out.csv --truth truth.csv --force": "file",
+    "reproduce mice --seeds 1 --json": "out",
+}
+FAULTS = ("closed", "full", "gone")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    found = valid_files(tmp_path_factory.mktemp("valid"))
+    folder = found["recording"].parent
+    for name, kind in (("rests", ["--rests", "--duration", 24]), ("swing", ["--test", 2, "--duration", 20])):
+        found[name] = folder / f"{name}.csv"
+        made = child.run(folder, ["simulate", "link", *kind, "-o", found[name], "--truth", f"{name}-truth.csv"])
+        assert made.status == 0, made
+    return found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_with_faulty_standard_streams(tmp_path: Path, files: dict[str, Path], command: str) -> None:
+    """Each fault of stdout is at every third command; stderr and stdin never change what a command does."""
+    typed = words(command, files, tmp_path)
+    fault = FAULTS[list(COMMANDS).index(command) % len(FAULTS)]
+    without_messages = child.run(tmp_path, typed, {0: "closed", 2: fault})
+    assert without_messages.status == 0
+    assert bool(without_messages.out) == (COMMANDS[command] == "out")
+    without_results = child.run(tmp_path, typed, {1: fault})
+    check(without_results.status, without_results.err)
+    if COMMANDS[command] == "file":
+        assert without_results.status == 0
+    else:
+        assert without_results.status == 1
+        assert re.search("cannot write|has gone", without_results.err.splitlines()[-1])
+
+
+# Where a signal arrives: at the first file that is read, and at the first that is written.
+PLACES = ("linkpose.inputs._File", "linkpose.outputs._target")
+ENDS = {signal.SIGINT: {130}, signal.SIGTERM: {-signal.SIGTERM, 0, 130}, signal.SIGHUP: {-signal.SIGHUP, 0, 130}}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_signal_ends_every_command_without_a_traceback(tmp_path: Path, files: dict[str, Path], command: str) -> None:
+    typed = words(command, files, tmp_path)
+    at = list(COMMANDS).index(command)
+    number = list(ENDS)[at % len(ENDS)]
+    done = child.run(tmp_path, typed, signalled=(PLACES[at % 2], number))
+    assert done.status in ENDS[number] | {0}, done
+    assert "Traceback" not in done.err and "report it" not in done.err
+    assert not list(tmp_path.glob(".out*")), "a temporary file is left"

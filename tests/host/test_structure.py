@@ -16,8 +16,8 @@ PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 LEVELS = [
     {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
-    {"inputs"},
-    {"wire", "presentation", "extremes"},
+    {"inputs", "outputs"},
+    {"wire", "presentation", "extremes", "exclusions"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},
     {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,8 +23,9 @@ from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator, LiveEstimator
 from linkpose.extremes import Extremes
-from linkpose.presentation import aligned_length, angle_with_std, length_with_std, same_digits
+from linkpose.presentation import Row, aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
+from linkpose.sensors.measurements import Floats
 from linkpose.simulation.link import LinkRun
 
 OK = {"imu": {"state": "ok"}, "baro": {"state": "ok"}}
@@ -34,22 +35,33 @@ def health(**sensors: dict[str, Any]) -> Any:
     return SimpleNamespace(rate_hz=100.0, lost=0, sensors=OK | sensors)
 
 
-def link_screen(rows: int = 500) -> Screen:
-    screen = Screen("sim://link  J2S 1.653 m", ["joint-inertial", "joint", "tilt"])
-    for at in range(rows):
-        height = 1.5 + 0.15 * math.sin(0.045 * at)
-        screen.add(
-            0.05 * at,
-            {
-                name: {
-                    quantities.HEIGHT: (height + off, std),
-                    quantities.ROLL: (22.0, 0.1),
-                    quantities.PITCH: (13.1, 0.1),
-                }
-                for name, off, std in (("joint-inertial", 0.0, 4e-4), ("joint", 6e-4, 8e-3), ("tilt", -0.02, 0.02))
-            },
-        )
+def table(interval_s: float, rows: Sequence[Row]) -> tuple[list[str], Floats]:
+    """Columns and values (N, columns) of rows of one shape, as a filter's estimates have them."""
+    columns, values = ["time_s"], [interval_s * np.arange(len(rows))]
+    for name, of in rows[0].items():
+        for quantity in of:
+            for at, column in enumerate((quantity.column, quantity.std_column)):
+                columns.append(f"{name.replace('-', '_')}_{column}")
+                values.append(np.array([row[name][quantity][at] for row in rows]))
+    return columns, np.column_stack(values)
+
+
+def screen_of(title: str, interval_s: float, rows: Sequence[Row]) -> Screen:
+    columns, values = table(interval_s, rows)
+    screen = Screen(title, columns)
+    screen.add(values)
     return screen
+
+
+def link_rows(rows: int = 500) -> list[Row]:
+    filters = (("joint-inertial", 0.0, 4e-4), ("joint", 6e-4, 8e-3), ("tilt", -0.02, 0.02))
+    attitude = {quantities.ROLL: (22.0, 0.1), quantities.PITCH: (13.1, 0.1)}
+    heights = [1.5 + 0.15 * math.sin(0.045 * at) for at in range(rows)]
+    return [{n: {quantities.HEIGHT: (h + off, std), **attitude} for n, off, std in filters} for h in heights]
+
+
+def link_screen() -> Screen:
+    return screen_of("sim://link  J2S 1.653 m", 0.05, link_rows())
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (50, 24), (80, 12), (40, 8)])
@@ -64,13 +76,33 @@ def test_a_screen_fits_and_starts_with_the_best_filter(width: int, height: int) 
         )
 
 
+@pytest.mark.parametrize("sizes", [[1] * 100, [60, 40], [100]])
+def test_rows_may_arrive_in_blocks_of_any_size(sizes: list[int]) -> None:
+    """A filter that catches up brings all rows so far at once, a live board one at a time."""
+    pose = {quantities.X: (1.0, 0.01), quantities.Y: (0.0, 0.01), quantities.HEADING: (0.2, 0.01)}
+    heights = [1.5 + 0.002 * at for at in range(100)]
+    rows: list[Row] = [
+        {
+            "joint": {quantities.HEIGHT: (height, 0.01)},
+            "mice": {**pose, quantities.X: (height, 0.01), quantities.EXCLUDED: (4.0 * (at > 12), math.nan)},
+        }
+        for at, height in enumerate(heights)
+    ]
+    columns, values = table(0.01, rows)
+    screen, ends = Screen("sim://mice", columns), np.cumsum(sizes)
+    for size, end in zip(sizes, ends.tolist(), strict=True):
+        screen.add(values[end - size : end])
+    shown = screen.render(health(), 80, 40).plain
+    assert shown == screen_of("sim://mice", 0.01, rows).render(health(), 80, 40).plain
+    assert "mouse 3 LEFT OUT since 0.1 s" in shown and "1.70┤" in shown
+
+
 @pytest.mark.parametrize("width", [80, 50, 30])
 def test_faults_and_exclusions_are_never_cut(width: int) -> None:
-    screen = Screen("sim://mice", ["planar-ekf", "mice"])
     pose = {quantities.X: (1.0, 0.001), quantities.Y: (0.0, 0.001), quantities.HEADING: (0.2, 0.01)}
-    for at in range(100):
-        mask = 2.0 if at >= 51 else 0.0
-        screen.add(0.1 * at, {"planar-ekf": pose, "mice": {**pose, quantities.EXCLUDED: (mask, math.nan)}})
+    masks = [2.0 if 20 <= at < 30 or at >= 51 else 0.0 for at in range(100)]
+    rows = [{"planar-ekf": pose, "mice": {**pose, quantities.EXCLUDED: (mask, math.nan)}} for mask in masks]
+    screen = screen_of("sim://mice", 0.1, rows)
     shown = screen.render(health(imu={"state": "silent"}), width, 6).plain
     assert "IMU SILENT" in shown
     assert "mouse 2 LEFT OUT since 5.1 s" in shown
@@ -80,8 +112,7 @@ def test_faults_and_exclusions_are_never_cut(width: int) -> None:
 
 
 def test_an_unknown_height_is_said_to_be_unknown() -> None:
-    screen = Screen("sim://link", ["joint-inertial"])
-    screen.add(0.0, {"joint-inertial": {quantities.HEIGHT: (math.nan, math.nan)}})
+    screen = screen_of("sim://link", 0.1, [{"joint-inertial": {quantities.HEIGHT: (math.nan, math.nan)}}])
     assert "not known" in screen.render(health(), 80, 24).plain
 
 
@@ -253,17 +284,15 @@ def test_a_narrow_screen_drops_the_slow_columns_first() -> None:
 
 def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> None:
     """A barometer starts at once, a better filter later: its curve does not begin with the barometer's noise."""
-    screen = Screen("sim://link", ["joint", "baro"])
-    for at in range(100):
-        joint = 1.5 + 0.001 * at if at >= 50 else math.nan
-        screen.add(0.05 * at, {"joint": {quantities.HEIGHT: (joint, 0.01)}, "baro": {quantities.HEIGHT: (9.0, 0.3)}})
+    heights = [1.5 + 0.001 * at if at >= 50 else math.nan for at in range(100)]
+    rows = [{"joint": {quantities.HEIGHT: (h, 0.01)}, "baro": {quantities.HEIGHT: (9.0, 0.3)}} for h in heights]
+    screen = screen_of("sim://link", 0.05, rows)
     curve_lines = [line for line in screen.render(health(), 80, 24).plain.splitlines() if "┤" in line]
     assert [float(line.split("┤")[0]) for line in (curve_lines[0], curve_lines[-1])] == pytest.approx(
         [1.6, 1.55], abs=0.01
     )
-    robot = Screen("sim://mice", ["tilt", "mice"])
     pose = {quantities.X: (1.0, 0.01), quantities.Y: (2.0, 0.01), quantities.HEADING: (0.1, 0.01)}
-    robot.add(0.0, {"tilt": {quantities.HEIGHT: (math.nan, math.nan)}, "mice": pose})
+    robot = screen_of("sim://mice", 0.1, [{"tilt": {quantities.HEIGHT: (math.nan, math.nan)}, "mice": pose}])
     shown = robot.render(health(), 80, 24).plain
     assert "HEIGHT" not in shown and "x 1.000 m ±1.0 cm   y 2.000 m ±1.0 cm   heading +5.7° ±0.6°" in shown
     assert all(len(line) <= 40 for line in robot.render(health(), 40, 24).plain.splitlines())
@@ -273,17 +302,34 @@ def test_a_curve_is_of_one_filter_and_a_robot_has_no_height_without_j2s() -> Non
 def test_the_final_table_fits() -> None:
     height = quantities.HEIGHT
     summary = {("joint-inertial", height): (1.2, 1.65, 0.001), ("baro", height): (0.9, 2.0, 0.3)}
-    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [40, 50]
+    assert [max(map(len, final_table(summary, width))) for width in (40, 80)] == [36, 46]
     assert final_table({}, 80) == []
+    robot = {("planar-ekf", quantities.X): (-1e-6, 1.0, 1e-4), ("planar-ekf", quantities.HEADING): (-3.0, 1.0, 1e-3)}
+    lines = final_table(robot, 40)
+    assert max(map(len, lines)) <= 40 and lines[1].split()[2] == "0.0000"
 
 
-def test_the_final_table_lists_joint_angles_and_places() -> None:
-    columns = ["time_s", "chain_angle_deg", "chain_angle_std_deg", "mice_x_m", "mice_y_m", "mice_heading_rad"]
-    extremes = Extremes([*columns, "tilt_x_m"])
-    extremes.add(np.array([[0.0, -0.04, 1.0, 1.0, 2.0, 0.0, 5.0], [1.0, 30.0, 1.0, 3.0, 4.0, 0.0, 6.0]]))
+def test_the_final_table_lists_joint_angles_and_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("linkpose.extremes.ROWS", 1)  # rows that are looked at together
+    columns = ["time_s", "chain_angle_deg", "chain_angle_std_deg", "mice_x_m", "mice_y_m"]
+    extremes = Extremes([*columns, "mice_heading_rad", "mice_heading_std_rad", "tilt_x_m"])
+    std = math.radians(0.5)
+    for heading in ([0.0, 3.0], [math.nan, -2.0], [1.0]):  # a full turn, and a rad more
+        extremes.add(np.array([[0.0, -0.04, 1.0, 1.0, 2.0, rad, std, 5.0] for rad in heading]))
+    extremes.add(np.array([[1.0, 30.0, 1.0, 3.0, 4.0, math.nan, math.nan, 6.0]]))
     lines = [line.split() for line in final_table(extremes.summary(), 80)]
     assert lines[1] == ["chain", "angle", "0.0°", "+30.0°", "1.0°"]
-    assert [line[:2] for line in lines[2:]] == [["mice", "x"], ["mice", "y"]]
+    assert [line[:2] for line in lines[2:]] == [["mice", name] for name in ("x", "y", "heading")]
+    assert lines[2][-1] == "–" and lines[4][2:] == ["0.0°", f"+{math.degrees(1 + 2 * math.pi):.1f}°", "0.5°"]
+
+
+def test_the_final_table_has_the_median_deviation() -> None:
+    """A filter begins with a large σ; its root mean square would be that of the first second."""
+    extremes = Extremes(["time_s", "tilt_height_m", "tilt_height_std_m", "mice_heading_rad", "mice_heading_std_rad"])
+    extremes.add(np.array([[0.0, 1.0, 0.5, 0.0, 0.5]] * 20 + [[0.0, 1.0, 4e-4, 0.0, 1e-5]] * 80))
+    (_, _, height), (_, _, heading) = extremes.summary().values()
+    assert height == pytest.approx(4e-4, rel=0.03) and heading == pytest.approx(1e-5, rel=0.03)
+    assert [line.split()[-1] for line in final_table(extremes.summary(), 80)[1:]] == ["mm", "0.001°"]
 
 
 def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:
@@ -330,10 +376,9 @@ def test_the_next_filter_is_shown_with_its_own_curve() -> None:
 
 
 def test_a_chain_shows_its_joint_angle_with_its_deviation_and_curve() -> None:
-    screen = Screen("sim://chain", ["joint-inertial", "chain"])
-    for at in range(200):
-        values = {quantities.ANGLE: (30 * math.sin(0.1 * at), 0.4), quantities.HEIGHT1: (0.25, 0.01)}
-        screen.add(0.1 * at, {"joint-inertial": {quantities.HEIGHT: (0.2, 0.001)}, "chain": values})
+    link = {quantities.HEIGHT: (0.2, 0.001)}
+    angles = [{quantities.ANGLE: (30 * math.sin(0.1 * at), 0.4), quantities.HEIGHT1: (0.25, 0.01)} for at in range(200)]
+    screen = screen_of("sim://chain", 0.1, [{"joint-inertial": link, "chain": values} for values in angles])
     shown = screen.render(health(), 80, 24).plain
     assert "joint angle +26.0° ±0.4°   height 1 0.250 m ±1.0 cm" in shown and "HEIGHT over joint" in shown
     assert shown.splitlines()[2].strip().startswith("30┤")
@@ -341,9 +386,8 @@ def test_a_chain_shows_its_joint_angle_with_its_deviation_and_curve() -> None:
 
 
 def test_a_ball_joint_shows_its_three_angles() -> None:
-    screen = Screen("sim://chain", ["chain"])
     angles = zip(quantities.BALL_ANGLES, ((42.0, 0.9), (-3.0, 0.8), (math.nan, math.nan)), strict=True)
-    screen.add(0.0, {"chain": dict(angles) | {quantities.HEIGHT1: (0.2, 0.001)}})
+    screen = screen_of("sim://chain", 0.1, [{"chain": dict(angles) | {quantities.HEIGHT1: (0.2, 0.001)}}])
     line = "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°   axial rotation not known"
     assert line in screen.render(health(), 80, 24).plain.splitlines()
     assert "flexion +42.0° ±0.9°   abduction −3.0° ±0.8°" in screen.render(health(), 60, 24).plain.splitlines()

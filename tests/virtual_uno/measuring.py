@@ -15,6 +15,7 @@ MICE: list[dict[str, Any]] = [{"clockHz": clock_hz} for clock_hz in CLOCKS_HZ]  
 MOUSE_VALID = (SampleFlags.MOUSE1_VALID, SampleFlags.MOUSE2_VALID, SampleFlags.MOUSE3_VALID, SampleFlags.MOUSE4_VALID)
 DEFAULTS = Configure(100, 8, 1000, 3, 1, 8, 400)
 UP_MS = 1500.0  # from power-on until usual mice stream
+PATIENCE_S = 600.0  # a bound for a command that hangs, on a loaded machine, never a wait
 
 
 def path(seconds: float, seed: int, top_speed_mm_s: float = 1000.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

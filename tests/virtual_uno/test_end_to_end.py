@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from measuring import MICE
+from measuring import MICE, PATIENCE_S
 from pty_server import PtyServer
 from rig_signals import RigFeed
 from wire_link import WireLink
@@ -31,7 +31,7 @@ J2S = ["--j2s", ",".join(map(str, PAPER_J2S_M))]
 
 def linkpose(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "linkpose", *map(str, arguments)]
-    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=90)
+    return subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, t
         while not (path.exists() and path.read_bytes().count(b"\n") > 100):
             assert process.poll() is None
         served.call(served.uno.reset)
-        output = process.communicate(timeout=30)[1]
+        output = process.communicate(timeout=PATIENCE_S)[1]
     assert process.returncode == 0
     assert "was reset (external)" in output
     table = read_table(path, "recording")

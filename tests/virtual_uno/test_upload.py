@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from bootloader import build_optiboot
+from measuring import PATIENCE_S
 from pty_server import PtyServer
 
 from linkpose.flashing.image import PREBUILT, read_image
@@ -34,7 +35,7 @@ def blank(tmp_path: Path) -> Iterator[VirtualUno]:
 def flash(port: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "linkpose", "flash", "--port", str(port), *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "PLATFORMIO_CORE_DIR": str(ROOT / ".piocore")}
-    return subprocess.run(command, env=environment | variables, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, env=environment | variables, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
 def test_the_prebuilt_firmware_is_built_from_these_sources(firmware_hex: Path) -> None:

@@ -1,16 +1,18 @@
 """Counts per metre and mounting angle of each mouse, from straight lines of known length and full turns.
 
-Written with complex numbers (x + jy in the robot's frame), mouse i at p_i turned by φ_i counts c_i over a drive. With
-g_i = e^{jφ_i} / (counts per metre), (6) and (7) integrated are linear in all that is unknown:
+With complex numbers (x + jy in the robot's frame), mouse i at p_i, turned by φ_i, counts c_i over a drive. With
+g_i = e^{jφ_i} / (counts per metre), (6) and (7) of [Mice], integrated over the drive, are linear in all unknowns:
 
     a line of length L that turned by δ    g_i c_i − jδ p_i = L
-    a turn of Θ about wherever             g_i c_i − D = jΘ p_i
+    a turn of Θ about any point            g_i c_i − D − jΘ δp_i − jδΘ p_i = jΘ p_i
 
-D, by how far the robot's centre went (in its own, turning axes), is found as well: the robot need not turn on the spot.
-So is L where nobody measured it: the scale then comes from the turn and from where two or more mice sit. The ahead of
-the robot's frame is by definition the way along which the line goes.
+D is the displacement of the robot's centre in its own, turning axes, so the robot need not turn on the spot. δp_i is
+the error of the mouse's position in the rig file, and δΘ the angle by which the turn does not close; both are known to
+be small. Without a measured length, L is an unknown too: the scale then follows from the turn and from the positions of
+two or more mice. The direction of the line defines "ahead".
 
-Source: the redundant-mice paper, (6), (7).
+Where both a length and a turn show the common scale, they must agree; what they differ by beyond their standard
+deviations is part of the stated ones.
 """
 
 from __future__ import annotations
@@ -34,10 +36,14 @@ TURN_TOLERANCE_RAD = math.radians(20)  # from a straight line, or from full turn
 GYRO_SCALE = 0.04  # of an uncalibrated gyro: 3 % (data sheet), and 1 % of cross-axis sensitivity
 MOST_TURNS = 12  # beyond which such a gyro miscounts
 FEWEST_COUNTS = 1000  # of a mouse over a line: so that a count is a tenth of a percent
-PLACE_STD_M = 0.001  # σ of a mouse's position measured with a ruler
-LINE_STD_M = 0.001  # to which a line is driven straight
+PLACE_STD_M = 0.001  # σ of a mouse's position measured with a ruler. Doubled: a scale without a length is half as sure
+# σ of a mouse's way over a line, and over a full turn (m): scatter of the surface, and how straight a line is driven.
+# Doubled: so are the stated deviations of scale and angle.
+WAY_STD_M = 0.001
+CLOSING_STD_RAD = math.radians(1.0)  # σ of the heading at which a turn ends, set by eye against a mark
 GYRO_STD_RAD = 0.01  # of a line's small turn, by the gyro
-WORST_MISFIT = 8.0  # of these standard deviations
+WORST_MISFIT = 8.0  # largest residual over its standard deviation. Doubled: a wrong place of 2 cm passes
+WORST_SCALE_Z = 4.0  # difference of the scales of line and turn over its σ. Doubled: a slip of 4 % passes
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +55,10 @@ class MouseCalibration:
     counts_per_m_std: float
     angle_deg: float
     angle_std_deg: float
-    residual_mm: float  # rms over all drives
+    x_m: float  # position as the turns show it, relative to the mean of all mice, which the rig file states
+    y_m: float
+    position_std_m: float
+    residual_mm: float  # rms over all drives, with the mouse where the rig file places it
 
     def as_dict(self) -> dict[str, int | float]:
         """The object that `calibrate mice --json` prints."""
@@ -58,7 +67,7 @@ class MouseCalibration:
 
 @dataclass(frozen=True, slots=True)
 class _DriveSums:
-    """What a recording adds up to."""
+    """Sums over one recording."""
 
     name: str
     counts: NDArray[np.complex128]  # (M,) of each mouse
@@ -70,7 +79,8 @@ def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | 
     """Calibration of each mouse that the rig places. `length_m` is the length of every line; None if unknown.
 
     Raises LinkposeError naming the drive and the cure for a rig without mice, a motion that is missing or is neither a
-    line nor full turns, a recording that did not see it all, and mice that contradict their places.
+    line nor full turns, a recording that does not cover the whole motion, a mouse without counts, and mice that
+    contradict their positions or the length.
     """
     if not rig.mouse:
         raise LinkposeError(
@@ -83,16 +93,14 @@ def calibrate_mice(recordings: Sequence[Recording], rig: Rig, length_m: float | 
     if not any(drive.turns for drive in drives):
         raise LinkposeError("no recording is of a full turn; turn the robot once round and add its recording")
     places = np.array([complex(mouse.x_m, mouse.y_m) for mouse in rig.mouse])
-    design, target = _equations(drives, places, length_m)
-    if np.linalg.matrix_rank(design / np.linalg.norm(design, axis=0)) < design.shape[1]:
-        raise LinkposeError("these drives do not determine the scale; measure the length of the line and give it")
-    solution, covariance, residual = _least_squares(design, target)
-    _check_fit(residual, len(rig.mouse))
-    return [_described(i, solution, covariance, _own(residual, i, drives, len(places))) for i in range(len(places))]
+    fit = _solve(drives, places, length_m)
+    _check_fit(fit)
+    common_std = _scale_disagreement(drives, places, fit) if length_m is not None and len(places) > 1 else 0.0
+    return [_described(i, places, fit, drives, common_std) for i in range(len(places))]
 
 
 def with_calibration(rig: Rig, found: Sequence[MouseCalibration]) -> Rig:
-    """The rig with the mice as they were found."""
+    """The rig with the scales and angles as they were found."""
     mice = list(rig.mouse)
     for mouse in found:
         old: Mouse = mice[mouse.mouse - 1]
@@ -127,10 +135,24 @@ def _sums(recording: Recording, mice: int) -> _DriveSums:
             f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; drive it anew"
         )
     total = counts[first:last].sum(axis=0)
-    if not turns and (np.hypot(total[:, 0], total[:, 1]) < FEWEST_COUNTS).any():
-        fewest = float(np.hypot(total[:, 0], total[:, 1]).min())
-        raise LinkposeError(f"{name}: a mouse counts only {fewest:.0f}; drive a longer line, of a metre or more")
+    if not turns:
+        _check_line(name, counts[first:last], total)
     return _DriveSums(name, total[:, 0] + 1j * total[:, 1], turn, turns)
+
+
+def _check_line(name: str, counts: Floats, total: Floats) -> None:
+    """Every mouse must count over the whole line."""
+    size = np.hypot(total[:, 0], total[:, 1])
+    worst = int(np.argmin(size))
+    if size[worst] < 0.1 * size.max() or not counts[len(counts) // 2 :, worst].any():
+        raise LinkposeError(
+            f"{name}: mouse {worst + 1} counts {size[worst]:.0f} while another counts {size.max():.0f}; check that it "
+            "lies flat on the floor and that its plug sits, then drive it anew"
+        )
+    if size[worst] < FEWEST_COUNTS:
+        raise LinkposeError(
+            f"{name}: mouse {worst + 1} counts only {size[worst]:.0f}; drive a longer line, of a metre or more"
+        )
 
 
 def _check_whole(name: str, m: Measurements, counts: Floats, first: int, last: int) -> None:
@@ -163,85 +185,176 @@ def _turned(name: str, m: Measurements, first: int, last: int) -> float:
 # ---- least squares ----
 
 
-def _equations(
-    drives: Sequence[_DriveSums], places: NDArray[np.complex128], length_m: float | None
-) -> tuple[Floats, Floats]:
-    """Design matrix and right-hand side, each row over its standard deviation. The rows of a drive are 2 to a mouse.
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Least-squares solution for M mice: g_i (real, imaginary part), then δp_i (x, y), then what belongs to drives."""
 
-    Unknowns: real and imaginary part of each g_i; for each drive δ (a line) or the two parts of D (a turn); last the
-    lines' length where it is not given.
-    """
+    mice: int
+    design: Floats  # each row over its standard deviation
+    target: Floats
+    solution: Floats
+    covariance: Floats  # widened where the fit is worse than its standard deviations
+    owner: NDArray[np.int64]  # the mouse of each row, -1 for none
+
+    @property
+    def residual(self) -> Floats:
+        """Of each row, over its standard deviation."""
+        return np.asarray(self.target - self.design @ self.solution)
+
+
+class _Equations:
+    """Rows of the design matrix and of the right-hand side, each divided by its standard deviation."""
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+        self.rows: list[Floats] = []
+        self.target: list[float] = []
+        self.owner: list[int] = []
+
+    def add(self, owner: int, std: float, terms: Sequence[tuple[int, complex]], value: complex) -> None:
+        """A complex equation: `terms` are a column and the complex factor of the real number in it."""
+        for part in (np.real, np.imag):
+            self.add_real(owner, std, [(column, float(part(factor))) for column, factor in terms], float(part(value)))
+
+    def add_real(self, owner: int, std: float, terms: Sequence[tuple[int, float]], value: float) -> None:
+        """A real equation."""
+        row = np.zeros(self._width)
+        for column, factor in terms:
+            row[column] += factor
+        self.rows.append(row / std)
+        self.target.append(value / std)
+        self.owner.append(owner)
+
+
+def _solve(drives: Sequence[_DriveSums], places: NDArray[np.complex128], length_m: float | None) -> _Fit:
+    """The fit to all drives. Raises LinkposeError where they do not determine the scale."""
     mice = len(places)
-    width = 2 * mice + sum(2 if drive.turns else 1 for drive in drives) + (length_m is None)
-    rows, target = [], []
-    own = 2 * mice
+    width = 4 * mice + sum(3 if drive.turns else 1 for drive in drives) + (length_m is None)
+    equations, own = _Equations(width), 4 * mice
+    for i in range(mice):
+        at = 2 * mice + 2 * i
+        equations.add(i, PLACE_STD_M, ((at, 1.0), (at + 1, 1j)), 0.0)
     for drive in drives:
-        arm = 1j * places
-        for i in range(mice):
-            std = PLACE_STD_M * FULL_TURN * abs(drive.turns) if drive.turns else LINE_STD_M
-            c = drive.counts[i]
-            aim = FULL_TURN * drive.turns * arm[i] if drive.turns else complex(length_m or 0.0)
-            for part, of_g, of_arm, value in (
-                (0, (c.real, -c.imag), arm[i].real, aim.real),
-                (1, (c.imag, c.real), arm[i].imag, aim.imag),
-            ):
-                row = np.zeros(width)
-                row[2 * i : 2 * i + 2] = of_g
-                row[own + (part if drive.turns else 0)] = -1.0 if drive.turns else -of_arm
-                if length_m is None and not drive.turns and part == 0:
-                    row[-1] = -1.0
-                rows.append(row / std)
-                target.append(value / std)
-        if not drive.turns:
-            row = np.zeros(width)
-            row[own] = 1 / GYRO_STD_RAD
-            rows.append(row)
-            target.append(drive.turn_rad / GYRO_STD_RAD)
-        own += 2 if drive.turns else 1
-    return np.array(rows), np.array(target)
-
-
-def _least_squares(design: Floats, target: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solution, its covariance (widened where the fit is worse than it should be), and weighted residuals."""
+        if drive.turns:
+            _add_turn(equations, drive, places, own)
+        else:
+            _add_line(equations, drive, places, own, length_m)
+        own += 3 if drive.turns else 1
+    design, target = np.array(equations.rows), np.array(equations.target)
     scale = np.linalg.norm(design, axis=0)  # counts and radians side by side
     scaled = design / scale
-    solution = np.linalg.lstsq(scaled, target, rcond=None)[0]
-    residual = target - scaled @ solution
-    freedom = len(target) - design.shape[1]
-    worse = max(1.0, float(residual @ residual) / freedom) if freedom else 1.0
+    weak = _without_priors(scaled, mice, drives)
+    if np.linalg.matrix_rank(weak) < weak.shape[1]:
+        raise LinkposeError("these drives do not determine the scale; measure the length of the line and give it")
+    solution = np.linalg.lstsq(scaled, target, rcond=None)[0] / scale
+    residual = target - design @ solution
+    freedom = len(target) - width
+    worse = max(1.0, float(residual @ residual) / freedom) if freedom > 0 else 1.0
     covariance = np.linalg.inv(scaled.T @ scaled) * worse / np.outer(scale, scale)
-    return solution / scale, covariance, residual
+    return _Fit(mice, design, target, solution, covariance, np.array(equations.owner))
 
 
-def _own(residual: Floats, mouse: int, drives: Sequence[_DriveSums], mice: int) -> float:
-    """The rms (mm) of what a mouse's own equations leave."""
-    squares, at = [], 0
+def _add_turn(equations: _Equations, drive: _DriveSums, places: NDArray[np.complex128], own: int) -> None:
+    mice, turn = len(places), FULL_TURN * drive.turns
+    for i, (c, place) in enumerate(zip(drive.counts.tolist(), places.tolist(), strict=True)):
+        at = 2 * mice + 2 * i
+        equations.add(
+            i, WAY_STD_M * math.sqrt(abs(drive.turns)),
+            ((2 * i, c), (2 * i + 1, 1j * c), (own, -1.0), (own + 1, -1j), (own + 2, -1j * place), (at, -1j * turn),
+             (at + 1, turn)),
+            1j * turn * place,
+        )  # fmt: skip
+    equations.add_real(-1, CLOSING_STD_RAD, ((own + 2, 1.0),), 0.0)
+
+
+def _add_line(
+    equations: _Equations, drive: _DriveSums, places: NDArray[np.complex128], own: int, length_m: float | None
+) -> None:
+    for i, (c, place) in enumerate(zip(drive.counts.tolist(), places.tolist(), strict=True)):
+        terms = [(2 * i, c), (2 * i + 1, 1j * c), (own, -1j * place)]
+        if length_m is None:
+            terms.append((-1, -1.0))
+        equations.add(i, WAY_STD_M, terms, length_m or 0.0)
+    equations.add_real(-1, GYRO_STD_RAD, ((own, 1.0),), drive.turn_rad)
+
+
+def _without_priors(design: Floats, mice: int, drives: Sequence[_DriveSums]) -> Floats:
+    """The design with exact positions and closed turns: what is unknown there is unknown with small errors too."""
+    columns, own = list(range(2 * mice)), 4 * mice
     for drive in drives:
-        std = PLACE_STD_M * FULL_TURN * abs(drive.turns) if drive.turns else LINE_STD_M
-        squares += [(std * value) ** 2 for value in residual[at + 2 * mouse : at + 2 * mouse + 2].tolist()]
-        at += 2 * mice + (0 if drive.turns else 1)
-    return 1e3 * math.sqrt(sum(squares) / len(squares))
+        columns += [own, own + 1] if drive.turns else [own]
+        own += 3 if drive.turns else 1
+    columns += range(own, design.shape[1])
+    return np.asarray(design[2 * mice :, columns])
 
 
-def _check_fit(residual: Floats, mice: int) -> None:
-    worst = float(np.abs(residual).max())
-    if worst > WORST_MISFIT:
+def _check_fit(fit: _Fit) -> None:
+    residual = np.abs(fit.residual)
+    worst = int(np.argmax(residual))
+    if residual[worst] > WORST_MISFIT:
+        whose = f", mouse {fit.owner[worst] + 1} most of all" if fit.mice > 2 and fit.owner[worst] >= 0 else ""
         raise LinkposeError(
-            f"the {mice} mice contradict one another ({worst:.0f} standard deviations): check their x_m and y_m in the "
-            "rig file, the --length of the line, and that no mouse slipped"
+            f"the {fit.mice} mice contradict one another ({residual[worst]:.0f} standard deviations{whose}): check "
+            "their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died"
         )
 
 
-def _described(i: int, solution: Floats, covariance: Floats, residual_mm: float) -> MouseCalibration:
-    g = complex(solution[2 * i], solution[2 * i + 1])
+def _scale_disagreement(drives: Sequence[_DriveSums], places: NDArray[np.complex128], fit: _Fit) -> float:
+    """By how much the scales of line and turn differ beyond their σ, as a share. Raises LinkposeError for too much."""
+    by_turn = _solve(drives, places, None)
+    scale, scale_std = _mean_scale(fit)
+    turn_scale, turn_std = _mean_scale(by_turn)
+    off, std = turn_scale / scale - 1.0, math.hypot(scale_std, turn_std)
+    if abs(off) > WORST_SCALE_Z * std:
+        raise LinkposeError(
+            f"line and turn contradict each other: by the turn, the mice count {100 * abs(off):.1f} % "
+            f"{'fewer' if off > 0 else 'more'} per metre than by the line. Check --length and the x_m and y_m of the "
+            "mice, and drive both anew on a floor on which no mouse slips"
+        )
+    return math.sqrt(max(0.0, off * off - std * std))
+
+
+def _mean_scale(fit: _Fit) -> tuple[float, float]:
+    """Mean metres per count of all mice, and its standard deviation as a share."""
+    g = fit.solution[: 2 * fit.mice].reshape(-1, 2)
+    size = np.hypot(*g.T)
+    gradient = (g / size[:, None]).ravel() / fit.mice
+    mean = float(size.mean())
+    variance = float(gradient @ fit.covariance[: 2 * fit.mice, : 2 * fit.mice] @ gradient)
+    return mean, math.sqrt(variance) / mean
+
+
+def _residual_mm(i: int, fit: _Fit, drives: Sequence[_DriveSums]) -> float:
+    """The rms (mm) of a mouse's residuals over all drives, with the mouse at its place in the rig file."""
+    at_rig = fit.solution.copy()
+    at_rig[2 * fit.mice : 4 * fit.mice] = 0.0
+    off = fit.target - fit.design @ at_rig
+    squares: list[float] = []
+    first = 2 * fit.mice  # after the rows of the positions
+    for drive in drives:
+        std = WAY_STD_M * math.sqrt(max(1, abs(drive.turns)))
+        squares += [(std * value) ** 2 for value in off[first + 2 * i : first + 2 * i + 2].tolist()]
+        first += 2 * fit.mice + 1
+    return 1e3 * math.sqrt(sum(squares) / len(squares))
+
+
+def _described(
+    i: int, places: NDArray[np.complex128], fit: _Fit, drives: Sequence[_DriveSums], common_std: float
+) -> MouseCalibration:
+    """The result for one mouse; `common_std` is a further error of all scales, as a share."""
+    g = complex(*fit.solution[2 * i : 2 * i + 2])
     along = np.array([g.real, g.imag]) / abs(g)
     across = np.array([-along[1], along[0]])
-    part = covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+    part = fit.covariance[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+    at = 2 * fit.mice + 2 * i
     return MouseCalibration(
         mouse=i + 1,
         counts_per_m=1 / abs(g),
-        counts_per_m_std=math.sqrt(along @ part @ along) / abs(g) ** 2,
+        counts_per_m_std=math.hypot(math.sqrt(along @ part @ along) / abs(g), common_std) / abs(g),
         angle_deg=math.degrees(math.atan2(g.imag, g.real)),
         angle_std_deg=math.degrees(math.sqrt(across @ part @ across) / abs(g)),
-        residual_mm=residual_mm,
+        x_m=places[i].real + float(fit.solution[at]),
+        y_m=places[i].imag + float(fit.solution[at + 1]),
+        position_std_m=math.sqrt(0.5 * float(fit.covariance[at, at] + fit.covariance[at + 1, at + 1])),
+        residual_mm=_residual_mm(i, fit, drives),
     )

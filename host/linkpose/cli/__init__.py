@@ -102,8 +102,8 @@ def _run() -> int:
         click.echo(f"linkpose: {printable(sentence(error))}", err=True)
         return 2 if isinstance(error, WRONG_USAGE) else 1
     except Exception as error:
-        if isinstance(error, OSError) and error.filename is not None:
-            click.echo(f"linkpose: cannot use {printable(os.fsdecode(error.filename))}: {error.strerror}", err=True)
+        if obstacle := _of_the_system(error):
+            click.echo(f"linkpose: {printable(obstacle)}", err=True)
             return 1
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
@@ -113,3 +113,14 @@ def _run() -> int:
         )
         return 1
     return status if isinstance(status, int) else 0
+
+
+def _of_the_system(error: Exception) -> str:
+    """What the operating system lacks, for errors of which no part of the program knows more; empty for others."""
+    if isinstance(error, MemoryError):
+        return "the memory does not suffice; close other programs, or take a shorter file"
+    if not isinstance(error, OSError) or error.strerror is None:
+        return ""
+    if error.filename is not None:
+        return f"cannot use {os.fsdecode(error.filename)}: {error.strerror}"
+    return f"the operating system reports: {error.strerror}; check the disk and its connection"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 from linkpose.sensors.rig import CHAIN_JOINTS
 
 if TYPE_CHECKING:
@@ -41,22 +42,22 @@ def command(
     """
     from linkpose.calibration.chain import LARGE_RESIDUAL_M_S2, calibrate_chain, remarks, with_calibration
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_chain(loaded, rig, joint)
     with_calibration(rig, found).save(rig_file)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
     else:
-        _show(found, joint, rig.chain.joint)
+        _show(found, joint, rig.chain.joint, console)
     for remark in remarks(found, joint, rig):
-        click.echo(remark, err=True)
+        console.report(remark)
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
-        click.echo("The residual is large. Check that each sensor is firm on its own link.", err=True)
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+        console.report("The residual is large. Check that each sensor is firm on its own link.")
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
-def _show(found: ChainCalibration, stated: str | None, of_rig: str) -> None:
+def _show(found: ChainCalibration, stated: str | None, of_rig: str, console: Console) -> None:
     """The result on stdout; what is not observable, and what to do, on stderr."""
     from linkpose.calibration.chain import WEAK_M
 
@@ -78,13 +79,12 @@ def _show(found: ChainCalibration, stated: str | None, of_rig: str) -> None:
         if std > WEAK_M
     ]
     if weak:
-        click.echo(
+        console.report(
             f"Not observable: {', '.join(weak)}. Rotate that sensor's link about its other axes, faster, while the "
-            "joint between the links moves to and fro.",
-            err=True,
+            "joint between the links moves to and fro."
         )
     if found.joint == "hinge" and found.axes is None:
-        click.echo("The axis is not observable. Move both links, in more than one direction.", err=True)
+        console.report("The axis is not observable. Move both links, in more than one direction.")
 
 
 def _verdict(found: ChainCalibration, stated: str | None, of_rig: str) -> str:

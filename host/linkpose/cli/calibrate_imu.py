@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 from linkpose.presentation import counted
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     """
     from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_imu(loaded)
     with_calibration(rig, found).save(rig_file)
     if json_lines:
@@ -36,13 +38,12 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     else:
         _show(found)
     if found.accel_scale is None:
-        click.echo(
+        console.report(
             f"Offset and scale of the accelerometer are unchanged: {counted(found.attitudes, 'attitude')} recorded, "
-            f"{FEWEST_ATTITUDES} needed.",
-            err=True,
+            f"{FEWEST_ATTITUDES} needed."
         )
-    calibrate = ("calibrate", "joint", "swing.csv", "--rig", rig_file)
-    options.show_rig_written(rig_file, quiet, "record", "swing.csv", then=calibrate)
+    record = options.record_command("swing.csv", loaded[0], "swing")
+    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "joint", record[1], "--rig", rig_file))
 
 
 def _show(found: FoundImuErrors) -> None:

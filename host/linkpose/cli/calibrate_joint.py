@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 
 if TYPE_CHECKING:
     from linkpose.calibration.joint import JointCalibration
@@ -35,7 +36,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
         with_calibration,
     )
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_joint(loaded, rig)
     with_calibration(rig, found, with_imu).save(rig_file)
     if json_lines:
@@ -47,29 +49,23 @@ def command(recordings: tuple[Path, ...], rig_file: Path, with_imu: bool, json_l
         for name in SENSOR_ERRORS:
             click.echo(f"{name} {', '.join(f'{value:.4f}' for value in getattr(found.imu, name))}")
     if found.weak_axis is not None and not json_lines:
-        _show_weak(found)
+        _show_weak(found, console)
     if found.residual_m_s2 > LARGE_RESIDUAL_M_S2:
-        click.echo("The residual is large. Check that the joint is fixed and the sensor firm on the link.", err=True)
+        console.report("The residual is large. Check that the joint is fixed and the sensor firm on the link.")
     if not with_imu:
-        click.echo(
-            f"The sensor errors found ({', '.join(SENSOR_ERRORS)}) are not saved. Add --imu to save them.", err=True
-        )
+        console.report(f"The sensor errors found ({', '.join(SENSOR_ERRORS)}) are not saved. Add --imu to save them.")
         if not is_calibrated(rig.imu, found):
-            click.echo(
-                "The rig file does not calibrate the sensor: add --imu, or type `linkpose calibrate imu`.", err=True
-            )
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+            console.report("The rig file does not calibrate the sensor: add --imu, or type `linkpose calibrate imu`.")
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
-def _show_weak(found: JointCalibration) -> None:
+def _show_weak(found: JointCalibration, console: Console) -> None:
     """The direction along which the motion does not show J2S, and what to do."""
     axis = found.weak_axis
     others = " and ".join(name for at, name in enumerate("xyz") if at != axis)
     x, y, z = found.worst_direction
-    click.echo(
+    console.report(
         f"J2S is not observable along the sensor's {'xyz'[axis or 0]} axis (direction {x:.2f}, {y:.2f}, {z:.2f}): "
         f"σ {found.worst_std_m:.3f} m. Rotate the link about its {others} axes too, and faster; on a hinge with a "
-        "horizontal axis this direction does not enter the height.",
-        err=True,
+        "horizontal axis this direction does not enter the height."
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 from linkpose.errors import LinkposeError
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
     """
     from linkpose.calibration.mag import LEAST_FIELD_UT, MOST_FIELD_UT, calibrate_mag, with_calibration
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_mag(loaded, rig)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
@@ -43,22 +45,20 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
         )
     if found.outliers:
         readings = "1 reading is" if found.outliers == 1 else f"{found.outliers} readings are"
-        click.echo(f"{readings} left out: the magnitude is far from the median of all readings.", err=True)
+        console.report(f"{readings} left out: the magnitude is far from the median of all readings.")
     if not found.is_clean:
-        click.echo(
+        console.report(
             "The residual is large: iron or a current was near the sensor in a part of the recording. Record again, "
-            "away from both.",
-            err=True,
+            "away from both."
         )
     if found.rotation is None:
-        click.echo(
+        console.report(
             "The rotation into the inertial sensor's axes is not determined, and the axes are assumed to agree: turn "
-            "the sensor faster, about all axes.",
-            err=True,
+            "the sensor faster, about all axes."
         )
     with_calibration(rig, found).save(rig_file)
-    calibrate = ("calibrate", "joint", "swing.csv", "--rig", rig_file)
-    options.show_rig_written(rig_file, quiet, "record", "swing.csv", then=calibrate)
+    record = options.record_command("swing.csv", loaded[0], "swing")
+    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "joint", record[1], "--rig", rig_file))
 
 
 def _show(found: MagCalibration) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 
 if TYPE_CHECKING:
     from linkpose.calibration.mice import MouseCalibration
@@ -35,20 +36,20 @@ def command(recordings: tuple[Path, ...], rig_file: Path, length: float | None, 
     from linkpose.calibration.mice import calibrate_mice, with_calibration
     from linkpose.sensors.devices import slow_mouse_remarks
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_mice(loaded, rig, length)
     with_calibration(rig, found).save(rig_file)
     for mouse in found:
         click.echo(json.dumps(mouse.as_dict()) if json_lines else _line(mouse))
-    if not quiet:
-        for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
-            click.echo(remark, err=True)
-    estimate = ("estimate", recordings[0], "--rig", rig_file, "-o", options.new_estimates())
-    options.show_rig_written(rig_file, quiet, *estimate)
+    for remark in slow_mouse_remarks([mouse.counts_per_m for mouse in found], loaded[0].sample_rate_hz):
+        console.report(remark)
+    options.show_rig_written(rig_file, quiet, *options.estimate_command(recordings[0], "--rig", rig_file))
 
 
 def _line(mouse: MouseCalibration) -> str:
     return (
         f"mouse {mouse.mouse}: {mouse.counts_per_m:.1f} ± {mouse.counts_per_m_std:.1f} counts/m, "
-        f"turned by {mouse.angle_deg:.2f} ± {mouse.angle_std_deg:.2f}°, residual {mouse.residual_mm:.2f} mm"
+        f"turned by {mouse.angle_deg:.2f} ± {mouse.angle_std_deg:.2f}°, by the turns at x_m = {mouse.x_m:.4f}, "
+        f"y_m = {mouse.y_m:.4f} (± {1e3 * mouse.position_std_m:.1f} mm), residual {mouse.residual_mm:.2f} mm"
     )

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from linkpose.cli import options
+from linkpose.cli.live import Console
 from linkpose.errors import LinkposeError
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
@@ -29,10 +30,12 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
 
     Lay the sensor on a firm table, away from motors and fans, and record it untouched for half an hour or more. The
     Allan deviation of each axis gives the coefficients. Without a change of temperature of 1 °C there is no drift.
+    `linkpose simulate link --still --duration 1800` simulates such a recording.
     """
     from linkpose.calibration.noise import calibrate_noise, with_calibration
 
-    loaded, rig = options.recordings_and_rig(recordings, rig_file)
+    console = Console(quiet, verbose=False)
+    loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
     found = calibrate_noise(loaded)
     if json_lines:
         click.echo(json.dumps(found.as_dict()))
@@ -44,8 +47,8 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             "--force to write the figures all the same"
         )
     with_calibration(rig, found).save(rig_file)
-    calibrate = ("calibrate", "imu", "rests.csv", "--rig", rig_file)
-    options.show_rig_written(rig_file, quiet, "record", "rests.csv", then=calibrate)
+    record = options.record_command("rests.csv", loaded[0], "sides")
+    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "imu", record[1], "--rig", rig_file))
 
 
 def _show(found: NoiseCalibration) -> None:

@@ -44,7 +44,7 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
         "record it turned through all attitudes, type `linkpose calibrate mag RECORDING --rig rig.toml`, and add "
         "--rig rig.toml"
     ),
-    errors.NoMagnetometer: lambda e: "type --port 'sim://link?mag=1'" if e.simulated else "",
+    errors.NoMagnetometer: lambda e: "type --port 'sim://link?mag=1'" if e.is_simulated else "",
     errors.FilterCannotRun: lambda e: cure(e.reason),
     errors.NoFilterRuns: lambda e: "; ".join(dict.fromkeys(filter(None, map(cure, e.reasons.values())))),
     errors.MissingMap: lambda e: "add --map MAP.yaml",

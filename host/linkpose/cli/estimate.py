@@ -199,9 +199,9 @@ def _replay(path: Path, request: Request, console: Console) -> None:
     if request.output or not sink.gives_rows:
         console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
     if request.output:
-        options.show_next(console.is_quiet, "plot", request.output)
+        options.show_next(console.is_quiet, *options.plot_command(request.output))
     elif not sink.gives_rows:
-        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.new_estimates())
+        options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.new_file("estimate.csv"))
 
 
 def _smooth(estimator: Estimator) -> None:

@@ -13,7 +13,6 @@ from linkpose.cli import options
 from linkpose.cli.findings import report_findings, report_running
 from linkpose.cli.page import show_newest
 from linkpose.cli.sink import Sink
-from linkpose.errors import NoMagnetometer
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -52,10 +51,7 @@ def estimate_live(
 
         estimator = Estimator.for_board(request.filter_names, connected, request.chain_joint)
         if request.mag:
-            try:
-                estimator.hold_heading()
-            except NoMagnetometer:
-                raise NoMagnetometer(connected.port if connected.port.startswith("sim://") else None) from None
+            estimator.hold_heading(connected.port)
         report_running(estimator, request.joint, console)
         names = [f.name for f in estimator.filters]
         compiling = stack.enter_context(Precompilation(names))
@@ -75,7 +71,7 @@ def estimate_live(
         run.finish(ended)
         live.show_summary(console, run.health, request.json_lines, options.written(request.output))
         if request.output:
-            options.show_next(console.is_quiet, "plot", request.output)
+            options.show_next(console.is_quiet, *options.plot_command(request.output))
         connected.check_usable()
 
 

@@ -69,18 +69,23 @@ def _report_excluded(estimator: Estimator, console: Console) -> None:
     """Which mice were left out, since when, and for how long."""
     excluded = estimator.excluded
     long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
+    causes = estimator.mouse_causes
+    if 0 in causes and len(long) == len(estimator.rig.mouse):  # together: each beside the others means nothing
+        causes = {0: causes[0]}
     for name in long:
         still = "; it is still left out" if name in excluded.now else ""
+        mouse = int(name.removeprefix("mouse"))
         console.report(
-            f"mouse {name.removeprefix('mouse')} was left out for {excluded.total_s[name]:.1f} s, first at "
-            f"{excluded.first_s[name]:.1f} s{still}: it contradicted the other sensors. Check that it is on the floor, "
-            "and its place and angle in the rig file"
+            f"mouse {mouse} was left out for {excluded.total_s[name]:.1f} s, first at "
+            f"{excluded.first_s[name]:.1f} s{still}: {causes.get(mouse, 'it contradicted the other sensors')}. Check "
+            "that it is on the floor, and its place and angle in the rig file"
         )
     mice = len(estimator.rig.mouse)
     if mice and len(long) == mice and min(excluded.total_s.values()) > _LONG_S:
+        cause = f" ({causes[0]})" if 0 in causes else ""
         console.report(
-            "all mice were left out for long: together they contradict the gyro. If they were on the floor, their "
-            "counts_per_m or angle_deg in the rig file are wrong: type `linkpose calibrate mice`"
+            f"all mice were left out for long: together they contradict the gyro{cause}. If they were on the floor, "
+            "their counts_per_m or angle_deg in the rig file are wrong: type `linkpose calibrate mice`"
         )
 
 
@@ -100,6 +105,8 @@ def _report_mice(estimator: Estimator, console: Console) -> None:
             f"mouse {mouse.mouse} is {1e3 * mouse.off_m:.0f} mm from its place in the rig file: the turns show it at "
             f"x_m = {mouse.x_m:.3f}, y_m = {mouse.y_m:.3f}"
         )
+    for remark in estimator.mice_remarks:
+        console.report(remark)
     if estimator.mice_scale:
         factor, std = estimator.mice_scale
         change = "more" if factor > 1 else "fewer"
@@ -121,7 +128,11 @@ def _report_field(estimator: Estimator, console: Console) -> None:
         )
         return
     console.report(
-        f"The magnetometer held the heading for {found.used_s:.0f} s; for {found.rejected_s:.0f} s the field was "
-        f"disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+        f"The magnetometer held the heading for {found.used_s:.0f} s."
+        + (
+            f" For {found.rejected_s:.0f} s the field was disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+            if found.rejected_s >= 0.5  # which rounds to 1 s
+            else ""
+        )
         + ("" if found.north_deg is None else f" Magnetic north is at yaw {found.north_deg:.0f}°.")
     )

@@ -42,7 +42,7 @@ def _number(
         kind = options.FiniteRange(min=least, min_open=least == 0 and name not in MAY_BE_ZERO)
     default = getattr(DEFAULTS, name)
     if default is None and (assumed := ESTIMATED_NOISES[name][1]) is not None:
-        text += f" Default: estimated from the log; in a stream, or with few measurements, {assumed:g}."
+        text += f" Else {assumed:g}."
     return click.option(flag, name, type=kind, default=default, show_default=default is not None, help=text)
 
 
@@ -109,7 +109,39 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     return Numbers("X,Y,HEADING").convert(value, param, ctx)
 
 
-@click.command("localize")
+# The help's sections: title, a sentence on the options, and the first of them.
+SECTIONS = (
+    ("Map or beacons", "", "map_path"),
+    ("Results", "", "output"),
+    ("Filter", "", "filters"),
+    (
+        "Noise",
+        "Default: estimated from the log of beacons. Streams, laser scans and logs with few measurements use the value "
+        'after "Else".',
+        "range_std_m",
+    ),
+    ("Variants of the thesis", "", "noise"),
+)
+
+
+class Sectioned(click.Command):
+    """A command whose help lists the options of the ordinary case first."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        chosen = [parameter for parameter in self.params if isinstance(parameter, click.Option)]
+        own = self.get_help_option(ctx)
+        if own is not None:
+            chosen.insert(next(i for i, option in enumerate(chosen) if option.name == "filters"), own)
+        names = [option.name for option in chosen]
+        starts = [names.index(first) for _, _, first in SECTIONS]
+        for (title, sentence, _), start, end in zip(SECTIONS, starts, [*starts[1:], len(chosen)], strict=True):
+            with formatter.section(title):
+                if sentence:
+                    formatter.write_text(sentence)
+                formatter.write_dl([record for option in chosen[start:end] if (record := option.get_help_record(ctx))])
+
+
+@click.command("localize", cls=Sectioned)
 @click.argument("log", type=options.FILE)
 @click.option(
     "--map",
@@ -133,100 +165,12 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
     help="Take the odometry from this estimate of the mice filter, on the log's clock.",
 )
 @click.option(
-    "--filter",
-    "filters",
-    type=click.Choice(["scan-match", "ekf", "ukf", "mcl"]),
-    multiple=True,
-    help="May be repeated. Default: scan-match for a log with laser scans, ekf for others.",
-)
-@click.option(
-    "--noise",
-    type=click.Choice(["fixed", "adaptive", "affine"]),
-    default=DEFAULTS.noise,
-    show_default=True,
-    help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)².",
-)
-@_number("--correlation", "correlation", "Between ranges taken at one instant.")
-@click.option(
-    "--gate",
-    callback=gate_probability,
-    default="0.997",
-    show_default=True,
-    metavar="P|off",
-    help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
-)
-@_number("--range-std", "range_std_m", "σ of a range (m).")
-@_number(
-    "--range-growth",
-    "range_growth",
-    "Growth k of the range's standard deviation with --noise affine (m/m).",
-)
-@_number("--eta", "eta", "η of --noise adaptive.")
-@_number("--bearing-std", "bearing_std_rad", "σ of a bearing (rad).")
-@_number("--depth-std", "depth_std_m", "σ of a depth (m).")
-@_number("--attitude-std", "attitude_std_rad", "σ of a yaw reading (rad).")
-@_number("--speed-std", "speed_std_m_s", "σ of one odometry sample's speed (m/s).")
-@_number("--turn-std", "turn_std_rad_s", "σ of one odometry sample's turn rate (rad/s).")
-@_number("--velocity-std", "velocity_std_m_s", "σ of one velocity sample on each axis (m/s).")
-@_number(
-    "--acceleration-std",
-    "acceleration_std_m_s2",
-    "σ of the acceleration on each axis of a log without odometry (m/s²).",
-)
-@_number(
-    "--error-time",
-    "error_time_s",
-    "Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
-    "count less. Default: estimated for landmarks; with few measurements 0, and 0.5 for landmarks.",
-)
-@_number(
-    "--drift-std",
-    "drift_std_m",
-    "σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose.",
-)
-@_number("--drift-time", "drift_time_s", "Time for which this part persists (s); estimated with it.")
-@_number(
-    "--motion-correlation",
-    "motion_correlation",
-    "Between the errors of speed and turn rate.",
-)
-@click.option(
-    "--estimate",
-    multiple=True,
-    callback=estimated_constants,
-    metavar="scale|bias[:each]|none",
-    help="Estimate the scale error or the bias of the ranges, too, for all beacons or for each. "
-    "May be repeated or separated by commas. Default: scale,bias for ranges to three beacons and more, except under "
-    "water.",
-)
-@click.option(
     "--start",
     callback=start_pose,
     metavar="X,Y,HEADING|auto",
     help="Pose at the log's start (m, m, rad), or `auto`: search the whole map. "
     "Default: the log's own pose, else auto.",
 )
-@click.option(
-    "--start-std",
-    callback=start_std,
-    metavar="M,RAD",
-    default=",".join(map(str, DEFAULTS.start_std)),
-    show_default=True,
-    help="Standard deviation of the start.",
-)
-@click.option(
-    "--transform",
-    type=click.Choice(["unscented", "scaled"]),
-    default=DEFAULTS.transform,
-    show_default=True,
-    help="Sigma points √(n + κ) σ out, as the thesis has them, or α times that: better in a map with many edges.",
-)
-@_number("--alpha", "alpha", "α of --transform scaled.", options.FiniteRange(0, 1, min_open=True))
-@_number("--beta", "beta", "β of --transform scaled.")
-@_number("--kappa", "kappa", "κ of either transform.")
-@click.option("--smooth", is_flag=True, help="Smooth the path afterwards with all measurements.")
-@_number("--particles", "particles", "Of --filter mcl.", click.IntRange(10, 1000000))
-@_number("--seed", "seed", "Of --filter mcl.", click.IntRange(min=0))
 @click.option("-o", "--output", type=options.FILE, metavar="OUT.csv", help="Write the estimated path.")
 @click.option(
     "--plot",
@@ -239,10 +183,94 @@ def start_pose(ctx: click.Context, param: click.Parameter, value: str | None) ->
 @click.option(
     "--truth", "truth_path", type=options.FILE, metavar="T.csv", help="True path: time_s,x_m,y_m[,z_m][,heading_rad]."
 )
+@click.option("--smooth", is_flag=True, help="Smooth the path afterwards with all measurements.")
+@options.as_json
 @options.page
 @options.force
-@options.as_json
 @options.quiet
+@click.option(
+    "--filter",
+    "filters",
+    type=click.Choice(["scan-match", "ekf", "ukf", "mcl"]),
+    multiple=True,
+    help="May be repeated. Default: scan-match for a log with laser scans, ekf for others.",
+)
+@click.option(
+    "--gate",
+    callback=gate_probability,
+    default="0.997",
+    show_default=True,
+    metavar="P|off",
+    help="Reject measurements whose squared Mahalanobis distance exceeds the χ² quantile for this probability.",
+)
+@click.option(
+    "--estimate",
+    multiple=True,
+    callback=estimated_constants,
+    metavar="scale|bias[:each]|none",
+    help="Estimate the scale error or the bias of the ranges, too, for all beacons or for each. "
+    "May be repeated or separated by commas. Default: scale,bias for ranges to three beacons and more, except under "
+    "water.",
+)
+@click.option(
+    "--start-std",
+    callback=start_std,
+    metavar="M,RAD",
+    default=",".join(map(str, DEFAULTS.start_std)),
+    show_default=True,
+    help="Standard deviation of the start.",
+)
+@_number("--particles", "particles", "Of --filter mcl.", click.IntRange(10, 1000000))
+@_number("--seed", "seed", "Of --filter mcl.", click.IntRange(min=0))
+@_number("--range-std", "range_std_m", "σ of a range (m).")
+@_number("--range-growth", "range_growth", "Growth of σ with the range (m/m). scan-match: 0.005.")
+@_number("--bearing-std", "bearing_std_rad", "σ of a bearing (rad).")
+@_number("--speed-std", "speed_std_m_s", "σ of one odometry sample's speed (m/s).")
+@_number("--turn-std", "turn_std_rad_s", "σ of one odometry sample's turn rate (rad/s).")
+@_number("--velocity-std", "velocity_std_m_s", "σ of one velocity sample on each axis (m/s).")
+@_number(
+    "--acceleration-std",
+    "acceleration_std_m_s2",
+    "σ of the acceleration on each axis of a log without odometry (m/s²).",
+)
+@_number(
+    "--error-time",
+    "error_time_s",
+    "Time for which the error of a range or bearing of one beacon persists (s): sightings in quicker succession "
+    "count less. Else 0, and 0.5 for landmarks.",
+)
+@_number(
+    "--drift-std",
+    "drift_std_m",
+    "σ of the part of a range's error that drifts (m), for each beacon by itself; estimated beside the pose.",
+)
+@_number("--drift-time", "drift_time_s", "Time for which this part persists (s); estimated with it.")
+@_number("--depth-std", "depth_std_m", "σ of a depth (m); not estimated.")
+@_number("--attitude-std", "attitude_std_rad", "σ of a yaw reading (rad); not estimated.")
+@click.option(
+    "--noise",
+    type=click.Choice(["fixed", "adaptive", "affine"]),
+    default=DEFAULTS.noise,
+    show_default=True,
+    help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)² with the growth k.",
+)
+@_number("--eta", "eta", "η of --noise adaptive.")
+@_number("--correlation", "correlation", "Between ranges taken at one instant.")
+@_number(
+    "--motion-correlation",
+    "motion_correlation",
+    "Between the errors of speed and turn rate.",
+)
+@click.option(
+    "--transform",
+    type=click.Choice(["unscented", "scaled"]),
+    default=DEFAULTS.transform,
+    show_default=True,
+    help="Sigma points √(n + κ) σ out, as the thesis has them, or α times that: better in a map with many edges.",
+)
+@_number("--alpha", "alpha", "α of --transform scaled.", options.FiniteRange(0, 1, min_open=True))
+@_number("--beta", "beta", "β of --transform scaled.")
+@_number("--kappa", "kappa", "κ of either transform.")
 def command(
     log: Path,
     map_path: Path | None,
@@ -345,7 +373,7 @@ def _stream(
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(encoding="utf-8-sig", errors="replace")
     with contextlib.suppress(KeyboardInterrupt), ending_well():
-        for line in stream.csv_lines(sys.stdin):
+        for line in stream.csv_lines(sys.stdin or ()):  # None: it was closed, which is as empty as /dev/null
             click.echo(line)
             sys.stdout.flush()
     for remark in stream.remarks():
@@ -395,7 +423,7 @@ def _sentence(name: str, track: Track, result: PathScore | None) -> str:
     if track.relocated:
         text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found anew"
     for verdict in track.consistency.verdicts():
-        text += f"\n  {verdict.sentence()} ({verdict.figures()})"
+        text += f"\n  {verdict.sentence()}" + (f" ({figures})" if (figures := verdict.figures()) else "")
     if result is not None:
         text += (
             f"\n  position error {result.position_rmse_m:.3f} m rms, {result.position_max_m:.3f} m at most, "

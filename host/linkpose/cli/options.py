@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.errors import printable
-from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
+from linkpose.sensors.rig import LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
     from linkpose.recording.reader import Recording
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-LONGEST_LINK_M = 10.0
 ERROR_LEVELS = ("calibrated", "datasheet", "none")
 
 
@@ -284,11 +282,40 @@ def show_next(quiet: bool, *words: object, then: Sequence[object] = ()) -> None:
             click.echo(f"{when}: {typed(command)}", err=True)
 
 
-def new_estimates() -> Path:
-    """The file of estimates to propose: estimate.csv, or estimate-2.csv and so on where it exists."""
-    from linkpose.recording.csvfile import numbered
+def estimate_command(recording: Path, *flags: object) -> tuple[object, ...]:
+    """The command that estimates over a recording, to propose as the next one."""
+    return "estimate", recording, *flags, "-o", new_file("estimate.csv")
 
-    path = Path("estimate.csv")
+
+def plot_command(estimates: Path) -> tuple[object, ...]:
+    """The command that draws estimates, to propose as the next one; it replaces no picture."""
+    picture = estimates.with_suffix(".png")
+    return "plot", estimates, *(("-o", new_file(str(picture))) if picture.exists() else ())
+
+
+def record_command(name: str, before: Recording, motion: str) -> tuple[object, ...]:
+    """The command that records a new file of this name, to propose after the recording `before`.
+
+    A simulated board is simulated again, with another motion ("swing" or "sides").
+    """
+    device = str(before.metadata.get("device"))
+    port = ("--port", _with_motion(device, motion)) if device.startswith("sim://link") else ()
+    return "record", new_file(name), *port
+
+
+def _with_motion(address: str, motion: str) -> str:
+    """The address of a simulated link with this motion."""
+    rig, _, query = address.partition("?")
+    options = [option for option in query.split("&") if option and not option.startswith("motion=")]
+    options += [f"motion={motion}"] * (motion != "swing")
+    return "?".join(filter(None, (rig, "&".join(options))))
+
+
+def new_file(name: str) -> Path:
+    """A file to propose: of this name, or estimate-2.csv and so on where estimate.csv exists."""
+    from linkpose.outputs import numbered
+
+    path = Path(name)
     return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())
 
 
@@ -334,9 +361,18 @@ def resolve_rig(rig_file: Path | None, joint: Joint | None, brought: Rig | None)
     return replace(rig, joint=joint) if joint else rig
 
 
-def recordings_and_rig(paths: Sequence[Path], rig_file: Path) -> tuple[list[Recording], Rig]:
-    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording."""
-    loaded = load_recordings(paths)
+def recordings_and_rig(
+    paths: Sequence[Path], rig_file: Path, report: Callable[[str], None]
+) -> tuple[list[Recording], Rig]:
+    """The recordings of a calibration, and the rig that it changes: the file's, or else that of the first recording.
+
+    `report` gets the remarks on the recordings.
+    """
+    from linkpose.recording.reader import load_recording
+
+    loaded = [load_recording(path) for path in paths]
+    for remark in (remark for recording in loaded for remark in recording.remarks):
+        report(remark)
     return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
 
 
@@ -345,13 +381,3 @@ def show_rig_written(rig_file: Path, quiet: bool, *words: object, then: Sequence
     if not quiet:
         click.echo(f"written to {rig_file}", err=True)
     show_next(quiet, *words, then=then)
-
-
-def load_recordings(paths: Sequence[Path]) -> list[Recording]:
-    """The recordings; their remarks go to stderr."""
-    from linkpose.recording.reader import load_recording
-
-    loaded = [load_recording(path) for path in paths]
-    for remark in (remark for recording in loaded for remark in recording.remarks):
-        click.echo(printable(remark), err=True)
-    return loaded

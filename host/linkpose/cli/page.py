@@ -88,8 +88,9 @@ class PageOptions:
         with ending_well(), opened as page:
             console.report("Ctrl-C ends")
             with contextlib.suppress(KeyboardInterrupt):
-                while page is not None and not page.stopped.wait(0.5):  # Windows delivers Ctrl-C between two waits only
-                    pass
+                while page is not None:
+                    page.stopped.wait(0.5)  # Windows delivers Ctrl-C between two waits only
+                    page.raise_if_stopped()
 
     @contextlib.contextmanager
     def follow(

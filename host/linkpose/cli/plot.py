@@ -60,7 +60,7 @@ def command(
     from linkpose.cli.live import Console
     from linkpose.evaluation.references import read_any, read_for_picture
     from linkpose.localization.surroundings import Surroundings
-    from linkpose.recording.csvfile import STDOUT
+    from linkpose.outputs import STDOUT
 
     page = PageOptions(has_page, view_host, view_port)
     page.check()

@@ -83,7 +83,7 @@ def command(
         live.run_board(connected, duration, handle)
         path = connected.recording or path
         live.show_summary(console, connected.health, json_lines, options.written(path))
-        options.show_next(quiet, "estimate", path, "-o", options.new_estimates())
+        options.show_next(quiet, *options.estimate_command(path))
         connected.check_usable()
 
 

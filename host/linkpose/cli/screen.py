@@ -11,13 +11,17 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from linkpose import quantities
 from linkpose.cli.curve import curve, path_map, time_axis
 from linkpose.device.session import Health
+from linkpose.exclusions import Exclusions
 from linkpose.presentation import (
-    Exclusions,
     Row,
+    RowReader,
     aligned_length,
+    angle_with_std,
     best_filter,
     fault_lines,
     joint_angle,
@@ -29,6 +33,7 @@ from linkpose.presentation import (
     std_text,
 )
 from linkpose.quantities import Quantity
+from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -50,8 +55,10 @@ Points = deque[tuple[float, float]]  # time (s) and value
 class Screen:
     """The content of the view, as text of a given size."""
 
-    def __init__(self, title: str, filters: Sequence[str], keys: str = "") -> None:
-        self._title, self._filters, self._keys = title, list(filters), keys
+    def __init__(self, title: str, columns: Sequence[str], keys: str = "") -> None:
+        """`columns` are those of the estimates; `keys` is the line about keys."""
+        self._rows, self._columns = RowReader(columns), columns
+        self._title, self._filters, self._keys = title, self._rows.filters, keys
         self._time_s = 0.0
         self._row: Row = {}
         self._chosen: str | None = None  # None: the best filter
@@ -64,31 +71,32 @@ class Screen:
         self._has_height = False  # ever; without J2S, a link's filters have a height without a value
         self._angles: dict[str, Points] = {}  # of a chain's joint
         self._paths: dict[str, list[tuple[float, float]]] = {}
-        self._exclusions = Exclusions()
+        self._exclusions = Exclusions(self._columns)
 
     def next_filter(self) -> None:
         """Chooses the next filter to show: the best one, then each of the others."""
         choices = [None, *self._filters]
         self._chosen = choices[(choices.index(self._chosen) + 1) % len(choices)]
 
-    def add(self, time_s: float, row: Row) -> None:
-        """Adds a row of estimates."""
-        self._time_s, self._row = time_s, row
-        for name, values in row.items():
+    def add(self, rows: Floats) -> None:
+        """Adds rows (N ≥ 1, columns) of estimates."""
+        times = rows[:, 0].tolist()
+        self._time_s, self._row = times[-1], self._rows.read(rows[-1].tolist())
+        for name, values in self._rows.series(rows).items():
             if quantities.HEIGHT in values:
-                height_m = values[quantities.HEIGHT][0]
-                self._has_height |= math.isfinite(height_m)
-                _add_point(self._heights, name, time_s, height_m)
-            if (angle := joint_angle(values)) is not None:
-                _add_point(self._angles, name, time_s, angle[0])
+                heights_m = values[quantities.HEIGHT]
+                self._has_height |= bool(np.isfinite(heights_m).any())
+                _add_points(self._heights, name, times, heights_m)
+            if (angles_deg := joint_angle(values)) is not None:
+                _add_points(self._angles, name, times, angles_deg)
             if quantities.HEADING in values and quantities.X in values and quantities.Y in values:
-                self._add_place(name, values[quantities.X][0], values[quantities.Y][0])
-        self._exclusions.follow(time_s, row)
+                self._add_places(name, values[quantities.X], values[quantities.Y])
+        self._exclusions.follow(rows)
 
-    def _add_place(self, name: str, x_m: float, y_m: float) -> None:
+    def _add_places(self, name: str, x_m: Floats, y_m: Floats) -> None:
         path = self._paths.setdefault(name, [])
-        path.append((x_m, y_m))
-        if len(path) > PATH_POINTS:
+        path.extend(zip(x_m.tolist(), y_m.tolist(), strict=True))
+        while len(path) > PATH_POINTS:
             del path[::2]
 
     def _shown(self, quantity: Quantity) -> str | None:
@@ -233,12 +241,15 @@ def _packed(parts: Iterable[str], width: int) -> list[str]:
     return lines
 
 
-def _add_point(curves: dict[str, Points], name: str, time_s: float, value: float) -> None:
-    """Adds a point to a filter's curve, unless it is close to the one before."""
+def _add_points(curves: dict[str, Points], name: str, times: Sequence[float], values: Floats) -> None:
+    """Adds points to a filter's curve, except those that are close to the one before."""
     points = curves.setdefault(name, deque(maxlen=round(CURVE_S / POINT_INTERVAL_S) + 1))
-    # A stamp lies a little before or after its tick: some slack keeps the points evenly spaced.
-    if not points or time_s - points[-1][0] >= 0.9 * POINT_INTERVAL_S:
-        points.append((time_s, value))
+    last_s = points[-1][0] if points else -math.inf
+    for time_s, value in zip(times, values.tolist(), strict=True):
+        # A stamp lies a little before or after its tick: some slack keeps the points evenly spaced.
+        if time_s - last_s >= 0.9 * POINT_INTERVAL_S:
+            points.append((time_s, value))
+            last_s = time_s
 
 
 def _curve_sections(
@@ -252,23 +263,29 @@ def _curve_sections(
 
 
 def final_table(summary: Summary, width: int) -> list[str]:
-    """The lines that stay after the end: the extremes and the RMS of σ of each quantity.
+    """The lines that stay after the end: the extremes and the median σ of each quantity.
 
     The last column is left out where the lines would be wider than `width` characters.
     """
-    rows = [("filter", "lowest", "highest", "rms σ")]
+    rows = [("filter", "lowest", "highest", "median σ")]
     for (name, quantity), (low, high, std) in summary.items():
         title = name if quantity == quantities.HEIGHT else f"{name} {quantity.name.replace('_', ' ')}"
         if quantity.is_angle:
-            shown = signed_angle(low), signed_angle(high), signed_angle(std).removeprefix("+")
+            low, high, std = (quantity.value.scale * value for value in (low, high, std))
+            lowest, _, bound = angle_with_std(low, std).partition(" ±")
+            shown = lowest, angle_with_std(high, std).partition(" ±")[0], bound or "–"
         else:
             shown = aligned_length(low, std), aligned_length(high, std), std_text(std)
         rows.append((title, *shown))
-    first = max(16, *(len(row[0]) for row in rows))
-    lines = [f"  {title:<{first}} {low:>10} {high:>10}" for title, low, high, _ in rows]
-    if len(lines[0]) + 10 <= width:
-        lines = [f"{line} {row[3]:>9}" for line, row in zip(lines, rows, strict=True)]
-    return lines if summary else []
+    if not summary:
+        return []
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    columns = 4 if sum(widths) + 2 * len(widths) <= width else 3
+    return [
+        f"  {title:<{widths[0]}}"
+        + "".join(f"  {value:>{w}}" for value, w in zip(values, widths[1:columns], strict=False))
+        for title, *values in rows
+    ]
 
 
 def _signed_length(metres: float) -> str:

@@ -58,4 +58,4 @@ def command(
     run = ChainRun(joint, seed, duration, rate, level, noise_of=noise_of, first_joint=first_joint)
     write_chain(run, output, truth, rig_file, force)
     with_rig = ("--rig", rig_file) if rig_file else ()
-    options.show_next(quiet, "estimate", output, "--filter", "chain", *with_rig, "-o", options.new_estimates())
+    options.show_next(quiet, *options.estimate_command(output, "--filter", "chain", *with_rig))

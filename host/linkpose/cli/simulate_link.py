@@ -25,6 +25,9 @@ from linkpose.sensors.rig import Rig, Vector
     help="J2S: vector from the joint centre to the sensor, in its axes (m).",
 )
 @click.option("--rests", is_flag=True, help="Lay the sensor on its six sides in turn, as `calibrate imu` needs it.")
+@click.option(
+    "--still", is_flag=True, help="Keep the link at rest, as `calibrate noise` needs it: with --duration 1800 or more."
+)
 @click.option("--imu2", is_flag=True, help="Add a second inertial sensor, half-way between the joint and the first.")
 @click.option("--mag", is_flag=True, help="Add a magnetometer.")
 @click.option(
@@ -44,6 +47,7 @@ def command(
     errors: str | Rig,
     j2s: Vector,
     rests: bool,
+    still: bool,
     imu2: bool,
     mag: bool,
     mag_disturbance: str | None,
@@ -54,16 +58,20 @@ def command(
     from linkpose.simulation.export import check_length, check_outputs, write_link
     from linkpose.simulation.link import LinkRun
 
+    if rests and still:
+        raise click.UsageError("--rests lays the sensor on its sides, --still keeps it at rest: leave out one of them")
     check_outputs((output, truth), force)
     check_length(duration, rate)
     level, noise_of = ("calibrated", errors) if isinstance(errors, Rig) else (errors, None)
     has_mag = mag or mag_disturbance is not None
+    motion = "sides" if rests else "rest" if still else "swing"
     run = LinkRun(
-        test, seed, duration, rate, level, j2s, rests=rests, imu2=imu2, mag=has_mag, mag_disturbance=mag_disturbance,
+        test, seed, duration, rate, level, j2s, motion=motion, imu2=imu2, mag=has_mag, mag_disturbance=mag_disturbance,
         noise_of=noise_of,
     )  # fmt: skip
     write_link(run, output, truth, force)
     held = ("--mag",) if has_mag and level != "datasheet" else ()  # a data sheet's specimen has no calibration
-    calibrate = ("calibrate", "imu", output, "--rig", "rig.toml")
-    estimate = ("estimate", output, *held, "-o", options.new_estimates())
-    options.show_next(quiet, *(calibrate if rests else estimate))
+    if motion == "swing":
+        options.show_next(quiet, *options.estimate_command(output, *held))
+    else:
+        options.show_next(quiet, "calibrate", "imu" if rests else "noise", output, "--rig", "rig.toml")

@@ -72,4 +72,4 @@ def command(
     placed = ring(mice, counts_per_m=1000.0 * resolution)
     run = MiceRun(seed, duration, rate, placed, path, errors, faults=tuple(map(Fault.parse, faults)), length_m=length)
     write_mice(run, resolution, output, truth, force)
-    options.show_next(quiet, "estimate", output, "-o", options.new_estimates())
+    options.show_next(quiet, *options.estimate_command(output))

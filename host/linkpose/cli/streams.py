@@ -81,19 +81,39 @@ class _Closed:
     encoding, errors = "utf-8", "strict"
 
     def write(self, _text: str) -> int:
-        raise LinkposeError("cannot write the output: stdout is closed; write it to a file or a pipe")
+        raise _closed()
 
     def flush(self) -> None:
         """Nothing is buffered."""
 
+    def fileno(self) -> int:
+        raise _closed()
+
     def isatty(self) -> bool:
         return False
+
+
+def _closed() -> LinkposeError:
+    return LinkposeError("cannot write the output: stdout is closed; write it to a file or a pipe")
+
+
+def _occupy_closed() -> None:
+    """Opens the null device as each standard stream that is closed.
+
+    The next file that is opened would get the stream's number, and what another program or a library in C writes to the
+    stream would go into that file.
+    """
+    with contextlib.suppress(OSError):
+        while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+            os.set_inheritable(number, True)
+        os.close(number)
 
 
 @contextlib.contextmanager
 def safe_streams() -> Iterator[None]:
     """Within this context, stdout and stderr fail as this module describes."""
     before = sys.stdout, sys.stderr
+    _occupy_closed()
     characters.register()
     for stream in before:  # a code page without σ or −, as on Windows: a character is replaced, nothing fails
         if isinstance(stream, io.TextIOWrapper):

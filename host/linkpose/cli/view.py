@@ -8,15 +8,16 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import click
+import numpy as np
 
 from linkpose.cli.screen import Screen
 from linkpose.device.session import Health
-from linkpose.presentation import RowReader
 
 if TYPE_CHECKING:
     from rich.live import Live
 
     from linkpose.estimation import LiveRows
+    from linkpose.sensors.measurements import Floats
 
 REDRAW_INTERVAL_S = 0.1
 
@@ -26,8 +27,9 @@ class View:
 
     def __init__(self, columns: Sequence[str], is_shown: bool, title: str, keys: str = "") -> None:
         """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys."""
-        self._rows, self._width = RowReader(columns), len(columns)
-        self._screen = Screen(title, self._rows.filters, keys)
+        self._screen = Screen(title, columns, keys)
+        self._waiting: list[Floats] = []  # rows (N, columns) since the screen was drawn
+        self._begins_anew = False  # whether they replace all rows before
         self._live: Live | None = None
         self._size: tuple[int, int] = (0, 0)
         self._drawn_at = -math.inf
@@ -57,6 +59,7 @@ class View:
 
     def line(self, health: Health) -> str:
         """The faults and the headline in one line, where the view is not on the screen."""
+        self._take_waiting()
         return self._screen.line(health)
 
     def report(self, text: str) -> None:
@@ -71,13 +74,23 @@ class View:
         self._screen.next_filter()
 
     def add(self, rows: LiveRows) -> None:
-        """Adds the newest row of estimates, or begins anew with all rows so far where a filter has caught up."""
+        """Adds the newest row of estimates, or begins anew with all rows so far where a filter has caught up.
+
+        The screen takes all waiting rows at once before it is drawn: a filter that catches up delays no sample.
+        """
         if not self._is_wanted:
             return
         if len(rows.caught_up):
+            self._waiting, self._begins_anew = [rows.caught_up], True
+        elif len(rows.newest):
+            self._waiting.append(rows.newest[np.newaxis])
+
+    def _take_waiting(self) -> None:
+        if self._begins_anew:
             self._screen.forget()
-        for row in rows.caught_up if len(rows.caught_up) else rows.newest.reshape(-1, self._width):
-            self._screen.add(float(row[0]), self._rows.read(row.tolist()))
+        if self._waiting:
+            self._screen.add(np.concatenate(self._waiting))
+        self._waiting, self._begins_anew = [], False
 
     def redraw(self, health: Callable[[], Health], status: str = "") -> None:
         """Redraws a few times a second, also while no estimates arrive.
@@ -88,6 +101,7 @@ class View:
         if self._live is None or now - self._drawn_at < REDRAW_INTERVAL_S:
             return
         self._drawn_at = now
+        self._take_waiting()
         if self._live.console.size != self._size:
             self._restart()
         self._live.update(self._screen.render(health(), *self._size, status), refresh=True)

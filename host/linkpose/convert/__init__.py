@@ -14,24 +14,24 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 from linkpose.convert import c3d, mcap, parquet, text
 from linkpose.convert.motion import Motion
 from linkpose.convert.source import Source
-from linkpose.errors import CannotWrite, InvalidValue
-from linkpose.recording.csvfile import create
+from linkpose.errors import InvalidValue
+from linkpose.outputs import new_file
 from linkpose.recording.table import Progress, TableFile
 
-_OF_MOTION: dict[str, Callable[[Path, Motion], None]] = {
+_OF_MOTION: dict[str, Callable[[BinaryIO, Path, Motion], None]] = {
     ".sto": text.write_sto,
     ".trc": text.write_trc,
     ".c3d": c3d.write,
     ".tum": text.write_tum,
 }
-_OF_TABLE: dict[str, Callable[[Path, Source], None]] = {
+_OF_TABLE: dict[str, Callable[[BinaryIO, Path, Source], None]] = {
     ".mot": text.write_mot,
     ".mcap": mcap.write,
     ".parquet": parquet.write,
@@ -67,27 +67,10 @@ def convert(
             file.require("time_s")
         table = Source(file, wanted, _PASSES[ending], progress)
         if ending not in _OF_MOTION:
-            _write(output, force, lambda: _OF_TABLE[ending](output, table))
+            with new_file(output, force) as written:
+                _OF_TABLE[ending](written, output, table)
             return table.remarks
         motion = Motion(table, wanted, label)
-        _write(output, force, lambda: _OF_MOTION[ending](output, motion))
+        with new_file(output, force) as written:
+            _OF_MOTION[ending](written, output, motion)
         return table.remarks + motion.remarks
-
-
-def _write(output: Path, force: bool, action: Callable[[], None]) -> None:
-    """Runs `action`, which fills the new file; removes the file where that fails."""
-    os.close(create(output, force))
-    try:
-        action()
-    except OSError as error:
-        _remove(output)
-        raise CannotWrite(output, error.strerror) from error
-    except BaseException:
-        _remove(output)
-        raise
-
-
-def _remove(output: Path) -> None:
-    with contextlib.suppress(OSError):
-        if output.is_file():
-            output.unlink()

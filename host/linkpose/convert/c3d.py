@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -10,8 +12,11 @@ from linkpose.convert import libraries
 from linkpose.convert.motion import Motion
 
 
-def write(path: Path, motion: Motion) -> None:
-    """Three markers in mm at equal intervals; the world has Z up. A missing marker has the residual −1."""
+def write(output: BinaryIO, path: Path, motion: Motion) -> None:
+    """Three markers in mm at equal intervals; the world has Z up. A missing marker has the residual −1.
+
+    ezc3d writes to a name only: to one in a folder of its own, which nobody else can write.
+    """
     ezc3d = libraries.load("ezc3d", path)
     markers = np.concatenate(list(motion.markers()))
     file = ezc3d.c3d()
@@ -23,4 +28,7 @@ def write(path: Path, motion: Motion) -> None:
     points = np.ones((4, 3, len(markers)))
     points[:3] = 1000 * markers.transpose(2, 1, 0)
     file["data"]["points"] = points
-    file.write(str(path))
+    with tempfile.TemporaryDirectory() as folder:
+        written = Path(folder) / "motion.c3d"
+        file.write(str(written))
+        output.write(written.read_bytes())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from linkpose import __version__
 from linkpose.convert import libraries
@@ -16,20 +16,19 @@ from linkpose.errors import LinkposeError
 _NUMBER = {"type": "number"}
 
 
-def write(path: Path, source: Source) -> None:
+def write(file: BinaryIO, path: Path, source: Source) -> None:
     """A topic /linkpose/values with all columns, and /linkpose/pose where the table has a motion. World: Z up."""
     writer_module = libraries.load("mcap.writer", path)
-    with path.open("wb") as file:
-        writer = writer_module.Writer(file)
-        writer.start(profile="", library=f"linkpose {__version__}")
-        values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(source.names))
-        for block in source.blocks():
-            for row in zip(*(column.tolist() for column in block.values()), strict=True):
-                content = {name: value for name, value in zip(block, row, strict=True) if math.isfinite(value)}
-                _add(writer, values, content["time_s"], content)
-        if (motion := _motion(source)) is not None:
-            _add_poses(writer, motion)
-        writer.finish()
+    writer = writer_module.Writer(file)
+    writer.start(profile="", library=f"linkpose {__version__}")
+    values = _channel(writer, "/linkpose/values", "linkpose.Values", _schema(source.names))
+    for block in source.blocks():
+        for row in zip(*(column.tolist() for column in block.values()), strict=True):
+            content = {name: value for name, value in zip(block, row, strict=True) if math.isfinite(value)}
+            _add(writer, values, content["time_s"], content)
+    if (motion := _motion(source)) is not None:
+        _add_poses(writer, motion)
+    writer.finish()
 
 
 def _motion(source: Source) -> Motion | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from linkpose.convert.source import Source
 from linkpose.sensors.measurements import Floats
 
 
-def write_sto(path: Path, motion: Motion) -> None:
+def write_sto(file: BinaryIO, _path: Path, motion: Motion) -> None:
     """OpenSense's orientations: one column of quaternions w,x,y,z, which turn the sensor's axes into a world with Z up.
 
     OpenSim's own world has Y up: pass `sensor_to_opensim_rotations` = (-π/2, 0, 0) to its tools.
@@ -23,10 +24,10 @@ def write_sto(path: Path, motion: Motion) -> None:
         for poses in motion.parts()
         for t, quaternion in zip(poses.time_s.tolist(), poses.quaternion.tolist(), strict=True)
     )
-    _write(path, [*head, f"time\t{motion.label}"], rows)
+    _write(file, [*head, f"time\t{motion.label}"], rows)
 
 
-def write_mot(path: Path, source: Source) -> None:
+def write_mot(file: BinaryIO, path: Path, source: Source) -> None:
     """OpenSim's motion file: all columns; angles as their names state."""
     names = [name for name in source.names if name != "time_s"]
     angles = "yes" if any(name.endswith("_deg") for name in names) else "no"
@@ -36,10 +37,10 @@ def write_mot(path: Path, source: Source) -> None:
         for block in source.blocks()
         for row in np.column_stack([block[name] for name in ("time_s", *names)]).tolist()
     )
-    _write(path, [*head, "endheader", "\t".join(["time", *names])], rows)
+    _write(file, [*head, "endheader", "\t".join(["time", *names])], rows)
 
 
-def write_trc(path: Path, motion: Motion) -> None:
+def write_trc(file: BinaryIO, path: Path, motion: Motion) -> None:
     """Three markers in mm at equal intervals, in OpenSim's world with Y up. An empty field is a missing marker."""
     rate, names, count = motion.rate_hz, motion.marker_names, motion.frames()
     head = [
@@ -56,22 +57,21 @@ def write_trc(path: Path, motion: Motion) -> None:
         f"{i + 1}\t{motion.start_s + i / rate:.6f}\t" + "\t".join(_cells(row)) + "\t"
         for i, row in enumerate(row for block in y_up for row in block.reshape(-1, 9))
     )
-    _write(path, head, rows)
+    _write(file, head, rows)
 
 
-def write_tum(path: Path, motion: Motion) -> None:
+def write_tum(file: BinaryIO, _path: Path, motion: Motion) -> None:
     """Time (s), position (m) and quaternion x, y, z, w of each pose; the world has Z up."""
     values = (
         np.column_stack([poses.time_s, poses.position_m, poses.quaternion[:, [1, 2, 3, 0]]]) for poses in motion.parts()
     )
-    _write(path, [], (" ".join(f"{value:.9f}" for value in row) for block in values for row in block.tolist()))
+    _write(file, [], (" ".join(f"{value:.9f}" for value in row) for block in values for row in block.tolist()))
 
 
 def _cells(row: Floats) -> list[str]:
     return ["" if value != value else f"{value:.4f}" for value in row.tolist()]
 
 
-def _write(path: Path, head: list[str], rows: Iterable[str]) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in head)
-        file.writelines(f"{row}\n" for row in rows)
+def _write(file: BinaryIO, head: list[str], rows: Iterable[str]) -> None:
+    file.writelines(f"{line}\n".encode(errors="backslashreplace") for line in head)  # a file's name may be no UTF-8
+    file.writelines(f"{row}\n".encode() for row in rows)

@@ -7,7 +7,7 @@ import itertools
 import math
 import random
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
@@ -136,6 +136,7 @@ class Session:
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
         self._arrived_s = 0.0  # s, the connection's clock: of the last sample
+        self._repeats = 0  # samples since the last one with a new number
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = self._asked_s = (
             0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
@@ -203,8 +204,7 @@ class Session:
             if time.perf_counter() > deadline:
                 break
             time.sleep(SETTLE_S)
-            self._connection.send(GetInfo())
-            hello = self._await(Hello, "GET_INFO")
+            hello = self._ask_hello()
         return hello
 
     def _check_versions(self, hello: Hello) -> None:
@@ -229,8 +229,7 @@ class Session:
         for _ in range(ATTEMPTS):
             self._command(settings, Command.CONFIGURE)
             time.sleep(SETTLE_S)
-            self._connection.send(GetInfo())
-            self.hello = self._await(Hello, "GET_INFO")
+            self.hello = self._ask_hello()
             if _configured(self.hello) == settings:
                 self._wanted = settings
                 return self.hello
@@ -248,8 +247,7 @@ class Session:
                 self.notify("Waiting for the mice, which are being set up or have not been found yet")
                 notified = True
             time.sleep(ASK_INTERVAL_S)
-            self._connection.send(GetInfo())
-            self.hello = self._await(Hello, "GET_INFO")
+            self.hello = self._ask_hello()
         for remark in mouse_remarks(self.hello):
             self.notify(remark)
 
@@ -260,7 +258,10 @@ class Session:
     def self_test(self, device: int = 0) -> SelfTestResult:
         """Runs the self-test of inertial sensor 0 (0x68) or 1 (0x69). Raises LinkposeError if the board refuses."""
         with_ack = self._command(SelfTest(device), Command.SELF_TEST)
-        return self._await(SelfTestResult, "SELF_TEST", with_ack.messages, SELF_TEST_TIMEOUT_S)
+        result = _first(SelfTestResult, itertools.chain(with_ack.messages, self._messages(SELF_TEST_TIMEOUT_S)))
+        if result is None:
+            raise _no_answer("SELF_TEST")
+        return result
 
     def _command(self, message: Message, command: Command) -> Arrival:
         """Sends a command, again where its answer is lost; the arrival that holds the ACK, from behind the ACK on.
@@ -277,22 +278,20 @@ class Session:
                         return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
                     if isinstance(answer, Sample) and command == Command.START:
                         return Arrival(arrival.time_s, arrival.messages[at:], b"")
-        raise LinkposeError(f"the board did not answer {command.name}; unplug it, plug it in and try again")
+        raise _no_answer(command.name)
 
-    def _await(
-        self,
-        kind: type[Answer],
-        asked: str,
-        received: Sequence[Message | OtherProtocol] = (),
-        timeout_s: float = ANSWER_TIMEOUT_S,
-    ) -> Answer:
-        """The answer of a kind, from what was `received` already or from what arrives within the time."""
-        arrivals = self._arrivals(timeout_s)
-        for messages in itertools.chain([received], (arrival.messages for arrival in arrivals)):
-            for answer in messages:
-                if isinstance(answer, kind):
-                    return answer
-        raise LinkposeError(f"the board did not answer {asked}; unplug it, plug it in and try again")
+    def _ask_hello(self) -> Hello:
+        """The HELLO that answers GET_INFO, which is sent again where the answer is lost."""
+        for _ in range(ATTEMPTS):
+            self._connection.send(GetInfo())
+            hello = _first(Hello, self._messages(ANSWER_TIMEOUT_S))
+            if hello is not None:
+                return hello
+        raise _no_answer("GET_INFO")
+
+    def _messages(self, timeout_s: float) -> Iterator[Message | OtherProtocol]:
+        """The messages that arrive within a time."""
+        return itertools.chain.from_iterable(arrival.messages for arrival in self._arrivals(timeout_s))
 
     def _arrivals(self, timeout_s: float) -> Iterator[Arrival]:
         """What arrives within a time."""
@@ -437,6 +436,8 @@ class Session:
                 self._arrived_s = arrival.time_s
                 place = timeline.place(message, self._clock, arrival.time_s)
                 self._report_clock_fault(timeline)
+                self._repeats = 0 if place else self._repeats + 1
+                self._report_repeats(timeline)
                 if place is not None:
                     placements.append(Placement(message, place))
             elif placements and isinstance(message, Hello | OtherProtocol):
@@ -464,6 +465,14 @@ class Session:
             self.notify(
                 f"{timeline.duration_s:.2f} s: the board's clock {fault}; its count of ticks gives the times from here "
                 "on. Replace the board if it happens again"
+            )
+
+    def _report_repeats(self, timeline: Timeline) -> None:
+        """Report a board that sends the number of one sample again and again: only the first is part of the stream."""
+        if self._repeats == round(SILENCE_S * self.hello.sample_rate_hz) and not timeline.is_over:
+            self.notify(
+                f"{timeline.duration_s:.2f} s: {self._repeats} samples came with numbers that came before, and are "
+                "left out; reset the board, and replace it if it happens again"
             )
 
     def _ask_when_silent(self) -> None:
@@ -617,6 +626,15 @@ def reset_causes(hello: Hello) -> str:
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
     return Configure(*(getattr(hello, name) for name in Configure._fields))
+
+
+def _first(kind: type[Answer], messages: Iterable[Message | OtherProtocol]) -> Answer | None:
+    """The first message of a kind."""
+    return next((message for message in messages if isinstance(message, kind)), None)
+
+
+def _no_answer(command: str) -> LinkposeError:
+    return LinkposeError(f"the board did not answer {command}; unplug it, plug it in and try again")
 
 
 def _reason(code: int) -> str:

@@ -129,10 +129,14 @@ def _find(
 
 
 def label(variant: Variant) -> str:
-    """The variant in one line of a plot."""
-    words = [variant.filter, variant.noise, f"ρ {variant.correlation:g}", f"Q {variant.others['motion_correlation']}"]
-    words += [str(variant.others["transform"]), "gate" if variant.gate else "no gate"]
-    return ", ".join([*words, f"unmapped {variant.others['unmapped']}"])
+    """The variant in one line of a plot: the filter, R, and what differs from the plain case."""
+    of_q, transform, unmapped = (variant.others[name] for name in ("motion_correlation", "transform", "unmapped"))
+    words = [variant.filter, f"{variant.noise} R"]
+    words += [f"correlated R ({variant.correlation:g})"] * bool(variant.correlation)
+    words += [f"correlated Q ({of_q})"] * bool(of_q)
+    words += [f"{transform} transform"] * (transform != "unscented")
+    words += ["no gate"] * (not variant.gate)
+    return ", ".join([*words, *[f"unmapped beams ({unmapped})"] * bool(unmapped)])
 
 
 @dataclass(frozen=True, slots=True)

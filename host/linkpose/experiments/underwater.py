@@ -201,10 +201,13 @@ def _find(
 
 
 def label(variant: Variant) -> str:
-    """The variant in one line of a plot."""
-    words = [variant.filter, str(variant.others["timing"]), f"ρ {variant.correlation:g}"]
-    words += ["gate" if variant.gate else "no gate", f"common {variant.others['correlation_std_m']} m"]
-    return ", ".join([*words, f"{variant.others['outliers']} outliers"])
+    """The variant in one line of a plot: the filter, when sensors are read, and what differs from the plain case."""
+    common_m, outliers = variant.others["correlation_std_m"], variant.others["outliers"]
+    words = [variant.filter, str(variant.others["timing"])]
+    words += [f"correlated R ({variant.correlation:g})"] * bool(variant.correlation)
+    words += ["no gate"] * (not variant.gate)
+    words += [f"common error {common_m} m"] * bool(common_m)
+    return ", ".join([*words, *[f"{outliers} outliers"] * bool(outliers)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -127,6 +127,24 @@ class FindsMovedMice(Protocol):
 
 
 @runtime_checkable
+class ExplainsMice(Protocol):
+    """Further interface of a filter that excludes mice."""
+
+    @property
+    def mouse_causes(self) -> dict[int, str]:
+        """For a mouse (1 for the first; 0: all together), why it was excluded, as the end of a sentence."""
+
+
+@runtime_checkable
+class RemarksOnMice(Protocol):
+    """Further interface of a filter that compares the mice with the gyro turn by turn."""
+
+    @property
+    def mice_remarks(self) -> list[str]:
+        """What the mice did wrong together, one sentence with its cure for each fault."""
+
+
+@runtime_checkable
 class FindsGyroJumps(Protocol):
     """Further interface of a filter that finds jumps of the gyro's bias."""
 

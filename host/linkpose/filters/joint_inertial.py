@@ -99,6 +99,7 @@ def declared(errors: SensorErrors, imu: Imu) -> SensorErrors:
     gyro, accel = imu.gyro_bias_std_rad_s, imu.accel_offset_std_m_s2
     return errors._replace(
         gyro_bias_rad_s=errors.gyro_bias_rad_s if gyro is None else gyro,
+        switch_on_bias_rad_s=errors.switch_on_bias_rad_s if gyro is None else gyro,
         accel_bias_m_s2=errors.accel_bias_m_s2 if accel is None else accel,
     )
 
@@ -188,6 +189,7 @@ class JointInertialFilter:
                 own.start_mean[BG:BA] *= -1
                 own.start_covariance[BG:BA] *= -1
                 own.start_covariance[:, BG:BA] *= -1
+                own.switch_on_variance = float(np.diag(own.start_covariance)[BG:BA].max())
 
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 14) in the order of `columns`; NaN where unknown so far."""

@@ -31,6 +31,7 @@ BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 be
 FLASER_MAX_RANGE_M = 80.0  # a SICK scanner's; the line does not contain it
 # Readings this near to the longest of the log are equal to it, and so many of them are no coincidence.
 SAME_RANGE_M, SHARED_READINGS = 0.005, 10
+QUARTERS = 720  # quarters of a degree in a FLASER's field of view
 FIRST_TIME_S = 60.0  # a log whose clock starts at 0 has its next line within this time
 HEAD_LINES, LONGEST_HEAD = 1000, 200  # how far `is_carmen` looks
 Pose = tuple[float, float, float]
@@ -106,7 +107,7 @@ def _timed(readings: list[Reading]) -> list[Reading]:
 def _without_echo(readings: list[Reading]) -> list[Reading]:
     """FLASER lines do not state the longest range: a longest reading that many beams share means "no echo"."""
     scans = [reading.ranges_m for reading in readings if reading.ranges_m is not None and len(reading.ranges_m)]
-    longest = max((float(ranges.max()) for ranges in scans), default=0.0)
+    longest = max((float(ranges.max(initial=0.0, where=np.isfinite(ranges))) for ranges in scans), default=0.0)
     if sum(int(np.count_nonzero(ranges > longest - SAME_RANGE_M)) for ranges in scans) < SHARED_READINGS:
         return readings
     limit = longest - SAME_RANGE_M
@@ -166,12 +167,12 @@ def _read_line(path: Path, number: int, words: list[str]) -> Reading:
         n = line.count(1)
         line.require(n + 9)
         angles = flaser_angles(n)
-        return Reading(line.number(n + 8), line.pose(n + 5), line.numbers(2, n), angles, line.pose(n + 2), line=number)
+        return Reading(line.number(n + 8), line.pose(n + 5), line.ranges(2, n), angles, line.pose(n + 2), line=number)
     n = line.count(8)
     after = 10 + n + line.count(9 + n)
     line.require(after + 12)
     angles = line.number(2) + line.number(4) * np.arange(n, dtype=np.float64)
-    ranges, longest = line.numbers(9, n), line.number(5)
+    ranges, longest = line.ranges(9, n), line.number(5)
     return Reading(line.number(after + 11), line.pose(after + 3), ranges, angles, line.pose(after), longest, number)
 
 
@@ -193,8 +194,13 @@ class _Words:
     def number(self, index: int) -> float:
         return read_number(self.words[index], self.path, self.line)
 
-    def numbers(self, first: int, count: int) -> Floats:
-        return np.array([self.number(index) for index in range(first, first + count)])
+    def ranges(self, first: int, count: int) -> Floats:
+        """The readings of a scan; other programs write a beam without an echo as infinity or as no number."""
+        words = self.words[first : first + count]
+        try:
+            return np.array(words, dtype=np.float64)
+        except ValueError:
+            return np.array([self.number(index) for index in range(first, first + count)])
 
     def pose(self, first: int) -> Pose:
         return self.number(first), self.number(first + 1), self.number(first + 2)
@@ -211,9 +217,15 @@ class _Words:
 
 
 def flaser_angles(count: int) -> Floats:
-    """A FLASER line gives no angles: it begins at -90 degrees and spans 180, or a step less."""
-    step_deg = {180: 1.0, 181: 1.0, 360: 0.5, 361: 0.5}.get(count, 180.0 / max(count - 1, 1))
-    return np.radians(step_deg * np.arange(count, dtype=np.float64) - 90.0)
+    """A FLASER line gives no angles: it begins at -90 degrees and spans 180, or a step less.
+
+    The step is the one of both that is a multiple of a quarter of a degree, as scanners have it, too where every n-th
+    reading was kept.
+    """
+    steps = max(count - 1, 1)
+    if count and QUARTERS % steps and QUARTERS % count == 0:
+        steps = count
+    return np.radians(180.0 / steps * np.arange(count, dtype=np.float64) - 90.0)
 
 
 def _scan(reading: Reading, robot: Pose, ranges: Floats, angles: Floats) -> Scan:

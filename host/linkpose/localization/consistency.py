@@ -55,7 +55,11 @@ class Verdict:
         return f"{name} noise fits"
 
     def figures(self) -> str:
-        """The median NIS, by which the verdict is decided, over the χ² one; and the mean where outliers rule it."""
+        """The median NIS, by which the verdict is decided, over the χ² one; and the mean where outliers rule it. Empty
+        where too few innovations decide nothing.
+        """
+        if self.count < FEWEST:
+            return ""
         median = self.noise_factor**2
         text = f"median NIS {median:.2f}, 1 is consistent"
         if self.mean_nis > _RULED * max(median, 1.0):

@@ -7,6 +7,8 @@ is interpolated bilinearly.
 Two kinds of map need two zeros. In a map that was made of scans, the echoes of a wall scatter about the centre of its
 cells. In a map that was drawn, walls are thick and beams end at their faces; there the field is signed, with the zero
 at the face and negative distances inside. A map counts as drawn where nearly all wall cells have another one behind.
+A wall that was drawn has two faces. A noisy beam may end nearer to the one that its laser cannot see; `seen_distance`
+returns the distance from the other one.
 """
 
 from __future__ import annotations
@@ -39,12 +41,14 @@ class DistanceField:
     """The field of one map: `counts[row, column]` times COUNT_M is the distance (m) of a cell's centre from a wall.
 
     `geometry` is the map's: cell size m, x and y of the lower left corner m, rotation rad. `wall_std_m` is how
-    uncertain the map is about where a beam ends in a wall: smeared walls are thicker than real ones.
+    uncertain the map is about where a beam ends in a wall: smeared walls are thicker than real ones. `is_drawn` states
+    that the distances are signed.
     """
 
     counts: Field
     geometry: Floats
     wall_std_m: float
+    is_drawn: bool
 
     @staticmethod
     def of(grid: GridMap) -> DistanceField:
@@ -58,10 +62,11 @@ class DistanceField:
         # A wall of thickness t has a mean depth of t/4, and a place drawn evenly from it a deviation of t/√12.
         depth = float(inside[wall].mean() - half) * COUNT_M if wall.any() else 0.0
         wall_std_m = min(4.0 * depth / math.sqrt(12.0), THICKEST_STD_M)
-        if thick_share(grid.blocked) > DRAWN_SHARE:
+        is_drawn = thick_share(grid.blocked) > DRAWN_SHARE
+        if is_drawn:
             wall_std_m = 0.0
             counts = np.where(wall, half - inside, counts - half).astype(np.int16)
-        return DistanceField(counts, grid.geometry, wall_std_m)
+        return DistanceField(counts, grid.geometry, wall_std_m, is_drawn)
 
 
 @compiled
@@ -151,3 +156,31 @@ def distance_at(counts: Field, geometry: Floats, x: float, y: float, out: Floats
     out[0] = (below + q * (above - below)) * COUNT_M
     out[1] = c * along_u - s * along_v
     out[2] = s * along_u + c * along_v
+
+
+@compiled
+def seen_distance(
+    counts: Field, geometry: Floats, x: float, y: float, ahead_x: float, ahead_y: float, reach: float, out: Floats
+) -> None:
+    """As `distance_at`, for a beam in direction (ahead_x, ahead_y) that ends at (x, y): from the face that it sees.
+
+    Where the nearest face looks away from the beam, the beam is followed back for at most `reach` (m) to a face that it
+    has entered. The distance is then the negative distance from the plane of that face.
+    """
+    distance_at(counts, geometry, x, y, out)
+    if out[1] * ahead_x + out[2] * ahead_y < 0.0:
+        return
+    near = np.empty(3)
+    step: float = 0.5 * geometry[0]
+    is_inside, back = out[0] < 0.0, 0.0
+    while back < reach:
+        back += step
+        distance_at(counts, geometry, x - back * ahead_x, y - back * ahead_y, near)
+        slope = near[1] * ahead_x + near[2] * ahead_y
+        if near[0] < 0.0:
+            is_inside = True
+        elif is_inside and slope < 0.0:
+            out[0], out[1], out[2] = near[0] + back * slope, near[1], near[2]
+            return
+        else:
+            is_inside = False

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +13,8 @@ from typing import ClassVar, Protocol, TypeVar
 
 from linkpose.errors import LinkposeError
 from linkpose.localization.linalg import Floats
+from linkpose.outputs import new_file
 from linkpose.presentation import counted
-from linkpose.recording.csvfile import create, write_all
 
 HEADER = ("time_s", "kind", "a", "b", "c")
 # kind -> what its columns a, b, c hold; the first of a kind in NAMED is the name of a beacon or landmark.
@@ -193,11 +192,8 @@ def format_event(event: Event) -> str:
 
 def write_lines(path: Path, lines: list[str], force: bool) -> None:
     """Writes a text file. Raises LinkposeError where that cannot be done, or the file exists and `force` is not set."""
-    descriptor = create(path, force)
-    try:
-        write_all(descriptor, path, ("\n".join(lines) + "\n").encode())
-    finally:
-        os.close(descriptor)
+    with new_file(path, force) as file:
+        file.write(("\n".join(lines) + "\n").encode())
 
 
 def _check_header(path: Path, line: int, row: list[str]) -> None:

@@ -16,7 +16,7 @@ from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
 from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.measuring import MeasurementBuilder, constant_states, drift_state, thesis_beams
+from linkpose.localization.measuring import MeasurementBuilder, constant_states, drift_states, thesis_beams
 from linkpose.localization.noise import check_correlation
 from linkpose.localization.relocation import Relocator
 from linkpose.localization.settings import DRIFT, Pose, Settings
@@ -44,6 +44,10 @@ Method = Literal["scan-match", "ekf", "ukf", "mcl"]
 # When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
+
+# Standard deviation (rad/s) of a vehicle's turn rate at one instant around the mean rate that attitudes show: waves and
+# thrusters turn it unevenly. That of the simulated commands of Table 2.2. Twice it doubles the stated σ of wz.
+UNEVEN_TURN_RAD_S = 0.01
 
 # An unscented filter predicts longer intervals (s) by linearisation: the headings of its sigma points spread around the
 # circle then, and have no mean. Sensors of the thesis measure at least every 0.2 s.
@@ -139,8 +143,9 @@ class Localizer:
         if self.vehicle is CONSTANT_VELOCITY:
             beacons = at_their_height(beacons)
         self.control_kind = CONTROLS.get(self.vehicle.model, "")
-        drifting = [drift_state(beacon) for beacon in beacons] if settings.drift_std_m else []
-        motion = self.vehicle.extended((*constant_states(settings.estimate, list(beacons)), *drifting))
+        names = list(beacons)
+        constants = constant_states(settings.estimate, names)
+        motion = self.vehicle.extended((*constants, *drift_states(settings, names)))
         self.prior = first_pose(head) if settings.start is None else None
         start = settings.start if self.prior is None else _pose_of(self.prior)
         if start is None and self.vehicle is CONSTANT_VELOCITY:
@@ -178,7 +183,7 @@ class Localizer:
         if name == "scan-match" and "scan" in kinds and grid is not None:
             from linkpose.localization.scan_tracking import ScanTracker
 
-            self.laser = ScanTracker(grid)
+            self.laser = ScanTracker(grid, settings.beam_growth)
 
     def feed(self, events: Sequence[Event | Scan], hold_s: float | None = None) -> Row:
         """Moves on to the events' time and applies them; all are one measurement. `hold_s` is how long a control holds,
@@ -219,6 +224,8 @@ class Localizer:
     def use(self, settings: Settings) -> None:
         """Continues with other noises. Adds states for errors of the ranges that drift where there were none yet."""
         has_drifts = bool(self.settings.drift_std_m)
+        if has_drifts:  # their states are in the filter
+            settings = replace(settings, drift_is_shared=self.settings.drift_is_shared)
         self.settings = self.sensors.settings = settings
         self.filter.noise_root = noise_root(settings, self.vehicle)
         if settings.drift_std_m and not has_drifts:
@@ -226,12 +233,12 @@ class Localizer:
         self.filter.drifts = drifts_of(settings, self.filter.motion)
 
     def _add_drifts(self) -> None:
-        """Adds a state for the drifting error of each beacon's ranges.
+        """Adds the states of the ranges' drifting errors.
 
         The pose so far assumed no drift, so its variance grows by that of the drift.
         """
         before, beacons = self.filter, self.sensors.beacons
-        motion = before.motion.extended(tuple(map(drift_state, beacons)))
+        motion = before.motion.extended(drift_states(self.settings, list(beacons)))
         n, size = len(before.state), len(motion.states)
         covariance = np.eye(size) * self.settings.drift_std_m**2
         covariance[:n, :n] = before.covariance
@@ -280,10 +287,14 @@ class Localizer:
             return Row(time_s, np.full_like(state, np.nan), np.full_like(covariance, np.nan))
         if not np.isfinite(state).all():
             state[:] = np.inf
-        elif self.laser:
+            return Row(time_s, state, covariance)
+        if self.laser:
             self.laser.add_map_error(self.filter, covariance)
-        elif self.filter.drifts is not None:
+        if self.filter.drifts is not None and not self.settings.drift_is_shared:
             covariance[[0, 1], [0, 1]] += self.settings.drift_std_m**2
+        if "wz_rad_s" in self.states:
+            at = self.states.index("wz_rad_s")
+            covariance[at, at] += UNEVEN_TURN_RAD_S**2
         return Row(time_s, state, covariance)
 
     def steer(self, event: Event, hold_s: float | None) -> None:
@@ -378,7 +389,7 @@ def check(
         )
     if settings.estimate and not kinds & set(NAMED):
         raise NothingToEstimate(origin)
-    if name == "mcl" and "scan" not in kinds:
+    if name in ("mcl", "scan-match") and "scan" not in kinds:
         raise NeedsScans(origin, name)
     if not _has_start(log, name, settings, beacons, kinds):
         raise MissingStart
@@ -388,7 +399,8 @@ def check(
                 f"{origin} line {event.line}: {event.kind} to beacon {event.beacon}, whose place is not known "
                 f"(known are {', '.join(beacons)}); add it to the beacon file or delete the row"
             )
-    check_correlation(settings.ranges.correlation, most_at_once(log), "the correlation of the ranges")
+    if settings.ranges.correlation:
+        check_correlation(settings.ranges.correlation, most_at_once(log), "the correlation of the ranges")
     check_correlation(
         settings.motion_correlation,
         2 if vehicle_of(kinds) is UNICYCLE else 3,

@@ -10,7 +10,7 @@ from linkpose.errors import MapMismatch
 from linkpose.localization.events import Log, Scan
 from linkpose.localization.grid import GridMap
 from linkpose.localization.linalg import Floats
-from linkpose.localization.scan_matching import FEWEST_BEAMS, ScanMatcher, beam_ends
+from linkpose.localization.scan_matching import FEWEST_BEAMS, ScanMatcher, beams_of
 
 # Share of the beams along an estimated path that hit a wall, below which the map is checked: 0.95 in a public
 # building with its own map, 0.03 to 0.25 with the map or the laser mirrored. A higher share costs needless searches.
@@ -25,16 +25,17 @@ GOOD_SHARE = 0.75
 
 
 class _Change(NamedTuple):
-    """What may be wrong, and the factors on x and y of the beam ends that make up for it."""
+    """What may be wrong, and the factors on the columns of the beams (`scan_fit`) that make up for it."""
 
     text: str
-    factors: tuple[float, float]
+    factors: tuple[float, float, float, float, float]
 
 
+UNCHANGED = (1.0, 1.0, 1.0, 1.0, 1.0)
 CHANGES = (
-    _Change("mirrored; flip the map's image, or reverse the order of the laser's beams", (1.0, -1.0)),
-    _Change("half as large; correct the resolution in its YAML file", (2.0, 2.0)),
-    _Change("twice as large; correct the resolution in its YAML file", (0.5, 0.5)),
+    _Change("mirrored; flip the map's image, or reverse the order of the laser's beams", (1.0, -1.0, 1.0, -1.0, 1.0)),
+    _Change("half as large; correct the resolution in its YAML file", (2.0, 2.0, 1.0, 1.0, 2.0)),
+    _Change("twice as large; correct the resolution in its YAML file", (0.5, 0.5, 1.0, 1.0, 0.5)),
 )
 
 
@@ -45,11 +46,11 @@ def check_map(log: Log, grid: GridMap, share: float, origin: str) -> str:
     """
     if share >= LEAST_SHARE:
         return ""
-    scans = [points for points in map(beam_ends, _spread(log)) if len(points) >= FEWEST_BEAMS]
+    scans = [beams for beams in map(beams_of, _spread(log)) if len(beams) >= FEWEST_BEAMS]
     if not scans:
         return ""
-    matcher = ScanMatcher(grid)
-    best_share, likelihood = _fit(matcher, scans, (1.0, 1.0))
+    matcher = ScanMatcher(grid, 0.0)
+    best_share, likelihood = _fit(matcher, scans, UNCHANGED)
     found = [(_fit(matcher, scans, change.factors), change) for change in CHANGES]
     (changed_share, changed), change = max(found, key=lambda item: item[0][1])
     if changed > likelihood + LEAD and changed_share >= GOOD_SHARE:
@@ -71,11 +72,11 @@ def _spread(log: Log) -> list[Scan]:
     return [scans[i] for i in sorted(set(np.linspace(0, len(scans) - 1, SCANS).astype(int).tolist()))] if scans else []
 
 
-def _fit(matcher: ScanMatcher, scans: list[Floats], factors: tuple[float, float]) -> tuple[float, float]:
+def _fit(matcher: ScanMatcher, scans: list[Floats], factors: tuple[float, ...]) -> tuple[float, float]:
     """Mean share of the beams that hit, and mean log-likelihood, of the scans at the best pose of each."""
     fits = []
-    for points in scans:
-        changed = points * np.array(factors)
+    for beams in scans:
+        changed = beams * np.array(factors)
         poses = matcher.search(changed, CANDIDATES)
         fits.append(matcher.compare(changed, poses[0]) if poses else (0.0, -np.inf))
     share, likelihood = np.mean(fits, axis=0).tolist()

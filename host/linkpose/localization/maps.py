@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError
 from linkpose.inputs import open_binary
 from linkpose.localization.grid import FREE, OCCUPIED, UNKNOWN, GridMap
+from linkpose.outputs import new_file
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -64,20 +65,24 @@ def load_map(path: Path) -> GridMap:
     return GridMap(blocked, np.array([keys.resolution_m, *keys.origin]))
 
 
-def save_map(path: Path, occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float]) -> None:
-    """Writes a map_server YAML file and a PGM image beside it. `occupied` is (rows, columns), row 0 the lowest y."""
+def save_map(
+    path: Path, occupied: NDArray[np.bool_], resolution: float, origin: tuple[float, float], force: bool = False
+) -> None:
+    """Writes a map_server YAML file and a PGM image beside it. `occupied` is (rows, columns), row 0 the lowest y.
+
+    Raises FileExists (unless `force`) and CannotWrite.
+    """
     from PIL import Image
 
     image = path.with_suffix(".pgm")
-    try:
-        Image.fromarray(np.where(occupied[::-1], 0, 254).astype(np.uint8)).save(image)
-        path.write_text(
-            f"image: {image.name}\nresolution: {resolution}\norigin: [{origin[0]}, {origin[1]}, 0.0]\n"
-            f"negate: 0\noccupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n",
-            encoding="utf-8",
-        )
-    except OSError as error:
-        raise LinkposeError(f"cannot write the map {path}: {error.strerror}; choose another place") from error
+    keys = (
+        f"image: {image.name}\nresolution: {resolution}\norigin: [{origin[0]}, {origin[1]}, 0.0]\n"
+        f"negate: 0\noccupied_thresh: {OCCUPIED_THRESHOLD}\nfree_thresh: {FREE_THRESHOLD}\n"
+    )
+    with new_file(image, force) as file:
+        Image.fromarray(np.where(occupied[::-1], 0, 254).astype(np.uint8)).save(file, format="PPM")
+    with new_file(path, force) as file:
+        file.write(keys.encode())
 
 
 _DEEPEST = 20  # levels of a map's YAML; a map file has two

@@ -19,7 +19,7 @@ from linkpose.localization.distance_field import DistanceField, Field, distance_
 from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import GridMap
 from linkpose.localization.linalg import Floats, wrap_angle
-from linkpose.localization.scan_matching import beam_ends
+from linkpose.localization.scan_matching import beams_of
 from linkpose.localization.settings import Settings
 from linkpose.localization.track import Track
 from linkpose.localization.vehicle import first_pose
@@ -57,7 +57,7 @@ def localize_mcl(log: Log, settings: Settings, grid: GridMap) -> Track:
             if not seen or step[1] > UPDATE_M or abs(step[0] + step[2]) > UPDATE_RAD:
                 _move(particles, step, rng)
                 updated, seen = odometry.copy(), True
-                points = beam_ends(event)
+                points = beams_of(event)
                 points = np.ascontiguousarray(points[:: max(1, math.ceil(len(points) / BEAMS))])
                 weigh(field.counts, field.geometry, points, particles, weights)
                 applied += len(points)

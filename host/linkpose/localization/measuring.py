@@ -24,6 +24,9 @@ BEACONS_FOR_CONSTANTS = 3
 MOST_REPEATS = 500.0
 
 
+_SHARED_DRIFT = f"{DRIFT}_m"
+
+
 def default_constants(kinds: set[str], beacons: int) -> tuple[str, ...]:
     """The constants of ranges to estimate where the user names none, for a log with these kinds of measurement and
     ranges to so many beacons. Acoustic ranges under water have no common bias.
@@ -43,8 +46,14 @@ def constant_states(estimate: Sequence[str], beacons: Sequence[str]) -> tuple[st
     return tuple(names)
 
 
-def drift_state(beacon: str) -> str:
-    """The state that holds the drifting error of a beacon's ranges."""
+def drift_states(settings: Settings, beacons: Sequence[str]) -> tuple[str, ...]:
+    """Names of the states that hold the drifting errors of the ranges: one of each beacon, one of all, or none."""
+    if settings.drift_std_m == 0.0:
+        return ()
+    return (_SHARED_DRIFT,) if settings.drift_is_shared else tuple(map(_drift_state, beacons))
+
+
+def _drift_state(beacon: str) -> str:
     return f"{DRIFT}_{_safe(beacon)}_m"
 
 
@@ -70,7 +79,8 @@ class MeasurementBuilder:
             beacon: [self._constant("scale", beacon), self._constant("bias", beacon)] for beacon in beacons
         }
 
-        self._drifts = {beacon: self._index(drift_state(beacon)) for beacon in beacons}
+        shared = self._index(_SHARED_DRIFT)
+        self._drifts = {name: self._index(_drift_state(name)) if shared < 0 else shared for name in beacons}
 
     def _index(self, state: str) -> int:
         """Index of a state, or −1."""

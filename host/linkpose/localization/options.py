@@ -40,7 +40,7 @@ class LocalizationOptions:
 
     Attributes:
         range_std_m: σ of a range (m).
-        range_growth: growth k of σ with the range (m/m), for the noise model "affine".
+        range_growth: growth k of σ with the range (m/m), of the noise model "affine" and of the beams of "scan-match".
         bearing_std_rad: σ of a bearing (rad).
         speed_std_m_s, turn_std_rad_s: σ of one odometry sample (m/s, rad/s).
         velocity_std_m_s: σ of one velocity sample on each axis (m/s).
@@ -126,7 +126,7 @@ class LocalizationOptions:
         With the start "auto", the settings have none.
         """
         from linkpose.localization.noise import RangeNoise
-        from linkpose.localization.settings import Settings
+        from linkpose.localization.settings import BEAM_GROWTH, Settings
         from linkpose.localization.ukf import Transform
 
         def noise(option: str) -> Any:
@@ -140,6 +140,7 @@ class LocalizationOptions:
             "transform": Transform(self.alpha, self.beta, self.kappa)
             if self.transform == "scaled"
             else Transform(kappa=self.kappa),
+            "beam_growth": BEAM_GROWTH if self.range_growth is None else self.range_growth,
             "estimate": constants,
             "start": None if self.start == "auto" else self.start or start,
         }

@@ -27,7 +27,7 @@ from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons, PathScore, Truth, read_beacons, read_truth, score_track
 from linkpose.localization.track import Track
 from linkpose.localization.tuning import described, tune
-from linkpose.localization.vehicle import kinds_of, vehicle_of
+from linkpose.localization.vehicle import WALK_M_S, WALK_RAD_S, kinds_of, never_moves, vehicle_of
 from linkpose.presentation import counted
 from linkpose.recording.table import Table
 
@@ -203,6 +203,12 @@ def prepare(
     settings = {
         method: options.settings(constants, None if method == "scan-match" else read.start) for method in methods
     }
+    if never_moves(events):
+        speed, turn = options.speed_std_m_s or WALK_M_S, options.turn_std_rad_s or WALK_RAD_S
+        settings = {
+            method: replace(chosen, speed_std_m_s=speed, turn_std_rad_s=turn) for method, chosen in settings.items()
+        }
+        remarks.append("the odometry of the log is always at rest: the motion is taken from the scans; give --start")
     if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
         check_units(events, places, str(origin))
     for method, chosen in settings.items():

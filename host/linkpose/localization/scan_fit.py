@@ -2,21 +2,24 @@
 
 The fitted pose minimises
 
-    Σ c²/(2 σ²) ln(1 + d(p_i)²/c²)  +  ½ (x − x̄)ᵀ P⁻¹ (x − x̄)
+    Σ c²/(2 σ²) ln(1 + w_i d_i²/c²)  +  ½ (x − x̄)ᵀ P⁻¹ (x − x̄)
 
-where d(p_i) is the distance from the end of beam i to the nearest wall, σ the deviation of a beam's end, and c the
-scale of the Cauchy loss (Zhang, "Parameter estimation techniques", Image and Vision Computing 15, 1997, Table 1). The
-second term is the prediction of the Kalman filter.
+where d_i is the distance from the end of beam i to the wall that it sees, σ²/w_i the variance of that distance, and c
+the scale of the Cauchy loss (Zhang, "Parameter estimation techniques", Image and Vision Computing 15, 1997, Table 1).
+The second term is the prediction of the Kalman filter.
+
+A scan is an array (n, 5) of beams: end x, y in the robot's axes (m), direction x, y in them, and range (m).
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import Field, distance_at
+from linkpose.localization.distance_field import Field, seen_distance
 from linkpose.localization.linalg import Floats, lower_cholesky, wrap_angle
 
 # The fit ends when a step is smaller than this (m, and rad): a tenth of what a laser scanner resolves.
@@ -27,68 +30,128 @@ LONGEST_STEP_M = 0.5
 LONGEST_TURN_RAD = 0.2
 
 
+class Walls(NamedTuple):
+    """A map's distance field, and how far (m) a beam may end behind the face that it sees: 0 in an unsigned field."""
+
+    counts: Field
+    geometry: Floats
+    reach: float
+
+
+class Weighted(NamedTuple):
+    """A scan (n, 5), the weights w (n,) of its beams, 1/σ² (1/m²), and the scale c (m) of the loss."""
+
+    beams: Floats
+    weights: Floats
+    information: float
+    scale: float
+
+
+class Prior(NamedTuple):
+    """The prediction: x, y, θ (3,) and its information P⁻¹ (3, 3)."""
+
+    mean: Floats
+    information: Floats
+
+
 @compiled
-def scan_cost(counts: Field, geometry: Floats, points: Floats, pose: Floats, scale: float) -> float:
-    """Σ c² ln(1 + d²/c²) / 2 (m²) of beam ends `points` (n, 2) in the robot's axes, seen from `pose`."""
+def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: float, weights: Floats) -> None:
+    """Fills w_i = σ² / (σ² + (k r_i cos β_i)²) for ranges r_i whose deviation grows by k (m/m); σ is `std` (m).
+
+    β_i is the angle between the beam and the normal of its wall, seen from `pose`: an error along a beam that grazes a
+    wall moves its end along the wall.
+    """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at = np.empty(3)
-    total = 0.0
-    for i in range(points.shape[0]):
-        px, py = points[i, 0], points[i, 1]
-        distance_at(counts, geometry, pose[0] + c * px - s * py, pose[1] + s * px + c * py, at)
-        total += math.log1p(at[0] * at[0] / (scale * scale))
-    return 0.5 * scale * scale * total
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        across = growth * beams[i, 4] * (at[1] * ux + at[2] * uy) / std
+        weights[i] = 1.0 / (1.0 + across * across)
 
 
 @compiled
-def normal_equations(
-    counts: Field, geometry: Floats, points: Floats, pose: Floats, scale: float, hessian: Floats, slope: Floats
-) -> None:
-    """Fills Σ w J Jᵀ (3, 3) and Σ w J d (3,) at `pose`, with the Cauchy weight w = 1 / (1 + d²/c²)."""
+def scan_cost(walls: Walls, scan: Weighted, pose: Floats) -> float:
+    """The first sum above, seen from `pose`."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
+    beams, scale2 = scan.beams, scan.scale * scan.scale
+    at = np.empty(3)
+    total = 0.0
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        total += math.log1p(scan.weights[i] * at[0] * at[0] / scale2)
+    return 0.5 * scan.information * scale2 * total
+
+
+@compiled
+def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Floats, slope: Floats) -> None:
+    """Fills Σ v w J Jᵀ and Σ v J Jᵀ (2, 3, 3), and Σ v w J d (3,), at `pose`, with the Cauchy weight v = 1 / (1 + w
+    d²/c²).
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    beams, scale2 = scan.beams, scan.scale * scan.scale
     at, row = np.empty(3), np.empty(3)
-    hessian[:] = 0.0
+    hessians[:] = 0.0
     slope[:] = 0.0
-    for i in range(points.shape[0]):
-        rx, ry = c * points[i, 0] - s * points[i, 1], s * points[i, 0] + c * points[i, 1]
-        distance_at(counts, geometry, pose[0] + rx, pose[1] + ry, at)
-        weight = 1.0 / (1.0 + at[0] * at[0] / (scale * scale))
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        weight = scan.weights[i]
+        robust = 1.0 / (1.0 + weight * at[0] * at[0] / scale2)
         row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
         for j in range(3):
-            slope[j] += weight * row[j] * at[0]
+            slope[j] += robust * weight * row[j] * at[0]
             for k in range(3):
-                hessian[j, k] += weight * row[j] * row[k]
+                hessians[0, j, k] += robust * weight * row[j] * row[k]
+                hessians[1, j, k] += robust * row[j] * row[k]
 
 
 @compiled
-def fit_scan(
-    counts: Field,
-    geometry: Floats,
-    points: Floats,
-    scale: float,
-    information: float,
-    mean: Floats,
-    prior: Floats,
-    pose: Floats,
-    hessian: Floats,
-) -> float:
-    """Improves `pose` (3,) in place and fills `hessian` (3, 3) with Σ w J Jᵀ there; returns the cost.
+def misfit(walls: Walls, scan: Weighted, pose: Floats, pull: Floats) -> float:
+    """How far (m) beams end from the walls that they hit: the root of Σ v² w d² / Σ v², seen from `pose`.
 
-    `information` is 1/σ² (1/m²); `mean` (3,) and `prior` (3, 3) are the prediction and its information P⁻¹. The cost is
-    the function above.
+    Fills `pull` (3,) with Σ ±v J, where the sign turns each wall's normal to the laser: how the walls move the pose
+    when all of them are nearer than in the map.
     """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    beams, scale2 = scan.beams, scan.scale * scan.scale
+    at = np.empty(3)
+    pull[:] = 0.0
+    total, weights = 0.0, 1e-12
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        square = scan.weights[i] * at[0] * at[0]
+        robust = 1.0 / (1.0 + square / scale2)
+        facing = robust if at[1] * ux + at[2] * uy < 0.0 else -robust
+        pull[0] += facing * at[1]
+        pull[1] += facing * at[2]
+        pull[2] += facing * (at[2] * rx - at[1] * ry)
+        total += robust * robust * square
+        weights += robust * robust
+    return math.sqrt(total / weights)
+
+
+@compiled
+def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians: Floats) -> float:
+    """Improves `pose` (3,) in place and fills `hessians` as `normal_equations` does there; returns the cost."""
     slope, step, trial = np.empty(3), np.empty(3), np.empty(3)
     matrix, lower = np.empty((3, 3)), np.empty((3, 3))
-    cost = _cost(counts, geometry, points, scale, information, mean, prior, pose)
+    cost = _cost(walls, scan, prior, pose)
     damping = 0.0
     for _ in range(MOST_STEPS):
-        normal_equations(counts, geometry, points, pose, scale, hessian, slope)
+        normal_equations(walls, scan, pose, hessians, slope)
         for j in range(3):
-            step[j] = -information * slope[j]
+            step[j] = -scan.information * slope[j]
             for k in range(3):
-                off = mean[k] - pose[k]
-                step[j] += prior[j, k] * (wrap_angle(off) if k == 2 else off)
-                matrix[j, k] = information * hessian[j, k] + prior[j, k]
+                off = prior.mean[k] - pose[k]
+                step[j] += prior.information[j, k] * (wrap_angle(off) if k == 2 else off)
+                matrix[j, k] = scan.information * hessians[0, j, k] + prior.information[j, k]
             matrix[j, j] *= 1.0 + damping
         if not lower_cholesky(matrix, lower) or lower[0, 0] == 0.0 or lower[1, 1] == 0.0 or lower[2, 2] == 0.0:
             break
@@ -97,7 +160,7 @@ def fit_scan(
         shrink = min(shrink, LONGEST_TURN_RAD / (abs(step[2]) + 1e-12))
         for j in range(3):
             trial[j] = pose[j] + shrink * step[j]
-        trial_cost = _cost(counts, geometry, points, scale, information, mean, prior, trial)
+        trial_cost = _cost(walls, scan, prior, trial)
         if trial_cost > cost:
             damping = 10.0 * damping + 0.1
             if damping > 1e3:
@@ -110,29 +173,20 @@ def fit_scan(
         if abs(step[0]) + abs(step[1]) + abs(step[2]) < SMALL_STEP:
             break
     pose[2] = wrap_angle(pose[2])
-    normal_equations(counts, geometry, points, pose, scale, hessian, slope)
+    normal_equations(walls, scan, pose, hessians, slope)
     return cost
 
 
 @compiled
-def _cost(
-    counts: Field,
-    geometry: Floats,
-    points: Floats,
-    scale: float,
-    information: float,
-    mean: Floats,
-    prior: Floats,
-    pose: Floats,
-) -> float:
+def _cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
     off = np.empty(3)
     for k in range(3):
-        off[k] = pose[k] - mean[k]
+        off[k] = pose[k] - prior.mean[k]
     off[2] = wrap_angle(off[2])
-    total = information * scan_cost(counts, geometry, points, pose, scale)
+    total = scan_cost(walls, scan, pose)
     for j in range(3):
         for k in range(3):
-            total += 0.5 * off[j] * prior[j, k] * off[k]
+            total += 0.5 * off[j] * prior.information[j, k] * off[k]
     return total
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import DistanceField, Field, distance_at
+from linkpose.localization.distance_field import FARTHEST_M, DistanceField, Field, distance_at
 from linkpose.localization.events import Scan
 from linkpose.localization.global_search import likely_poses, nearby_poses
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats, wrap_angle
-from linkpose.localization.scan_fit import fit_scan
+from linkpose.localization.scan_fit import Prior, Walls, Weighted, beam_weights, fit_scan, misfit
 
 # Deviation of a beam's end from the wall that the map shows (m), at least: half a cell of 5 cm, and a scanner's 3 cm.
 # Doubling it makes the filter follow its odometry more; the error in two public buildings grows by a fifth. A map with
@@ -51,36 +51,42 @@ NO_WALL = 0.1  # probability that a beam meets what the map does not have
 class Fit:
     """How a scan fitted: `share` of its beams that hit a wall, log-likelihood, and the test statistic of the shift.
 
-    `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `hessian` (3, 3) is Σ w J Jᵀ
-    of the beams at the fitted pose.
+    `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `walls` (3, 3) is Σ v J Jᵀ at
+    the fitted pose, the information of walls whose places are uncertain by 1 m, and `pull` (3,) the effect of an error
+    that all of them share. `misfit_m` is how far beams end from the walls that they hit.
     """
 
     share: float
     log_likelihood: float
     d2: float
     beams: int
-    hessian: Floats
+    walls: Floats
+    pull: Floats
+    misfit_m: float
 
 
-def beam_ends(scan: Scan) -> Floats:
-    """Ends (n, 2) of the beams with an echo, in the robot's axes (m)."""
+def beams_of(scan: Scan) -> Floats:
+    """The beams (n, 5) with an echo, at most MOST_BEAMS, as `scan_fit` describes them."""
     echo = np.flatnonzero(np.isfinite(scan.ranges_m))
-    echo = echo[:: max(1, math.ceil(len(echo) / MOST_BEAMS))]
+    if len(echo) > MOST_BEAMS:
+        echo = echo[np.linspace(0, len(echo) - 1, MOST_BEAMS).round().astype(int)]
     angles = scan.angles_rad[echo] + scan.mount[2]
-    ranges = scan.ranges_m[echo]
-    return np.column_stack((scan.mount[0] + ranges * np.cos(angles), scan.mount[1] + ranges * np.sin(angles)))
+    ranges, ahead, left = scan.ranges_m[echo], np.cos(angles), np.sin(angles)
+    return np.column_stack((scan.mount[0] + ranges * ahead, scan.mount[1] + ranges * left, ahead, left, ranges))
 
 
 class ScanMatcher:
     """Laser scans against one map. The state of the filters that it corrects starts with x, y, heading."""
 
-    def __init__(self, grid: GridMap) -> None:
-        self.grid = grid
+    def __init__(self, grid: GridMap, growth: float) -> None:
+        """`growth` is that of a range's standard deviation with the range (m/m)."""
+        self.grid, self.growth = grid, growth
         self.field = DistanceField.of(grid)
+        self.walls = Walls(self.field.counts, self.field.geometry, FARTHEST_M if self.field.is_drawn else 0.0)
         self.beam_std_m = max(BEAM_STD_M, self.field.wall_std_m)
 
-    def correct(self, run: KalmanFilter, points: Floats, expected: float = -math.inf) -> Fit:
-        """Corrects the filter, in place, with beam ends (n, 2).
+    def correct(self, run: KalmanFilter, beams: Floats, expected: float = -math.inf) -> Fit:
+        """Corrects the filter, in place, with a scan (n, 5).
 
         A fit whose log-likelihood is below `expected` is not trusted: the wheels may have slipped. Then the fit also
         starts from the poses nearby that explain the scan best, with a prediction that is SLIP times as uncertain.
@@ -89,63 +95,71 @@ class ScanMatcher:
         mean, covariance = run.state[at], run.covariance[np.ix_(at, at)]
         prior: Floats = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         std = np.sqrt(np.diag(covariance))
-        best, hessian, cost = self._fit(points, mean, prior, mean)
+        best, hessians, cost = self._fit(beams, mean, prior, mean)
         if max(std[0], std[1]) > CERTAIN_M or std[2] > CERTAIN_RAD:
             for start in _around(mean, std):
-                other = self._fit(points, mean, prior, start)
+                other = self._fit(beams, mean, prior, start)
                 if other[2] < cost:
-                    best, hessian, cost = other
-        share, log_likelihood = self.compare(points, best)
+                    best, hessians, cost = other
+        share, log_likelihood = self.compare(beams, best)
         if log_likelihood < expected:
             loose: Floats = np.asarray(np.linalg.inv(covariance + np.diag(np.square(SLIP))), dtype=np.float64)
             lead = log_likelihood + SLIP_LEAD
-            for start in nearby_poses(self.field.geometry, self.field.counts, points, mean, NEARBY):
-                pose, other_hessian, _ = self._fit(points, mean, loose, start)
-                other_share, other_likelihood = self.compare(points, pose)
+            for start in nearby_poses(self.field.geometry, self.field.counts, beams, mean, NEARBY):
+                pose, other_hessians, _ = self._fit(beams, mean, loose, start)
+                other_share, other_likelihood = self.compare(beams, pose)
                 slipped = other_likelihood - _half_square(pose - mean, loose)
                 if slipped > lead:
-                    best, hessian, prior, lead = pose, other_hessian, loose, slipped
+                    best, hessians, prior, lead = pose, other_hessians, loose, slipped
                     share, log_likelihood = other_share, other_likelihood
             covariance = np.asarray(np.linalg.inv(prior), dtype=np.float64)
         # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
-        d2 = _condition(run, at, best, covariance, prior + hessian / self.beam_std_m**2)
-        return Fit(share, log_likelihood, d2, len(points), hessian)
+        d2 = _condition(run, at, best, covariance, prior + hessians[0] / self.beam_std_m**2)
+        pull = np.empty(3)
+        off_m = misfit(self.walls, self._weighted(beams, best, LOSS_SCALE * self.beam_std_m), best, pull)
+        return Fit(share, log_likelihood, d2, len(beams), hessians[1], pull, off_m)
 
-    def compare(self, points: Floats, pose: Floats) -> tuple[float, float]:
+    def compare(self, beams: Floats, pose: Floats) -> tuple[float, float]:
         """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""
-        return hits(self.field.counts, self.field.geometry, points, pose)
+        return hits(self.field.counts, self.field.geometry, beams, pose)
 
-    def search(self, points: Floats, most: int) -> list[Floats]:
+    def search(self, beams: Floats, most: int) -> list[Floats]:
         """Poses (3,) of the whole map from which the scan fits, refined, best first."""
         wide = np.diag([1e-3, 1e-3, 1e-2])  # next to no information: only the scan decides
         found: list[tuple[float, Floats]] = []
-        for start in likely_poses(self.grid, self.field.counts, points, 4 * most):
-            pose, _, _ = self._fit(points, start, wide, start)
-            found.append((-self.compare(points, pose)[1], pose))
+        for start in likely_poses(self.grid, self.field.counts, beams, 4 * most):
+            pose, _, _ = self._fit(beams, start, wide, start)
+            found.append((-self.compare(beams, pose)[1], pose))
         found.sort(key=lambda item: item[0])
         return [pose for _, pose in found[:most]]
 
-    def _fit(self, points: Floats, mean: Floats, prior: Floats, start: Floats) -> tuple[Floats, Floats, float]:
-        pose, hessian = start.copy(), np.empty((3, 3))
-        field, information, narrow = self.field, 1.0 / self.beam_std_m**2, LOSS_SCALE * self.beam_std_m
+    def _fit(self, beams: Floats, mean: Floats, prior: Floats, start: Floats) -> tuple[Floats, Floats, float]:
+        pose, hessians = start.copy(), np.empty((2, 3, 3))
+        narrow = LOSS_SCALE * self.beam_std_m
         for scale in (max(WIDE_SCALE_M, narrow), narrow):
-            cost = fit_scan(field.counts, field.geometry, points, scale, information, mean, prior, pose, hessian)
-        return pose, hessian, cost
+            cost = fit_scan(self.walls, self._weighted(beams, pose, scale), Prior(mean, prior), pose, hessians)
+        return pose, hessians, cost
+
+    def _weighted(self, beams: Floats, pose: Floats, scale: float) -> Weighted:
+        """The scan with the weights that its beams have from `pose`."""
+        weights = np.empty(len(beams))
+        beam_weights(self.walls, beams, pose, self.growth, self.beam_std_m, weights)
+        return Weighted(beams, weights, 1.0 / self.beam_std_m**2, scale)
 
 
 @compiled
-def hits(counts: Field, geometry: Floats, points: Floats, pose: Floats) -> tuple[float, float]:
+def hits(counts: Field, geometry: Floats, beams: Floats, pose: Floats) -> tuple[float, float]:
     """Share of beam ends within HIT_M of a wall, and COMPARED_BEAMS times the mean of ln((1 − ε) exp(−d²/2s²) + ε)."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at = np.empty(3)
     count, total = 0, 0.0
-    for i in range(points.shape[0]):
-        px, py = points[i, 0], points[i, 1]
+    for i in range(beams.shape[0]):
+        px, py = beams[i, 0], beams[i, 1]
         distance_at(counts, geometry, pose[0] + c * px - s * py, pose[1] + s * px + c * py, at)
         count += abs(at[0]) < HIT_M
         ratio = at[0] / HIT_M
         total += math.log((1.0 - NO_WALL) * math.exp(-0.5 * ratio * ratio) + NO_WALL)
-    n = max(points.shape[0], 1)
+    n = max(beams.shape[0], 1)
     return count / n, COMPARED_BEAMS * total / n
 
 

@@ -12,20 +12,22 @@ from linkpose.localization.grid import GridMap
 from linkpose.localization.hypotheses import INCUMBENT, Contest, Hypothesis
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats
-from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beam_ends
+from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beams_of
 
 # The errors of a map do not average out over scans; they are added to the reported covariance. GRID_ERROR (m, m, rad)
-# is the part that no beam shows: the reference paths of two public buildings differ by so much. SHARED_BEAMS
-# neighbouring beams of a full scan end in one piece of wall and share its error, whose deviation (m) is at least
-# LEAST_WALL_STD_M. Where the walls do not bind a direction, the error is at most UNBOUND (m, m, rad). Twice
-# SHARED_BEAMS widens the stated deviations by 1.4.
+# is the part that no beam shows: the reference paths of two public buildings differ by so much. The rest is the error
+# of walls, whose deviation (m) is the usual misfit of the scans in this map, at least LEAST_WALL_STD_M and what the
+# thickness of the walls suggests. SHARED_BEAMS neighbouring beams of a full scan end in one piece of wall and share its
+# error, and all walls may be nearer by as much, as smeared ones are. Where the walls do not bind a direction, the error
+# is at most UNBOUND (m, m, rad). Twice SHARED_BEAMS widens the stated deviations by 1.4.
 GRID_ERROR = np.array([0.02, 0.02, 0.012])
 SHARED_BEAMS, LEAST_WALL_STD_M = 18.0, 0.025
 UNBOUND = np.array([0.5, 0.5, 0.2])
 CANDIDATES = 60  # poses of a global search that compete
 CANDIDATE_STD = np.array([0.2, 0.2, 0.1])  # of a pose that the search found (m, m, rad)
 # What this map and robot usually reach: the log-likelihood of a scan, and how far it falls below.
-# It follows better scans within RISE of them and worse ones within FALL: a lost robot must not become the usual.
+# It follows better scans within RISE of them and worse ones within FALL: a lost robot must not become the usual. The
+# usual misfit follows within RISE.
 RISE, FALL = 20.0, 200.0
 # A scan that is so many usual falls (and at least so much) below the usual is suspect, and bad. A suspect one is
 # fitted again as after a slip; so many bad ones in a row make the pose suspect.
@@ -50,14 +52,16 @@ class Result:
 class ScanTracker:
     """Corrects filters by scans in one map."""
 
-    def __init__(self, grid: GridMap) -> None:
-        self.matcher = ScanMatcher(grid)
+    def __init__(self, grid: GridMap, growth: float) -> None:
+        """`growth` is that of a range's standard deviation with the range (m/m)."""
+        self.matcher = ScanMatcher(grid, growth)
         self.contest: Contest | None = None
         self.bad = 0
         self.was_known = False
         self.wait = BAD_SCANS
         self.usual, self.fall = -2.0, 2.0  # before the first scan: an old map
         self.map_error = np.diag(GRID_ERROR**2)
+        self.misfit2 = LEAST_WALL_STD_M**2  # the usual one (m²)
 
     def _below(self, falls: float) -> float:
         """The log-likelihood so many falls below the usual."""
@@ -75,20 +79,20 @@ class ScanTracker:
 
     def correct(self, run: KalmanFilter, scan: Scan, known: bool) -> Result:
         """Corrects with a scan. Until the pose is known, hypotheses from a search of the whole map compete."""
-        points = beam_ends(scan)
-        if len(points) < FEWEST_BEAMS:
+        beams = beams_of(scan)
+        if len(beams) < FEWEST_BEAMS:
             return Result(run, known)
         if self.contest is not None:
-            return self._continue(self.contest, run, points)
+            return self._continue(self.contest, run, beams)
         if not known:
-            return self._open(run, points, [])
-        fit = self.matcher.correct(run, points, self._below(SUSPECT))
+            return self._open(run, beams, [])
+        fit = self.matcher.correct(run, beams, self._below(SUSPECT))
         self.was_known = True
         self.bad = self.bad + 1 if fit.log_likelihood < self._below(BAD) else 0
         if self.bad >= self.wait:
-            found = self.matcher.search(points, CANDIDATES)
-            if found and self.matcher.compare(points, found[0])[1] > fit.log_likelihood + BETTER:
-                return self._open(run, points, [run.copy()], found)
+            found = self.matcher.search(beams, CANDIDATES)
+            if found and self.matcher.compare(beams, found[0])[1] > fit.log_likelihood + BETTER:
+                return self._open(run, beams, [run.copy()], found)
             self.bad, self.wait = 0, min(2 * self.wait, MOST_BAD_SCANS)
         self._bind(fit)
         self._adapt(fit.log_likelihood)
@@ -110,37 +114,40 @@ class ScanTracker:
 
     def _bind(self, fit: Fit) -> None:
         """Estimates how the errors of the walls in this scan move the pose: the covariance of a fit to them alone."""
-        std = max(LEAST_WALL_STD_M, self.matcher.field.wall_std_m)
+        self.misfit2 += (fit.misfit_m**2 - self.misfit2) / RISE
+        std = max(LEAST_WALL_STD_M, self.matcher.field.wall_std_m, math.sqrt(self.misfit2))
         shared = SHARED_BEAMS * fit.beams / MOST_BEAMS
-        self.map_error = np.linalg.inv(fit.hessian / (shared * std**2) + np.diag(1.0 / UNBOUND**2))
-        self.map_error += np.diag(GRID_ERROR**2)
+        bound = fit.walls / (shared * std**2) + np.diag(1.0 / UNBOUND**2)
+        error = np.asarray(np.linalg.inv(bound), dtype=np.float64)
+        common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
+        self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
 
     def _open(
-        self, run: KalmanFilter, points: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
+        self, run: KalmanFilter, beams: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
     ) -> Result:
         """Starts a contest of the poses that a search of the whole map finds, and of `others`."""
         candidates = list(others)
-        for pose in self.matcher.search(points, CANDIDATES) if found is None else found:
+        for pose in self.matcher.search(beams, CANDIDATES) if found is None else found:
             candidate = run.copy()
             candidate.place(candidate.pose_indices, pose, np.diag(CANDIDATE_STD**2))
-            self.matcher.correct(candidate, points)
+            self.matcher.correct(candidate, beams)
             candidates.append(candidate)
         self.contest = Contest(
             [Hypothesis(other, INCUMBENT, True) for other in others]
             + [Hypothesis(candidate) for candidate in candidates[len(others) :]]
         )
-        self.contest.judge([self.matcher.compare(points, c.state[c.pose_indices])[1] for c in candidates])
-        return self._undecided(run, points)
+        self.contest.judge([self.matcher.compare(beams, c.state[c.pose_indices])[1] for c in candidates])
+        return self._undecided(run, beams)
 
-    def _undecided(self, run: KalmanFilter, points: Floats) -> Result:
+    def _undecided(self, run: KalmanFilter, beams: Floats) -> Result:
         """The tracked pose while it competes; unknown afterwards."""
         incumbent = self.contest.incumbent if self.contest is not None else None
-        return Result(incumbent or run, incumbent is not None, 0, len(points))
+        return Result(incumbent or run, incumbent is not None, 0, len(beams))
 
-    def _continue(self, contest: Contest, run: KalmanFilter, points: Floats) -> Result:
+    def _continue(self, contest: Contest, run: KalmanFilter, beams: Floats) -> Result:
         fits = [
             # Only the tracked pose may have slipped; the others are compared where they are.
-            self.matcher.correct(h.filter, points, self._below(SUSPECT) if h.is_incumbent else -math.inf)
+            self.matcher.correct(h.filter, beams, self._below(SUSPECT) if h.is_incumbent else -math.inf)
             for h in contest.hypotheses
         ]
         likelihoods = [fit.log_likelihood for fit in fits]
@@ -150,10 +157,10 @@ class ScanTracker:
             # A search that found nothing better is not repeated soon.
             self.wait = min(2 * self.wait, MOST_BAD_SCANS) if winner.is_incumbent else BAD_SCANS
             self.contest, self.bad, self.was_known = None, 0, True
-            share, _ = self.matcher.compare(points, winner.filter.state[winner.filter.pose_indices])
-            return Result(winner.filter, True, round(share * len(points)), len(points), relocated)
+            share, _ = self.matcher.compare(beams, winner.filter.state[winner.filter.pose_indices])
+            return Result(winner.filter, True, round(share * len(beams)), len(beams), relocated)
         self.bad = self.bad + 1 if max(likelihoods) < self._below(BAD) else 0
         if self.bad >= BAD_SCANS:  # none of the hypotheses is right: the robot was carried meanwhile
             self.bad = 0
-            return self._open(run, points, [])
-        return self._undecided(run, points)
+            return self._open(run, beams, [])
+        return self._undecided(run, beams)

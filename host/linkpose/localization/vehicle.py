@@ -25,6 +25,9 @@ DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehi
 CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
 FIRST_S = 5.0  # of ranges from which a tag's first place is fitted; a walk of a few metres at the most
 FIT_STEPS = 20
+# Standard deviations of speed and turn rate of a robot whose log has no odometry (m/s, rad/s): a walk. With twice them,
+# a scan may be fitted to the next door.
+WALK_M_S, WALK_RAD_S = 1.0, 0.8
 FASTEST_M_S = 2.0  # standard deviation of a tag's velocity at the start, on each axis: a walk
 
 
@@ -40,6 +43,12 @@ def vehicle_of(kinds: set[str]) -> MotionModel:
     if "twist" in kinds:
         return HOLONOMIC
     return UNICYCLE if "odometry" in kinds or "scan" in kinds or "bearing_range" in kinds else CONSTANT_VELOCITY
+
+
+def never_moves(log: Log) -> bool:
+    """Whether the odometry of a log with laser scans is at rest throughout, as without encoders."""
+    controls = [event for event in log if isinstance(event, Event) and event.kind in ("odometry", "twist")]
+    return "scan" in kinds_of(log) and not any(any(event.values) for event in controls)
 
 
 def control_holds(log: Log, kind: str) -> dict[int, float]:

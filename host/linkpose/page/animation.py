@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from linkpose import plotting
-from linkpose.errors import CannotWrite
 from linkpose.localization.surroundings import Surroundings
+from linkpose.outputs import new_file
+from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
 from linkpose.page.origin import titled
@@ -50,17 +51,16 @@ def save_animation(
     plotting.check_output(path, force, FORMATS)
     columns, values = rows_of(tables, wanted)
     text = _recorded(columns, values, rig_of(tables), surroundings)
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise CannotWrite(path, error.strerror or str(error)) from error
+    with new_file(path, force) as file:
+        file.write(text.encode())
 
 
 def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Surroundings) -> str:
     """HTML that plays rows (N ≥ 1, columns). viser records the scene while a server runs on the loopback address."""
     server = serve(LOOPBACK, free_port(LOOPBACK), is_named=False)
     try:
-        drawing, replay = Drawing(server, columns, rig, surroundings, values), Replay(values)
+        changes, replay = Changes(server), Replay(values)
+        drawing = Drawing(server, changes, columns, rig, surroundings, values)
         start, end = replay.span_s
         frames = int(np.clip(round((end - start) / FRAME_INTERVAL_S), 1, MOST_FRAMES)) + 1
         recorded = server.get_scene_serializer()
@@ -71,6 +71,7 @@ def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Su
             name = drawing.best(row)
             if name is not None:
                 drawing.draw(newest, row, name, replay)
+                changes.queue()
             recorded.insert_sleep((end - start) / frames)
         return titled(recorded.as_html())
     finally:

@@ -10,6 +10,7 @@ import numpy as np
 
 from linkpose import quantities
 from linkpose.localization.surroundings import Surroundings
+from linkpose.page.changes import Changes
 from linkpose.page.history import History, Replay
 from linkpose.page.scene import scene_of
 from linkpose.presentation import Row, RowReader
@@ -27,12 +28,15 @@ class Drawing:
     def __init__(
         self,
         server: viser.ViserServer,
+        changes: Changes,
         columns: Sequence[str],
         rig: Rig,
         surroundings: Surroundings,
         known: Floats | None = None,
     ) -> None:
         """`columns` are those of the estimates: `time_s`, `<filter>_<quantity>_<unit>`; others are a reference.
+
+        What moves goes into `changes`.
 
         `known` (N, columns) are all rows of a file, whose paths the camera shows from the start.
         """
@@ -45,7 +49,7 @@ class Drawing:
             if (part := quantities.split(column)) is not None and not (part.prefix or part.is_std)
         ]
         places = self._corners(np.empty((0, len(columns))) if known is None else known)
-        self._scene = scene_of(server, self._of_filter.values(), rig, surroundings, places)
+        self._scene = scene_of(server, changes, self._of_filter.values(), rig, surroundings, places)
         self._candidates = [(q, name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of]
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import socket
 import threading
@@ -11,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from linkpose import quantities
 from linkpose.errors import LinkposeError
+from linkpose.exclusions import Exclusions
 from linkpose.localization.surroundings import Surroundings
+from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import PageStatus
-from linkpose.presentation import Exclusions, fault_lines, working_sensors
-from linkpose.quantities import EXCLUDED
+from linkpose.presentation import fault_lines, working_sensors
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
@@ -30,8 +31,8 @@ if TYPE_CHECKING:
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
-# Seconds between two updates of the page. Whatever its size, an update costs 1 to 2 ms of CPU (tests/bench/page.py),
-# most of it in viser's server: twice the interval halves the cost, and a sample takes up to 0.12 s more to the screen.
+# Seconds between two updates of the page. An update costs about 1 ms of CPU (tests/bench/page.py): twice the interval
+# halves the cost, and a sample takes up to 0.12 s more to the screen.
 UPDATE_INTERVAL_S = 0.12
 CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two looks at the health, which counts over all sensors
@@ -43,8 +44,8 @@ _PORTS_TRIED = 100
 class Page:
     """Serves a page that shows estimates. A context manager: leaving it ends the server.
 
-    `show` only puts a block into a queue: another thread sends it, and drops old blocks rather than let anything wait
-    for a slow browser. The server sends the files of its own client program and no other file of the machine.
+    `show` only puts a block into a queue: the server's thread sends it, and drops old blocks rather than let anything
+    wait for a slow browser. The server sends the files of its own client program and no other file of the machine.
     """
 
     def __init__(
@@ -78,20 +79,17 @@ class Page:
         self._columns = list(columns)
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
-        self._exclusions = Exclusions()
+        self._exclusions = Exclusions(self._columns)
         self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
         self._status, self._blocks = PageStatus(), 0
         self._updates = 0
         self._clients: set[int] = set()
         self._marks: list[float] = []
         self._is_changed = self._is_status_changed = True  # since the last update
-        self._closing = threading.Event()
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self._follows_mice = any(EXCLUDED in of for of in quantities.by_filter(columns).values())
         self._build(rig, surroundings or Surroundings())
-        self._thread = threading.Thread(target=self._send, name="linkpose page", daemon=True)
-        self._thread.start()
+        self._sender = asyncio.run_coroutine_threadsafe(self._send(), self._server.get_event_loop())
 
     def show(self, estimates: Floats, status: Callable[[], PageStatus]) -> None:
         """Takes estimates (N, columns) or the newest row (columns,). Never waits.
@@ -111,14 +109,18 @@ class Page:
         self._queue.append((estimates, True))
 
     def raise_if_stopped(self) -> None:
-        """Raises KeyboardInterrupt once the user has pressed "stop", which ends a run as Ctrl-C does."""
+        """Raises KeyboardInterrupt once the user has pressed "stop", which ends a run as Ctrl-C does.
+
+        Raises the error with which the sender ended, if it did.
+        """
         if self.stopped.is_set():
             raise KeyboardInterrupt
+        if self._sender.done():
+            self._sender.result()
 
     def close(self) -> None:
         """Ends the server."""
-        self._closing.set()
-        self._thread.join()
+        self._sender.cancel()
         # viser waits up to 6 s for the farewell of browsers; the end of a measurement does not.
         threading.Thread(target=self._server.stop, name="linkpose page stop", daemon=True).start()
 
@@ -135,8 +137,9 @@ class Page:
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         known = self._replay.values if self._replay is not None else None
-        self._drawing = Drawing(server, self._columns, rig, surroundings, known)
-        self._panel = Panel(server, self._columns, self._drawing.charted, self._redraw)
+        self._changes = Changes(server)
+        self._drawing = Drawing(server, self._changes, self._columns, rig, surroundings, known)
+        self._panel = Panel(server, self._changes, self._columns, self._drawing.charted, self._redraw)
         if self._replay is not None:
             self._build_player(self._replay)
         elif self._on_mark is not None:
@@ -174,21 +177,29 @@ class Page:
             self._on_mark(self._marks[-1])
             self._redraw()
 
-    def _send(self) -> None:
-        """The sender: everything that arrived since the last update, as one update."""
-        while not self._closing.wait(UPDATE_INTERVAL_S):
-            self._take()
-            clients = set(self._server.get_clients())
-            if clients - self._clients:
-                self._redraw()
-            self._clients = clients
-            if not clients:
-                continue
-            if self._replay is not None:
-                self._advance(self._replay)
-            if self._is_changed or self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
-                self._is_changed = False
-                self._draw()
+    async def _send(self) -> None:
+        """The sender: everything that arrived since the last update, as one update.
+
+        It runs on the server's event loop: with a thread of its own, each update would wake two threads, which wait for
+        each other.
+        """
+        while True:
+            await asyncio.sleep(UPDATE_INTERVAL_S)
+            self._update()
+
+    def _update(self) -> None:
+        self._take()
+        clients = set(self._server.get_clients())
+        if clients - self._clients:
+            self._redraw()
+        self._clients = clients
+        if not clients:
+            return
+        if self._replay is not None:
+            self._advance(self._replay)
+        if self._is_changed or self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
+            self._is_changed = False
+            self._draw()
 
     def _take(self) -> None:
         blocks = [self._queue.popleft() for _ in range(len(self._queue))]
@@ -197,12 +208,10 @@ class Page:
         last_anew = max((at for at, (_, is_anew) in enumerate(blocks) if is_anew), default=None)
         if last_anew is not None:
             del blocks[:last_anew]
-            self._history, self._exclusions = History(self._columns), Exclusions()
-        rows = np.vstack([rows for rows, _ in blocks])
+            self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
+        rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
         self._history.add(rows)
-        if self._follows_mice:
-            for row in rows:
-                self._exclusions.follow(float(row[0]), self._drawing.read(row))
+        self._exclusions.follow(rows)
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -219,15 +228,14 @@ class Page:
         newest, status = self._history.newest, self._status
         row = self._drawing.read(newest) if newest is not None else {}
         if self._replay is not None:
-            self._exclusions.follow(self._place_s, row)
+            self._exclusions.follow(self._replay.newest[np.newaxis])
         name = self._panel.chosen or self._drawing.best(row)
-        with self._server.atomic():
-            if self._is_status_changed:
-                self._is_status_changed = False
-                self._draw_health(newest, status)
-            if newest is not None and name is not None:
-                self._draw_estimates(newest, row, name, status)
-        self._server.flush()  # at once: viser would wait for more
+        if self._is_status_changed:
+            self._is_status_changed = False
+            self._draw_health(newest, status)
+        if newest is not None and name is not None:
+            self._draw_estimates(newest, row, name, status)
+        self._changes.broadcast(self._clients)
         self._updates += 1
 
     def _draw_estimates(self, newest: Floats, row: Any, name: str, status: PageStatus) -> None:

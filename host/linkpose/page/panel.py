@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from linkpose import quantities
+from linkpose.page.changes import Changes, Nullable
 from linkpose.presentation import Row, angle_with_std, joint_texts, length_with_std, pose_text
 from linkpose.quantities import (
     HEADING,
@@ -23,14 +24,13 @@ from linkpose.sensors.measurements import Floats
 if TYPE_CHECKING:
     import viser
 
-Nullable = Floats | list[float | None]  # values of a chart; None is a gap
-
 GAP_S = 0.5  # the shortest gap of a curve
 BEST = "best"  # the choice that follows the best filter
 _BAND, _LINE, _REFERENCE = "rgba(0, 114, 178, 0.22)", "#0072B2", "#222222"
 _CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
 _OTHER_HEIGHT = 105
 _CHART_PADDING = (10, 14, 0, 0)  # pixels above, right, below, left: the outermost labels are not cut
+_LABEL_SPACE = 18  # pixels between two labels of the y axis, at least; with uPlot's 30 a low chart has a single label
 _OK, _FAULT = "#2b8a3e", "#c92a2a"
 
 
@@ -40,15 +40,17 @@ class Panel:
     def __init__(
         self,
         server: viser.ViserServer,
+        changes: Changes,
         columns: Sequence[str],
         charted: Sequence[Quantity],
         on_choice: Callable[[], None],
     ) -> None:
         """`charted` are the quantities with a chart if a filter estimates them.
 
-        `on_choice` is called when another filter is chosen.
+        Texts and curves go into `changes`. `on_choice` is called when another filter is chosen.
         """
-        gui = self._gui = server.gui
+        gui, self._changes = server.gui, changes
+        self._gui = gui
         self._columns = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
         self._health = gui.add_html("")
@@ -59,6 +61,7 @@ class Panel:
             self._choice.on_update(lambda _: on_choice())
         self._shown = [quantity for quantity in charted if quantity in able]
         self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
+        self._charted = ""  # the filter whose charts are visible
 
     def add_charts(self) -> None:
         """Adds the charts below what the panel has already."""
@@ -88,7 +91,7 @@ class Panel:
             title=quantity.axis_label,
             bands=(uplot.Band(series=(2, 1), fill=_BAND),),
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
-            axes=(uplot.Axis(size=26), uplot.Axis(size=48)),
+            axes=(uplot.Axis(size=26), uplot.Axis(size=48, space=_LABEL_SPACE)),
             legend=uplot.Legend(show=False),
             height=_CHART_HEIGHT.get(quantity, _OTHER_HEIGHT),
             padding=_CHART_PADDING,
@@ -97,20 +100,14 @@ class Panel:
     def draw_charts(self, window: Floats, name: str) -> None:
         """Draws the rows (N, columns) of the last seconds as the filter `name` sees them."""
         rows = with_gap_rows(window)
+        columns = self._of_filter.get(name, {})
+        if name != self._charted:
+            self._charted = name
+            for quantity, chart in self._charts.items():
+                chart.visible = quantity in columns
         for quantity, chart in self._charts.items():
-            column = self._of_filter.get(name, {}).get(quantity)
-            chart.visible = column is not None
-            if column is not None:
-                self._send(chart, self._chart_data(rows, quantity, column))
-
-    @staticmethod
-    def _send(chart: viser.GuiUplotHandle, data: tuple[Nullable, ...]) -> None:
-        """Gives a chart its data: arrays travel as binary, lists where there are gaps.
-
-        viser casts what is assigned to float arrays, which cannot hold uPlot's gap, null.
-        """
-        cast(Any, chart._impl.props).data = data
-        chart._queue_update("data", data)
+            if quantity in columns:
+                self._changes.plot(chart, self._chart_data(rows, quantity, columns[quantity]))
 
     def _chart_data(self, rows: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
         """Time, value − 2σ, value + 2σ, value, and the reference if there is one, with None in gaps."""
@@ -118,7 +115,9 @@ class Panel:
         value = rows[:, self._columns[column]] * scale
         if quantity.period is not None:
             known = np.isfinite(value)
-            value[known] = np.unwrap(value[known], period=quantity.period * scale)
+            period = quantity.period * scale
+            if (np.abs(np.diff(value[known])) > 0.5 * period).any():
+                value[known] = np.unwrap(value[known], period=period)
         std_at = self._columns.get(quantities.std_column(column) or "")
         std = rows[:, std_at] * scale if std_at is not None else np.zeros(len(rows))
         std = np.where(np.isfinite(std), std, 0.0)
@@ -132,7 +131,7 @@ class Panel:
         """Shows which sensors work, in green, and each fault as a red line."""
         pills = "".join(_pill(f"{name} ok", _OK) for name in working)
         alarms = "".join(_alarm(line) for line in faults)
-        self._set(
+        self._changes.write(
             self._health,
             f"<div style='padding:4px 12px'><div style='font-size:12px;color:#666'>{html.escape(title)}</div>"
             f"<div style='font-size:12px;color:#666;white-space:pre-wrap'>{html.escape(summary)}</div>"
@@ -155,17 +154,12 @@ class Panel:
         else:
             first, lines, caption = _angles(values), [], "attitude"
         below = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
-        self._set(
+        self._changes.write(
             self._headline,
             f"<div style='padding:2px 12px'><div style='font-size:12px;color:#666'>{caption}, {html.escape(name)}</div>"
             f"<div style='font-size:26px;font-weight:600;font-variant-numeric:tabular-nums'>{html.escape(first)}</div>"
             f"<div style='font-variant-numeric:tabular-nums;white-space:pre-wrap'>{below}</div></div>",
         )
-
-    @staticmethod
-    def _set(element: viser.GuiHtmlHandle, text: str) -> None:
-        if element.content != text:
-            element.content = text
 
 
 def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
@@ -182,6 +176,8 @@ def with_gap_rows(rows: Floats) -> Floats:
     if len(rows) < 3:
         return rows
     step = np.diff(rows[:, 0])
+    if step.max() <= GAP_S:
+        return rows
     at = np.flatnonzero(step > max(3.0 * float(np.median(step)), GAP_S))
     if not len(at):
         return rows
@@ -196,7 +192,8 @@ def _bounds(value: Floats, std: Floats) -> tuple[float, float]:
     if not known.any():
         return -np.inf, np.inf
     low, high = float(value[known].min()), float(value[known].max())
-    margin = max(0.3 * (high - low), 3 * float(np.median(std[known])))
+    middle = np.count_nonzero(known) // 2
+    margin = max(0.3 * (high - low), 3 * float(np.partition(std[known], middle)[middle]))
     return low - margin, high + margin
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from linkpose.localization.surroundings import Surroundings, map_corners
 from linkpose.page import geometry
+from linkpose.page.changes import Changes
 from linkpose.presentation import Row, best_filter
 from linkpose.quantities import (
     ANGLE,
@@ -42,7 +43,6 @@ _PATH_INTERVAL = 5  # redraws of the scene between two of the path, which is lar
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
 _ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
-_CONE_CHANGE = 0.02  # share of a cone's radius that is not worth a message: a pixel or two
 _FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does not hide parts of them
 
 
@@ -73,9 +73,9 @@ class LinkScene:
     shown_by: ClassVar[tuple[Quantity, ...]] = (HEIGHT, ROLL)
     is_path_due = False
 
-    def __init__(self, server: viser.ViserServer, j2s_m: Floats | None) -> None:
+    def __init__(self, server: viser.ViserServer, changes: Changes, j2s_m: Floats | None) -> None:
         """`j2s_m` (3,) is J2S, from the joint centre to the sensor, in the sensor's axes (m)."""
-        scene = server.scene
+        scene, self._changes = server.scene, changes
         length = 1.0 if j2s_m is None else float(np.linalg.norm(j2s_m))
         _ground(scene, 2.4 * length)
         scene.add_icosphere("/joint", 0.035 * length, _BLACK)
@@ -88,7 +88,7 @@ class LinkScene:
         size = 0.07 * length
         self._sensor = scene.add_box("/link/sensor", _ORANGE, (size, 0.75 * size, 0.3 * size))
         self._axes = scene.add_frame("/link/axes", axes_length=2.5 * size, axes_radius=0.07 * size)
-        self._cone = Cone(scene, "/link/cone")
+        self._cone = Cone(scene, changes, "/link/cone")
         self._drawn_j2s: Floats | None = None
         self.set_j2s(j2s_m)
         server.initial_camera.position = (1.15 * length, -1.75 * length, 1.0 * length)
@@ -116,13 +116,13 @@ class LinkScene:
         (roll, roll_std), (pitch, pitch_std), (yaw, _) = (values.get(q, nothing) for q in (ROLL, PITCH, YAW))
         self._link.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
-            self._link.wxyz = geometry.attitude(roll, pitch, yaw)
+            self._changes.turn(self._link, geometry.attitude(roll, pitch, yaw))
         self._cone.draw(max(roll_std, pitch_std) if is_known else math.nan)
         roll, pitch = (reference.get(q, math.nan) for q in (ROLL, PITCH))
         self._reference.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
             # A yaw that starts at 0 with the estimate is comparable with the reference's only up to a constant.
-            self._reference.wxyz = geometry.attitude(roll, pitch, yaw)
+            self._changes.turn(self._reference, geometry.attitude(roll, pitch, yaw))
 
 
 class RobotScene:
@@ -131,8 +131,8 @@ class RobotScene:
     charted: ClassVar[tuple[Quantity, ...]] = (X, Y, HEADING)
     shown_by: ClassVar[tuple[Quantity, ...]] = (HEADING,)
 
-    def __init__(self, server: viser.ViserServer, surroundings: Surroundings, places: Floats) -> None:
-        self._scene, self._draws = server.scene, 0
+    def __init__(self, server: viser.ViserServer, changes: Changes, surroundings: Surroundings, places: Floats) -> None:
+        self._scene, self._changes, self._draws = server.scene, changes, 0
         (x, y), size = _extent(np.vstack([surroundings.corners_m(), places]))
         self._floor_m = max(_FLOOR_M, 0.001 * size)
         _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
@@ -161,8 +161,8 @@ class RobotScene:
         x, y, heading = (values.get(q, (math.nan, math.nan))[0] for q in (X, Y, HEADING))
         self._robot.visible = is_known = math.isfinite(x + y + heading)
         if is_known:
-            self._robot.position = np.array([x, y, 0.0])
-            self._robot.wxyz = geometry.attitude(0.0, 0.0, math.degrees(heading))
+            self._changes.move(self._robot, np.array([x, y, 0.0]))
+            self._changes.turn(self._robot, geometry.attitude(0.0, 0.0, math.degrees(heading)))
         if path is not None:
             self._draw_path(path)
 
@@ -218,8 +218,8 @@ class ChainScene:
     shown_by: ClassVar[tuple[Quantity, ...]] = (QW,)
     is_path_due = False
 
-    def __init__(self, server: viser.ViserServer, rig: Rig) -> None:
-        scene, chain = server.scene, rig.chain
+    def __init__(self, server: viser.ViserServer, changes: Changes, rig: Rig) -> None:
+        scene, chain, self._changes = server.scene, rig.chain, changes
         r1, r2 = np.array(chain.r1_m or _UNKNOWN_R1_M), np.array(chain.r2_m or _UNKNOWN_R2_M)
         j2s = None if rig.joint.known_j2s_m is None or chain.r1_m is None else np.array(rig.joint.known_j2s_m)
         end = _BEYOND_SENSOR * r1 if j2s is None else r1 - j2s  # of link 1, from the joint between the links
@@ -240,7 +240,7 @@ class ChainScene:
             scene.add_frame(f"{name}/axes", axes_length=0.15 * size, axes_radius=0.005 * size, position=place)
         if j2s is not None:
             scene.add_icosphere("/joint/link1/fixed", 0.05 * size, _BLACK, position=end)
-        self._cone = Cone(scene, "/joint/link2/cone")
+        self._cone = Cone(scene, changes, "/joint/link2/cone")
         self._cone.point_along(_BEYOND_SENSOR * r2)
         server.initial_camera.position = (0.9 * size, -1.5 * size, 1.0 * size)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * size)
@@ -255,24 +255,25 @@ class ChainScene:
         chain = best_filter(row, row, QW)
         values = row[chain] if chain is not None else {}
         rotation = np.array([values.get(q, nothing)[0] for q in CHAIN_ROTATION])
-        self._links[0].wxyz = attitude
+        self._changes.turn(self._links[0], attitude)
         if self._fixed_m is not None:
-            self._joint.position = self._base_m - geometry.turned(attitude, self._fixed_m)
+            self._changes.move(self._joint, self._base_m - geometry.turned(attitude, self._fixed_m))
         self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
-            self._links[1].wxyz = product(attitude, rotation / np.linalg.norm(rotation))
+            self._changes.turn(self._links[1], product(attitude, rotation / np.linalg.norm(rotation)))
         self._cone.draw(values.get(QW, nothing)[1] if is_known else math.nan)
 
 
 class Cone:
     """A cone of ±2σ about an axis that starts at its parent's origin, hidden while σ is unknown."""
 
-    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+    def __init__(self, scene: viser.SceneApi, changes: Changes, name: str) -> None:
+        self._changes = changes
         vertices, faces = geometry.cone()
         self._mesh = scene.add_mesh_simple(
             name, vertices, faces, color=_BLUE, opacity=0.25, side="double", cast_shadow=False, visible=False
         )
-        self._length_m = self._radius_m = 0.0
+        self._length_m = 0.0
 
     def point_along(self, axis_m: Floats) -> None:
         """Gives the cone an axis (3,)."""
@@ -282,26 +283,29 @@ class Cone:
         """Opens the cone to ±2σ; NaN hides it."""
         radius = geometry.cone_radius(self._length_m, std_deg)
         self._mesh.visible = radius > 0.0
-        if abs(radius - self._radius_m) > _CONE_CHANGE * self._radius_m:
-            self._mesh.scale = (radius, radius, self._length_m)
-            self._radius_m = radius
+        if radius > 0.0:
+            self._changes.scale(self._mesh, (radius, radius, self._length_m))
 
 
 def scene_of(
     server: viser.ViserServer,
+    changes: Changes,
     filters: Iterable[Mapping[Quantity, str]],
     rig: Rig,
     surroundings: Surroundings,
     places: Floats,
 ) -> Scene:
-    """The scene for the quantities that the filters estimate. The camera of a robot's also shows `places` (N, 2), m."""
+    """The scene for the quantities that the filters estimate; what moves in it goes into `changes`.
+
+    The camera of a robot's scene also shows `places` (N, 2), m.
+    """
     estimated = {quantity for of in filters for quantity in of}
     if QW in estimated:
-        return ChainScene(server, rig)
+        return ChainScene(server, changes, rig)
     j2s = rig.joint.known_j2s_m
     if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
-        return RobotScene(server, surroundings, places)
-    return LinkScene(server, None if j2s is None else np.array(j2s))
+        return RobotScene(server, changes, surroundings, places)
+    return LinkScene(server, changes, None if j2s is None else np.array(j2s))
 
 
 def _extent(points: Floats) -> tuple[Floats, float]:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import datetime
 import io
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from linkpose.errors import CannotWrite, FileExists, UnknownPicture
-from linkpose.recording.csvfile import STDOUT, create, write_all
+from linkpose.outputs import STDOUT, new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -65,6 +64,30 @@ def finish(axes: Axes, label: str) -> None:
     axes.margins(x=0.0)
 
 
+# Seconds in a unit of time, the unit, and the shortest axis (s) that has it: ten minutes, two hours.
+_TIME_UNITS = ((3600.0, "h", 7200.0), (60.0, "min", 600.0))
+
+
+def label_time(axes: Axes) -> None:
+    """Label and ticks of a time axis (s), of long runs in minutes or hours, at round numbers of them."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    class Locator(MaxNLocator):
+        """Ticks at round numbers of the unit."""
+
+        def tick_values(self, vmin: float, vmax: float) -> list[float]:
+            return [factor * tick for tick in super().tick_values(vmin / factor, vmax / factor)]
+
+    first, last = axes.get_xlim()
+    factor, unit = next(((f, u) for f, u, least in _TIME_UNITS if last - first >= least), (1.0, "s"))
+    axes.set_xlabel(f"time ({unit})")
+    if factor > 1.0:
+        axes.xaxis.set_major_locator(Locator(nbins=9, steps=[1, 2, 5, 10]))
+        axes.xaxis.set_major_formatter(
+            FuncFormatter(lambda time_s, _: f"{time_s / factor:g}".replace("-", "\N{MINUS SIGN}"))
+        )
+
+
 def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -> None:
     """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
     rank = {label: i for i, label in enumerate(best_first)}
@@ -85,6 +108,15 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
 def _by_rows(labels: list[str], columns: int) -> list[str]:
     """Labels in the order in which matplotlib, which fills a legend column by column, shows them row by row."""
     return [label for column in range(columns) for label in labels[column::columns]]
+
+
+def without_formulas(figure: Figure) -> Figure:
+    """The figure, with each `$` as it is: in the names of files and columns, it does not begin a formula."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+    return figure
 
 
 def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMATS) -> None:
@@ -124,14 +156,10 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     Raises FileError as `check_output` does, and where the file cannot be written.
     """
     check_output(path, force)
-    if path == STDOUT:
-        figure.savefig(picture := io.BytesIO(), dpi=DPI, format="png")
-        with os.fdopen(create(STDOUT, force), "wb") as stream:
-            write_all(stream.fileno(), STDOUT, picture.getvalue())
-        return
+    ending = "png" if path == STDOUT else path.suffix[1:].lower()
     # Two pictures of the same data are the same file.
-    metadata = {".pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, ".svg": {"Date": None}}
-    try:
-        figure.savefig(path, dpi=DPI, metadata=metadata.get(path.suffix.lower()))
-    except (OSError, ValueError) as error:
-        raise CannotWrite(path, str(error)) from error
+    metadata = {"pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, "svg": {"Date": None}}
+    # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
+    figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
+    with new_file(path, force) as file:
+        file.write(picture.getvalue())

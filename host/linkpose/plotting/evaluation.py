@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linkpose.evaluation.statistics import normalised_errors
-from linkpose.plotting.canvas import finish, legend_above, line_style, new_figure
+from linkpose.plotting.canvas import finish, label_time, legend_above, line_style, new_figure, without_formulas
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, others_hide_best
 from linkpose.plotting.sources import is_barometric, shortened
@@ -55,12 +55,12 @@ def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
         _errors(axes, scores, name)
         axes.tick_params(labelbottom=row == len(rows) - 1)
         if row == len(rows) - 1:
-            axes.set_xlabel("time (s)")
+            label_time(axes)
         if any(_has_sigma(score, name) for score in scores):
             _histogram(figure.add_subplot(grid[row, 1]), scores, name)
     figure.align_ylabels()
     _table(figure.add_subplot(grid[-1, :]), found.scores)
-    return figure
+    return without_formulas(figure)
 
 
 def _has_sigma(score: Score, name: str) -> bool:

@@ -97,6 +97,6 @@ def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> 
     axes.set_title(title, fontsize=10, pad=20)
     finish(axes, "")
     axes.margins(x=0.05)
-    axes.invert_yaxis()
+    axes.set_ylim(len(compared), -1)
     legend_above(axes)
     return figure

@@ -64,11 +64,16 @@ def draw(axes: Axes, time_s: Floats, value: Floats, period: float | None = None,
     """A line over time, broken at gaps and where an angle wraps."""
     times, values = decimated(*broken(time_s, value, period=period))
     axes.plot(times, values, **style)
-    known = np.concatenate([[False], np.isfinite(values), [False]])
-    alone = known[1:-1] & ~known[:-2] & ~known[2:]  # no line has one point
+    alone = _alone(values)
     if alone.any():
         dots = style | {"label": None, "linestyle": "none"}
         axes.plot(times[alone], values[alone], marker=".", markersize=4, **dots)
+
+
+def _alone(values: Floats) -> NDArray[np.bool_]:
+    """Values between two that are missing: no line and no band has one point."""
+    known = np.concatenate([[False], np.isfinite(values), [False]])
+    return np.asarray(known[1:-1] & ~known[:-2] & ~known[2:])
 
 
 def band(axes: Axes, time_s: Floats, middle: Floats, std: Floats, colour: str, label: str | None = None) -> None:
@@ -79,6 +84,10 @@ def band(axes: Axes, time_s: Floats, middle: Floats, std: Floats, colour: str, l
     axes.fill_between(
         t, mean - 2 * sigma, mean + 2 * sigma, color=colour, alpha=BAND_ALPHA, linewidth=0, label=label, zorder=1
     )
+    alone = _alone(mean - sigma)
+    if alone.any():
+        low, high = (mean + factor * sigma for factor in (-2.0, 2.0))
+        axes.vlines(t[alone], low[alone], high[alone], color=colour, alpha=BAND_ALPHA, linewidth=5.0, zorder=1)
 
 
 def shade(axes: Axes, time_s: Floats, unknown: NDArray[np.bool_] | None) -> None:

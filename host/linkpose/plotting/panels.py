@@ -50,11 +50,20 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
         if quantity is YAW and drawn:
             value = _from_start_of(drawn[0][0], track)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
-    view_values(axes, [value for _, value in drawn])
+    view_values(axes, [value for _, value in drawn] + _reference_beside(sources, quantity, drawn))
     shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
     finish(axes, quantity.axis_label)
     if legend:
         legend_above(axes, best_first=[track.label for track, _ in drawn])
+
+
+def _reference_beside(sources: Sources, quantity: Quantity, drawn: Sequence[tuple[DrawnTrack, Floats]]) -> list[Floats]:
+    """The reference's values within the time of the filters, which are in view also where no filter has a value."""
+    track = sources.reference
+    if track is None or not track.has(quantity) or quantity is YAW or not drawn:
+        return []
+    first, last = drawn[0][0].time_s[[0, -1]]
+    return [track.values[quantity][(track.time_s >= first) & (track.time_s <= last)]]
 
 
 def _from_start_of(estimate: DrawnTrack, reference: DrawnTrack) -> Floats:
@@ -131,10 +140,11 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool 
     drawn = [(track, value) for track, value in pairs(sources.tracks, quantity) if track.file == 0]
     best, middle = drawn[0]
     scale, unit = quantity.error.scale / quantity.value.scale, unit_text(quantity.error.unit)
-    order = [f"{best.label} (best)"]
+    is_alone = best_only or len(drawn) == 1
+    order = [best.label if is_alone else f"{best.label} (best)"]
     differences: list[Floats] = []
     draw(axes, best.time_s, 0 * middle, label=order[0], **line_style(best.name))
-    for track, value in drawn[1:] if not best_only else []:
+    for track, value in [] if is_alone else drawn[1:]:
         difference = scale * (value - middle)
         differences.append(difference)
         rms = float(np.sqrt(np.nanmean(difference**2))) if np.isfinite(difference).any() else np.nan
@@ -146,7 +156,7 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool 
     stds = [scale * best.std[quantity]] if quantity in best.std else []
     bound_view(axes, differences, stds)
     shade_unknown(axes, sources.tracks)
-    finish(axes, f"from best ({unit})")
+    finish(axes, f"±2σ ({unit})" if is_alone else f"from best ({unit})")
     legend_above(axes, best_first=order)
 
 

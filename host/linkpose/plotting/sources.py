@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from linkpose import filters
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, printable
 from linkpose.evaluation.scores import evaluate
 from linkpose.evaluation.scoring import Score
 from linkpose.evaluation.series import interval
@@ -198,7 +198,8 @@ def _describe(table: Table) -> str:
 
 
 def shortened(name: str) -> str:
-    """A file's name, without its middle if it is so long that the title would not fit the figure."""
+    """A file's name as a picture can show it, without its middle if the title would not fit the figure."""
+    name = printable(name)
     if len(name) <= _LONGEST_NAME:
         return name
     half = (_LONGEST_NAME - 1) // 2

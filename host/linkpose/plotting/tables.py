@@ -11,7 +11,7 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import panels, readings, robots
-from linkpose.plotting.canvas import new_figure
+from linkpose.plotting.canvas import label_time, new_figure, without_formulas
 from linkpose.plotting.sources import Sources, gather, is_recording, title
 from linkpose.quantities import (
     ANGLE,
@@ -88,7 +88,7 @@ def plot_tables(
     note = panels.note_hidden(sources)
     if note:
         figure.supxlabel(note, fontsize=8, x=0.01, ha="left", color="#555555")
-    return figure, [*sources.remarks, *([note] if note else [])]
+    return without_formulas(figure), [*sources.remarks, *([note] if note else [])]
 
 
 def _lay_out(part: SubFigure, section: Section) -> None:
@@ -113,7 +113,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         panel.draw(axes)
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
-        axes.set_xlabel("time (s)")
+        label_time(axes)
         part.align_ylabels()
 
 

@@ -75,8 +75,9 @@ def _start(axes: Axes, point: Floats) -> None:
 
 
 def _from_above(axes: Axes) -> None:
-    """x and y in the same scale, with their names."""
+    """x and y in the same scale, with their names; the panels beside it begin at the same height."""
     axes.set_aspect("equal", "box")
+    axes.set_anchor("N")
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
@@ -84,7 +85,7 @@ def _from_above(axes: Axes) -> None:
 
 def _map_and_path(drive: DrawnDrive) -> Figure:
     """Figure 3.1."""
-    figure = new_figure(10.0, 5.2)
+    figure = new_figure(10.0, 4.8)
     _titled(figure, "3.1", "Map and path of the robot (simulated)")
     axes = figure.add_subplot()
     draw_map(axes, drive.grid)
@@ -109,6 +110,7 @@ def _estimate(number: str, path: ComparedPath, grid: GridMap, largest: tuple[flo
     legend_above(above)
     _errors(position, heading, path, path.way_m, largest)
     heading.set_xlabel("way (m)")
+    figure.align_ylabels([position, heading])
     return figure
 
 
@@ -123,6 +125,7 @@ def _errors(position: Axes, heading: Axes, path: ComparedPath, along: Floats, la
     most = np.degrees(_HEADROOM * largest[1])
     heading.set_ylim(-most, most)
     heading.sharex(position)
+    position.tick_params(labelbottom=False)
     legend_above(position)
 
 
@@ -199,6 +202,8 @@ def _command_and_motion(dive: Dive, beacons: Beacons) -> Figure:
     distance.plot(dive.time_s, apart, color=OTHERS[2], linewidth=1.4)
     finish(distance, "command to truth (m)")
     distance.set_xlabel("time (s)")
+    depth.tick_params(labelbottom=False)
+    figure.align_ylabels([depth, distance])
     _from_above(above)
     legend_above(above, 4)
     return figure
@@ -223,6 +228,7 @@ def _sets_of_measurements(paths: Sequence[ComparedPath], beacons: Beacons, large
         first = first or axes
         _position_error(axes, path, path.time_s, largest)
         axes.set_title(f"{path.label}: {_summary(path)}", fontsize=9, loc="left", pad=18 if i == 0 else 6)
+        axes.tick_params(labelbottom=path is paths[-1])
     legend_above(figure.axes[1])
     axes.set_xlabel("time (s)")
     return figure
@@ -249,9 +255,11 @@ def _dive_estimate(number: str, path: ComparedPath, beacons: Beacons, largest: t
     finish(depth, "depth (m)")
     depth.invert_yaxis()
     depth.sharex(position)
+    depth.tick_params(labelbottom=False)
     if len(path.rejected_s):
         marks = np.zeros(len(path.rejected_s))
         position.plot(path.rejected_s, marks, "|", color=OTHERS[3], label="range rejected", clip_on=False)
     _errors(position, heading, path, path.time_s, largest)
     heading.set_xlabel("time (s)")
+    figure.align_ylabels([depth, position, heading])
     return figure

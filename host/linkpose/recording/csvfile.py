@@ -12,19 +12,15 @@ A plain file has the header and the rows only. Its metadata are beside it: run.m
 from __future__ import annotations
 
 import contextlib
-import errno
-import itertools
 import json
 import os
-import stat
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from linkpose.errors import CannotWrite, FileChanged, FileError, FileExists
+from linkpose.errors import CannotWrite, FileExists
+from linkpose.outputs import STDOUT, check_unchanged, create, is_changed, numbered, replace_file, synchronise, write_all
 
-STDOUT = Path("-")  # as an output: the standard output
 _COPIED_BYTES = 1 << 20  # at once
 
 
@@ -78,7 +74,7 @@ class CsvFile:
         The new file begins with the rows so far if the old one was removed, and with the head alone if another program
         changed its content. Raises CannotWrite and FileError.
         """
-        has_all_rows = not _is_changed(self._fd)
+        has_all_rows = not is_changed(self._fd)
         with os.fdopen(self._fd, "rb") as old:
             self._fd = -1
             for path in numbered(self._asked):
@@ -100,9 +96,11 @@ class CsvFile:
         elif self._beside is not None:
             self._beside["closing"] = closing
             self._write_beside()
-        with contextlib.suppress(OSError):  # a pipe cannot be synced
-            os.fsync(self._fd)
-        self._release()
+        try:
+            synchronise(self._fd)
+            self._release()
+        except OSError as error:
+            raise CannotWrite(self.path, error.strerror) from error
 
     def __enter__(self) -> Self:
         return self
@@ -124,95 +122,10 @@ class CsvFile:
         if self._beside is not None:
             path = metadata_path(self.path)
             try:
-                path.write_text(json.dumps(self._beside) + "\n", encoding="utf-8")
+                replace_file(path, json.dumps(self._beside) + "\n")
             except OSError as error:
                 raise CannotWrite(path, error.strerror) from error
 
     def _release(self) -> None:
-        os.close(self._fd)
-        self._fd = -1
-
-
-def numbered(path: Path) -> Iterator[Path]:
-    """Further names for a file: run-2.csv, run-3.csv and so on for run.csv."""
-    return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-
-
-def create(path: Path, force: bool) -> int:
-    """Opens a new file for writing and gives its descriptor. An existing one is kept unless `force`.
-
-    STDOUT gives a duplicate of the standard output's descriptor.
-    """
-    if path == STDOUT:
-        return _standard_output()
-    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL
-    try:
-        if path.exists() and not path.is_file():  # a pipe or a device, such as /dev/stdout
-            flags = os.O_WRONLY
-        elif force:
-            path = Path(os.path.realpath(path))  # a link stays a link, and may point to no file
-            path.unlink(missing_ok=True)  # who still writes the old file notices, and does not write into the new one
-        return os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666)
-    except FileExistsError:
-        if force:  # another program created it in between; the last one has the name
-            return create(path, force)
-        raise FileExists(path) from None
-    except OSError as error:
-        raise CannotWrite(path, error.strerror) from error
-
-
-def _standard_output() -> int:
-    """A duplicate of the standard output's descriptor, after what is buffered for it was written."""
-    try:
-        sys.stdout.flush()
-        return os.dup(1)
-    except OSError as error:
-        raise CannotWrite("the standard output", error.strerror) from error
-
-
-def check_unchanged(fd: int, path: Path) -> None:
-    """Raises FileChanged when another program removed the file, or changed its size.
-
-    A pipe or a device has no size, and other programs may write what is behind the standard output.
-    """
-    of = os.fstat(fd)
-    if path == STDOUT or not stat.S_ISREG(of.st_mode):
-        return
-    if of.st_nlink == 0:
-        raise FileChanged(path, "it was removed while it was being written")
-    if _is_changed(fd):
-        raise FileChanged(path, "another program changed it while it was being written")
-
-
-def _is_changed(fd: int) -> bool:
-    """Whether the file does not end where this program's next byte goes."""
-    return os.fstat(fd).st_size != os.lseek(fd, 0, os.SEEK_CUR)
-
-
-def write_all(fd: int, path: Path, data: bytes) -> None:
-    """Writes all of `data`, or cuts the file back to its last whole line and raises LinkposeError."""
-    left = memoryview(data)
-    written = 0
-    try:
-        while len(left):
-            count = os.write(fd, left)
-            written += count
-            left = left[count:]
-    except OSError as error:
-        if written:
-            _cut_back(fd, data[:written])
-        name = "the standard output" if path == STDOUT else path
-        if error.errno == errno.EPIPE:
-            raise FileError(path, f"the reader of {name} has gone; nothing more can be written to it") from error
-        raise FileError(
-            path,
-            f"cannot write to {name} any more: {error.strerror}; what was written so far is whole, "
-            "make room or name a file on another disk",
-        ) from error
-
-
-def _cut_back(fd: int, written: bytes) -> None:
-    """Removes a partial last line that a full disk left behind."""
-    partial = len(written) - (written.rfind(b"\n") + 1)
-    with contextlib.suppress(OSError):
-        os.ftruncate(fd, os.lseek(fd, -partial, os.SEEK_END))
+        descriptor, self._fd = self._fd, -1
+        os.close(descriptor)

@@ -5,9 +5,6 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
-import os
-import stat
-import tempfile
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -17,6 +14,7 @@ from typing import Any
 
 from linkpose.errors import CannotWrite, FileFormatError
 from linkpose.inputs import read_bytes
+from linkpose.outputs import replace_file
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -35,6 +33,7 @@ _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
 # A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
 _GUESS_M = 0.1
+LONGEST_LINK_M = 10.0  # of a J2S that a user gives: a longer one is in centimetres or millimetres
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +242,7 @@ class Rig:
         Raises CannotWrite, also for a path that is a device or a folder.
         """
         try:
-            _replace_file(Path(path), self.to_toml())
+            replace_file(Path(path), self.to_toml())
         except OSError as error:
             raise CannotWrite(path, error.strerror, "the rig file") from error
 
@@ -370,34 +369,6 @@ def _read_quaternion(value: Any, origin: str, where: str) -> Quaternion:
     if abs(math.hypot(w, x, y, z) - 1) > _UNIT:
         raise FileFormatError(origin, f"{origin}: {where} is {quoted(value)}; a rotation must have length 1")
     return w, x, y, z
-
-
-def _replace_file(path: Path, text: str) -> None:
-    """Writes `text` to `path` through a temporary file with an unpredictable name in the same folder."""
-    path = path.resolve()  # a symbolic link stays, and its target is replaced
-    mode = None
-    if path.exists():
-        mode = stat.S_IMODE(path.stat().st_mode)
-        if not path.is_file():
-            raise OSError(0, "it is not a file")
-    descriptor, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(partial).chmod(mode if mode is not None else 0o666 & ~_umask())
-        Path(partial).replace(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            Path(partial).unlink()
-        raise
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def as_rig(rig: Rig | str | PathLike[str] | None, own: Rig | None = None) -> Rig:

@@ -15,7 +15,7 @@ from linkpose.errors import CannotWrite, FileExists, LinkposeError, NamedTwice
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
 from linkpose.localization.maps import save_map
-from linkpose.recording.csvfile import STDOUT
+from linkpose.outputs import STDOUT
 from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats
@@ -103,7 +103,7 @@ def write_indoor(run: IndoorRun, seed: int, log: Path, truth: Path, map_file: Pa
         "wz_rad_s": run.twist[:, 1],
     }
     write_truth(truth, columns, {"simulated": "indoor", "seed": seed}, force)
-    save_map(map_file, office_floor(), CELL_M, (0.0, 0.0))
+    save_map(map_file, office_floor(), CELL_M, (0.0, 0.0), force)
     lines = [format_reading(reading) for reading in run.readings]
     write_lines(log, [f"# linkpose simulate indoor --seed {seed}", *lines], force)
 

@@ -43,6 +43,7 @@ class PaperTest(NamedTuple):
     tempo: float  # how much faster than Test 1 the link is swung
 
 
+MOTIONS = ("swing", "sides", "rest")
 TESTS = {1: PaperTest(6.8, 1.0), 2: PaperTest(10.7, 1.12), 3: PaperTest(12.5, 1.2)}
 
 # Streams of random numbers, apart from each other so that a setting changes only what it is about.
@@ -131,7 +132,7 @@ class LinkRun:
         accel_range_g: int = 8,
         gyro_range_deg_s: int = 1000,
         oversampling: int = 1,
-        rests: bool = False,
+        motion: str = "swing",
         imu2: bool = False,
         mag: bool = False,
         mag_disturbance: str | None = None,
@@ -141,12 +142,13 @@ class LinkRun:
         """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer,
         whose field `mag_disturbance` (a key of mag.DISTURBANCES) disturbs.
 
-        `duration_s` None never ends (a live board). `rests` lays the sensor on its six sides in turn instead of
-        swinging the link, as `calibrate imu` asks for. `noise_of` is a rig whose noise and remaining biases the sensors
-        have, in place of those of `errors`. `swing_rad` is the rms of the swing; None: the Test's mean acceleration.
+        `duration_s` None never ends (a live board). `motion` is "swing", "sides" (the sensor is laid on its six sides
+        in turn, as `calibrate imu` requires it) or "rest" (as `calibrate noise` does). `noise_of` is a rig whose noise
+        and remaining biases the sensors have, in place of those of `errors`. `swing_rad` is the rms of the swing; None:
+        the Test's mean acceleration.
         Raises LinkposeError for a value that cannot be.
         """
-        _check(test, seed, duration_s, rate_hz, errors, j2s_m)
+        _check(test, seed, duration_s, rate_hz, errors, j2s_m, motion)
         self.test, self.seed, self.duration_s = test, seed, duration_s
         self.rate_hz, self.errors, self.j2s_m = rate_hz, errors, j2s_m
         self.accel_range_g, self.gyro_range_deg_s, self.oversampling = accel_range_g, gyro_range_deg_s, oversampling
@@ -154,13 +156,15 @@ class LinkRun:
         self.hello_sensors = Sensors.MPU6050 | Sensors.BMP180
         self.hello_sensors |= Sensors.IMU2 * imu2 | Sensors.MAG * mag
         paper = TESTS[test]
-        self.rests = rests
+        self.motion = motion
         self._motion: HandMotion | SixSides
-        if rests:
+        if motion == "sides":
             self._motion = SixSides(duration_s or PAPER_DURATION_S)
         else:
             swung = HandMotion(np.random.default_rng([seed, _MOTION, test]), paper.tempo, duration_s)
-            if swing_rad is None:
+            if motion == "rest":
+                swung.amplitude_rad = 0.0
+            elif swing_rad is None:
                 swung.scale_to(paper.mean_accel_m_s2, self._d, duration_s or PAPER_DURATION_S)
             else:
                 swung.amplitude_rad = swing_rad
@@ -189,12 +193,11 @@ class LinkRun:
 
     @property
     def description(self) -> str:
-        """What a file of this run names as its device."""
-        if self.rests:
-            return f"simulated link, laid on six sides, seed {self.seed}, errors {self.errors}"
+        """What a file of this run names as its device: the address of a simulated board with the same sensors."""
         others = "".join(
             f"&{s.name.lower()}=1" for s in (Sensors.IMU2, Sensors.MAG) if s.name and s & self.hello_sensors
         )
+        others += "" if self.motion == "swing" else f"&motion={self.motion}"
         return f"sim://link?test={self.test}&seed={self.seed}&errors={self.errors}{others}"
 
     @property
@@ -399,7 +402,11 @@ def _temperature(time_s: Floats) -> Floats:
     return np.asarray(25.0 + 0.3 * (1 - np.exp(-time_s / 200.0)))
 
 
-def _check(test: int, seed: int, duration_s: float | None, rate_hz: float, errors: str, j2s_m: Vector) -> None:
+def _check(
+    test: int, seed: int, duration_s: float | None, rate_hz: float, errors: str, j2s_m: Vector, motion: str
+) -> None:
+    if motion not in MOTIONS:
+        raise LinkposeError(f"there is no motion called {motion!r}: take {', '.join(MOTIONS)}")
     if test not in TESTS:
         raise LinkposeError(f"there is no Test {test}: take 1, 2 or 3")
     if seed < 0:

@@ -342,7 +342,7 @@ def _check(
     if errors not in LEVELS:
         raise LinkposeError(f"there are no errors called {errors!r}: take {', '.join(LEVELS)}")
     shortest = 2 * STILL_S + 1 if path in ("line", "turn") else 1.0
-    if (duration_s is None and shortest > 1) or (duration_s is not None and not shortest <= duration_s < math.inf):
+    if duration_s is not None and not shortest <= duration_s < math.inf:
         raise LinkposeError(f"a duration of {duration_s} s is none for this path: take {shortest:g} s or more")
     if not 0.01 <= length_m <= 100:
         raise LinkposeError(f"a line of {length_m:g} m cannot be: take 0.01 to 100 m")

@@ -1,11 +1,11 @@
 """`sim://...`: simulated boards as pyserial ports, for any code that opens a port.
 
-    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&imu2=0&mag=0&mag_disturbance=desk&drift_ppm=0&speed=1
-    sim://chain?joint=hinge&first_joint=fixed&seed=0&errors=calibrated&drift_ppm=0&speed=1
-    sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8&drift_ppm=0&speed=1
+    sim://link?test=1&seed=0&errors=calibrated&j2s=-0.09,-0.04,1.65&motion=swing&imu2=0&mag=0&mag_disturbance=desk
+    sim://chain?joint=hinge&first_joint=fixed&seed=0&errors=calibrated
+    sim://mice?seed=0&mice=3&path=drive&errors=calibrated&fault=lift:2:5-8
 
-`speed` is how much faster than real time the board lives; 0 is as fast as it is read. `drift_ppm` is how much its clock
-runs fast.
+Each of them has two more options, such as drift_ppm=0&speed=1: `speed` is how much faster than real time the board
+lives; 0 is as fast as it is read. `drift_ppm` is how much its clock runs fast.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
     if len(words) != 3:
         raise LinkposeError("j2s must be three numbers: j2s=X,Y,Z in metres")
     x, y, z = (_number({"j2s": word}, "j2s", 0) for word in words)
-    disturbance = options.pop("mag_disturbance", None)
+    motion, disturbance = options.pop("motion", "swing"), options.pop("mag_disturbance", None)
     imu2, mag = (_number(options, name, 0) != 0 for name in ("imu2", "mag"))
 
     def make_run(settings: Configure) -> LinkRun:
@@ -168,6 +168,7 @@ def _link(options: dict[str, str]) -> Callable[[Configure], Run]:
             accel_range_g=settings.accel_range_g,
             gyro_range_deg_s=settings.gyro_range_deg_s,
             oversampling=settings.baro_oversampling,
+            motion=motion,
             imu2=imu2,
             mag=mag or disturbance is not None,
             mag_disturbance=disturbance,

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters._records import record_of
+from linkpose.filters.chain.misfit import MOST_MEAN_RATE_RAD_S
 from linkpose.filters.chain.process import process
 from linkpose.filters.chain.state import (
     BG,
@@ -90,11 +91,17 @@ class ChainFilter:
         bank, found = self._bank[0], []
         samples = max(int(bank.samples), 1)
         for k in range(2):
-            mean = float(bank.force_sum[k]) / max(int(bank.forces[k]), 1)
-            if bank.forces[k] >= _FEWEST and not _LEAST_SHARE < mean / GRAVITY < 1 / _LEAST_SHARE:
+            readings = max(int(bank.readings[k]), 1)
+            mean, rate = float(bank.force_sum[k]) / readings, float(bank.rate_sum[k]) / readings
+            if readings >= _FEWEST and not _LEAST_SHARE < mean / GRAVITY < 1 / _LEAST_SHARE:
                 found.append(
                     f"chain: the mean acceleration of sensor {k + 1} is {mean:.3g} m/s², and gravity alone is 9.81 "
                     "m/s². Check that the sensor works and that its unit is m/s²."
+                )
+            if readings >= _FEWEST and rate > MOST_MEAN_RATE_RAD_S:
+                found.append(
+                    f"chain: the mean rate of sensor {k + 1} is {rate:.3g} rad/s, more than a joint turns. Check that "
+                    "its unit is rad/s, not °/s."
                 )
         if self.rejected > _MANY * samples:
             found.append(

@@ -1,10 +1,10 @@
 """Readings that two links with one joint cannot give.
 
 Wrong units, a gyro that repeats one value, a saturated sensor without flags, and a sensor that was mounted anew leave
-the joint's constraint with innovations that last, or with accelerometer biases that no sensor has. The estimates and
-their σ then mean nothing. They are blank until the readings fit again. After some seconds the filter forgets the
-mounting and the biases, so that it recovers from a sensor that was mounted anew. Readings that keep failing to fit
-have to fit for twice as long each time.
+the joint's constraint with innovations that last, with a large residual, or with accelerometer biases that no sensor
+has. The estimates and their σ then mean nothing. They are blank until the readings fit again. After some seconds the
+filter forgets the mounting and the biases, so that it recovers from a sensor that was mounted anew. Readings that keep
+failing to fit have to fit for twice as long each time.
 """
 
 from __future__ import annotations
@@ -13,9 +13,15 @@ from linkpose.compiling import inner
 from linkpose.filters.chain.rotation import square
 from linkpose.filters.chain.state import BA, BG, OF_SENSOR, Floats, R, Record
 
-# Accelerometer bias: ten times the data sheet's 0.5 m/s². The largest of the recordings [D] and [O] is 2.2 m/s², in a
-# direction that slow motion does not show; with accelerations in g it is 15 m/s², with rates in °/s 13 m/s².
+# Accelerometer bias: ten times the data sheet's 0.5 m/s². The largest of the recordings [D] and [O] is 1.0 m/s²; with
+# accelerations of one sensor in g it is 8 m/s² and more.
 _MOST_BIAS_M_S2 = 5.0
+# Residual of the joint as a share of ‖ω‖ ‖r‖: at most 0.05 in [D] and [O], and 0.2 for some seconds while a simulated
+# hinge follows a wrong heading; with rates of one sensor in °/s 0.3 to 1.2. It counts where the root mean square of
+# ‖ω‖ ‖r‖ exceeds the second figure (m/s): below, noise and play are as large.
+_MOST_RESIDUAL, _LEAST_REACH_M_S = 0.3, 0.1
+# Mean norm of the rate (rad/s): a runner's shank has 5; a leg whose rates are in °/s has 50.
+MOST_MEAN_RATE_RAD_S = 20.0
 # Mean square of the joint's lasting innovations, in multiples of its value for a right σ: 6 at most in [D] and [O]; a
 # gyro that repeats one value makes it 23, a sensor mounted anew 11 to 20.
 _MOST_LASTING = 10.0
@@ -34,8 +40,11 @@ _MOST_DOUBLINGS = 10
 def follow_misfit(bank: Record, best: Record, h: float, q: Record) -> None:
     """Measure for how long the readings have not fitted two links with one joint, `h` (s) after the last time."""
     fits = best.moving_square[0] < _MOST_LASTING * q.level_square and best.widening < _MOST_WIDENING
+    reaches = best.reach_square > _LEAST_REACH_M_S**2
+    fits = fits and not (reaches and best.residual_share > _MOST_RESIDUAL**2)
     for k in range(2):
         fits = fits and square(best.accel_bias[k]) < _MOST_BIAS_M_S2**2
+        fits = fits and bank.rate_sum[k] < MOST_MEAN_RATE_RAD_S * max(bank.readings[k], 1)
     bank.misfit_s = max(bank.misfit_s - _RECOVERY * h, 0.0) if fits else bank.misfit_s + h
     if fits:
         bank.probation_s = max(bank.probation_s - h, 0.0)

@@ -416,17 +416,19 @@ def process(
 def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, calibration: Floats) -> bool:
     """Calibrates the readings of sensor k into the bank. False where they are frozen, missing or impossible."""
     frozen = is_frozen(bank.last_readings[k], time_s, vec.load(accel), vec.load(gyro))
-    is_possible, turns, norm = True, False, 0.0
+    is_possible, turns, norm, turning = True, False, 0.0, 0.0
     for i in range(3):
         force = (accel[i] - calibration[k, 0, i]) / calibration[k, 1, i]
         rate = gyro[i] - calibration[k, 2, i]
         bank.new_accel[k, i], bank.new_gyro[k, i] = force, rate
         norm += force * force
+        turning += rate * rate
         is_possible = is_possible and abs(force) < _LARGEST and abs(rate) < _LARGEST
         turns = turns or abs(gyro[i]) > _RESTING_RAD_S
     if is_possible:
         bank.force_sum[k] += math.sqrt(norm)
-        bank.forces[k] += 1
+        bank.rate_sum[k] += math.sqrt(turning)
+        bank.readings[k] += 1
     frozen = frozen and (turns or time_s - bank.last_readings[k, MEMORY - 1] > _LONGEST_REPEAT_S)
     return is_possible and not frozen
 

@@ -7,6 +7,8 @@ J. Guidance, Control, and Dynamics 21(1), 1998.
 
 from __future__ import annotations
 
+import math
+
 from linkpose.compiling import inner
 from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S
 from linkpose.filters.chain.rotation import rotate, to_matrix, turn
@@ -124,6 +126,22 @@ def _transpose(p: Floats, size: int) -> None:
 
 
 @inner
+def _decay_bias(s: Record, size: int, k: int, walk: float, q: Record) -> None:
+    """Let the accelerometer bias of sensor k return to its prior, so that `walk` (m²/s⁴) keeps the prior's variance.
+
+    Scale and cross-axis errors are bounded, and so is the bias that stands for them.
+    """
+    bound = q.accel_bias_m_s2**2 + s.level * (q.accel_scale * GRAVITY) ** 2
+    p, keep, first = s.covariance, math.exp(-0.5 * walk / bound), OF_SENSOR * k + BA
+    for at in range(first, first + 3):
+        s.accel_bias[k, at - first] *= keep
+        for j in range(size):
+            p[at, j] *= keep
+        for j in range(size):
+            p[j, at] *= keep
+
+
+@inner
 def propagate_covariance(s: Record, size: int, q: Record) -> None:
     """P over the span since the last update: F P Fᵀ + Q."""
     p, span = s.covariance, s.span
@@ -138,6 +156,7 @@ def propagate_covariance(s: Record, size: int, q: Record) -> None:
     for k in range(2):
         o, turned, impulse = OF_SENSOR * k, s.turned[k], s.impulse[k]
         walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + s.level * q.accel_scale**2 * s.force_rate_square[k]) * span
+        _decay_bias(s, size, k, walk, q)
         for i in range(3):
             p[o + i, o + i] += s.rotation_variance[k]
             p[o + V + i, o + V + i] += s.velocity_variance[k]

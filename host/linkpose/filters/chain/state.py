@@ -45,7 +45,8 @@ class ChainParameters(NamedTuple):
     # Gyro scale and cross-axis errors as noise, share of the rate; correlated over 0.1 s. [D, O, E]; doubled: σ +20 %.
     gyro_misfit: float = 0.015
     # Scale and cross-axis errors of the accelerometer (data sheet: 3 %, 2 %) as a walk of its bias, share of the rate
-    # at which the force turns in the sensor's axes. [O]; doubled, ball joints of [D] lose a third of their accuracy.
+    # at which the force turns in the sensor's axes. The walk returns to the prior: these errors are bounded. Without
+    # the return, ball joints of [D] lose a third of their accuracy. [O]; doubled, σ +20 %.
     accel_scale: float = 0.02
     accel_scale_s: float = 0.5  # over which that rate is averaged (s)
     accel_walk_m_s2_sqrts: float = 0.001  # of the accelerometer bias: [MPU-6050]'s 35 mg over 65 K, 10 K in 10 min
@@ -249,7 +250,8 @@ BANK = np.dtype(
         ("forgotten", "i8"),  # how often the mounting was forgotten
         ("samples", "i8"),
         ("force_sum", "f8", 2),  # of the norms of their specific forces (m/s²)
-        ("forces", "i8", 2),  # how many these are
+        ("rate_sum", "f8", 2),  # and of their rates (rad/s)
+        ("readings", "i8", 2),  # how many these are
         ("restarts", "i8"),
         # Angles of a ball joint: axes of flexion, abduction and length of link 1 as columns, in sensor 1's axes;
         # whether the rig states the first and the last; the neutral rotation that it states.

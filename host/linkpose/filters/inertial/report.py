@@ -34,7 +34,7 @@ def report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
         _follow_covariance(s)
     _report_position_stds(s, tilt, north, west, row)
     _report_angle_stds(s, tilt, north, west, row)
-    row.distance, row.resolved = s.distance, s.resolved
+    row.distance, row.tilt_level, row.heading_level = s.distance, s.tilt_level, s.heading_level
     bias = sub_covariance(s.covariance, BA)
     across = vec.trace(bias) - vec.quadratic(bias, tilt)
     row.unknown = 1.5 * across / (s.prior[BA] + s.prior[BA + 1] + s.prior[BA + 2])

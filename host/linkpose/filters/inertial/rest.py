@@ -9,7 +9,14 @@ from linkpose.filters._vector import Vec
 from linkpose.filters.inertial.gravity import align_to_gravity, relate_heading
 from linkpose.filters.inertial.propagate import specific_force
 from linkpose.filters.inertial.state import BA, BG, MA, PSI, SIZE, Record, Z
-from linkpose.filters.inertial.update import constrain_attitude, project, sub_covariance, update_scalar, update_vector
+from linkpose.filters.inertial.update import (
+    constrain_attitude,
+    project,
+    start_parameters,
+    sub_covariance,
+    update_scalar,
+    update_vector,
+)
 
 # Stillness before the mean rate counts as the gyro bias and the mean force as gravity (s): longer than a turning point
 # of a slow swing. Doubled, a launch soon after switch-on leans the tilt.
@@ -80,17 +87,36 @@ def _is_turn(s: Record, variance: float) -> bool:
 
 
 @inner
+def _is_turn_at_start(s: Record) -> bool:
+    """Whether the mean rate since the first sample is too large for a gyro's bias at switch-on."""
+    for j in range(BG, BA):
+        innovation = s.rest_rate_sum[j - BG] / s.rest_s - s.start_mean[j]
+        if innovation * innovation > _TURN_SIGMAS**2 * s.switch_on_variance:
+            return True
+    return False
+
+
+@inner
 def align_at_rest(s: Record, h: float, imu: ImuCalibration) -> None:
     """Gyro bias and attitude from a rest, where the bias was unknown: no axis has turned since the rest began.
 
-    Until then, the bias has turned the attitude, by up to 10° after switch-on. `h` as for `update_bias_from_rest`.
+    Until then, the bias has turned the attitude, by up to 10° after switch-on, and the constraint has been met by wrong
+    sensor errors of a small σ. After a rest since switch-on, all of them start anew, and the data sheet alone decides
+    whether the mean rate is a bias. `h` as for `update_bias_from_rest`.
     """
     p, rest_s = s.covariance, s.rest_s
-    if rest_s <= REST_S or vec.trace(sub_covariance(p, BG)) * rest_s * rest_s <= _FAR_RAD**2:
+    if rest_s <= REST_S:
         return
     variance = imu.gyro_variance * h / rest_s + (_SWAY_RAD / rest_s) ** 2
-    if _is_turn(s, variance):
+    is_turn = _is_turn(s, variance)
+    if not (s.unmoved and is_turn) and vec.trace(sub_covariance(p, BG)) * rest_s * rest_s <= _FAR_RAD**2:
         return
+    if s.unmoved:
+        is_turn = _is_turn_at_start(s)
+    if is_turn:
+        return
+    if s.unmoved:
+        start_parameters(s)
     for i in range(BG, BG + 4):
         k = i if i < BA else PSI
         for j in range(SIZE):

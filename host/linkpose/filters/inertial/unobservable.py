@@ -1,10 +1,11 @@
-"""The direction of the state that the joint's constraint can never observe.
+"""The directions of the state that the joint's constraint can never observe.
 
-Let the sensor's axes be turned by a small φ about J2S, against those that the housing marks. Z, v, b_a and X then turn
-with them, and both sensors have the misalignment M = −[φ×]. J2S stays, and so does every innovation: the readings do
-not determine φ, and its mean and variance are those of the prior for ever. Each update is linear at another estimate,
-though, and the small differences between these lines move φ and shrink its variance, by a factor of three in a minute.
-Both are set back here.
+Let the sensor's axes be turned by a small φ, against those that the housing marks. Z, v, b_a, X and J2S then turn with
+them, and both sensors have the misalignment M = −[φ×]. Every innovation stays: the readings do not determine φ. What is
+known of φ is in the priors of M and of J2S. Where J2S is known, only a φ about J2S is undetermined, because it leaves
+J2S as it is; where J2S is unknown, each φ is. Mean and variance of φ are those of the priors for ever. Each update is
+linear at another estimate, though, and the small differences between these lines move φ and shrink its variance, by a
+factor of three in a minute. Both are set back here.
 
 Source: G. Huang, A. Mourikis, S. Roumeliotis, "Observability-based rules for designing consistent EKF SLAM estimators",
 Int. J. Robotics Research 29(5), 2010, describe the effect; there the lines are chosen, here the result is corrected.
@@ -17,22 +18,44 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._vector import Vec
-from linkpose.filters.inertial.state import BA, MA, MG, PSI, SIZE, Floats, Record, V, Z
+from linkpose.filters.inertial.state import BA, MA, MG, PSI, SIZE, D, Floats, Record, V, Z
 from linkpose.filters.inertial.update import constrain_attitude
+
+_ALONG = 0.7  # an axis with a larger share of the sensor's x axis is not crossed with it
 
 
 @inner
 def restore_unobservable(s: Record) -> None:
-    """Set φ back to its prior: the mean along the unobservable direction, and the variance where it lacks."""
+    """Set φ about J2S, and about two axes across it, back to its prior."""
     d = vec.load(s.j2s)
     length = math.sqrt(vec.dot(d, d))
-    if length == 0.0:
-        return
-    axis = vec.scale(1.0 / length, d)
-    p, u = s.covariance, s.direction
+    along = vec.scale(1.0 / length, d) if length > 0.0 else (0.0, 0.0, 1.0)
+    across = vec.unit(vec.cross(along, (1.0, 0.0, 0.0) if abs(along[0]) < _ALONG else (0.0, 1.0, 0.0)))
+    _restore(s, along)
+    _restore(s, across)
+    _restore(s, vec.cross(along, across))
+
+
+@inner
+def _restore(s: Record, axis: Vec) -> None:
+    """Set φ about `axis` back: the mean of the state along this direction, and the variance where it lacks.
+
+    The inverse variances of the misalignment and of J2S add up; their means are weighted with them.
+    """
+    p, u, prior = s.covariance, s.direction, s.prior
     fill_direction(s, axis)
-    _set_mean_back(s)
-    lacking = _misalignment_variance(s.prior, axis) - _turn_variance(s)
+    of_sensors = 1.0 / _misalignment_variance(prior, axis)
+    of_lever, turn = 0.0, 0.0
+    for i in range(D, PSI):
+        of_lever += u[i] * u[i] / prior[i]
+        turn += u[i] * (s.nominal[i] - s.start_mean[i]) / prior[i]
+    for i in range(MA, D):
+        turn += 0.25 * of_sensors * u[i] * (s.nominal[i] - s.start_mean[i])
+    variance = 1.0 / (of_sensors + of_lever)
+    for i in range(SIZE):
+        s.nominal[i] -= variance * turn * u[i]
+    constrain_attitude(s)
+    lacking = variance - _turn_variance(s)
     if lacking <= 0.0:
         return
     for i in range(SIZE):
@@ -41,25 +64,15 @@ def restore_unobservable(s: Record) -> None:
 
 
 @inner
-def _set_mean_back(s: Record) -> None:
-    u, turn = s.direction, 0.0
-    for i in range(MA, MG + 9):
-        turn += 0.25 * u[i] * (s.nominal[i] - s.start_mean[i])
-    for i in range(SIZE):
-        s.nominal[i] -= turn * u[i]
-    constrain_attitude(s)
-
-
-@inner
 def fill_direction(s: Record, axis: Vec) -> None:
-    """Change of the state with φ about `axis`: of Z, v, b_a, M_a, M_g and ψ."""
+    """Change of the state with φ about `axis`: of Z, v, b_a, M_a, M_g, J2S and ψ."""
     u = s.direction
     for i in range(SIZE):
         u[i] = 0.0
     z, v = vec.cross(axis, vec.load(s.tilt)), vec.cross(axis, vec.load(s.velocity))
-    b = vec.cross(axis, vec.load(s.accel_bias))
+    b, d = vec.cross(axis, vec.load(s.accel_bias)), vec.cross(axis, vec.load(s.j2s))
     for i in range(3):
-        u[Z + i], u[V + i], u[BA + i] = z[i], v[i], b[i]
+        u[Z + i], u[V + i], u[BA + i], u[D + i] = z[i], v[i], b[i], d[i]
         j, k = (i + 1) % 3, (i + 2) % 3
         u[MA + 3 * j + k] = u[MG + 3 * j + k] = axis[i]
         u[MA + 3 * k + j] = u[MG + 3 * k + j] = -axis[i]
@@ -82,7 +95,7 @@ def _misalignment_variance(prior: Floats, axis: Vec) -> float:
 def _turn_variance(s: Record) -> float:
     """Variance of φ in the covariance: φ is a quarter of the product of M_a, M_g with the direction's own part."""
     p, u, total = s.covariance, s.direction, 0.0
-    for i in range(MA, MG + 9):
-        for j in range(MA, MG + 9):
+    for i in range(MA, D):
+        for j in range(MA, D):
             total += u[i] * p[i, j] * u[j]
     return total / 16.0

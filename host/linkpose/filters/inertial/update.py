@@ -8,7 +8,7 @@ from __future__ import annotations
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._vector import Sym, Vec
-from linkpose.filters.inertial.state import PSI, SIZE, Floats, Record, Z
+from linkpose.filters.inertial.state import BG, PSI, SIZE, Floats, Record, Z
 
 SMALL_RAD2 = 0.01  # variance of Z (all axes) below which its error lies across it (rad²),
 _NONE_RAD2 = 1e-6  # with no more than this along it
@@ -103,6 +103,15 @@ def constrain_attitude(s: Record) -> None:
         for i in range(SIZE):
             for j in range(i):
                 p[i, j], p[j, i] = p[j, i], p[i, j]
+
+
+@inner
+def start_parameters(s: Record) -> None:
+    """Set the sensor errors and J2S, and their covariance, to those before the first sample."""
+    for i in range(BG, PSI):
+        s.nominal[i] = s.start_mean[i]
+        for j in range(SIZE):
+            s.covariance[i, j] = s.covariance[j, i] = s.start_covariance[i, j]
 
 
 @inner

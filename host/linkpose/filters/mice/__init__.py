@@ -22,6 +22,7 @@ from linkpose.compiling import compiled, inner
 from linkpose.errors import CannotRun
 from linkpose.filters._records import record_of
 from linkpose.filters._vector import wrapped
+from linkpose.filters.mice.causes import causes
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
 from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
 from linkpose.filters.mice.reading import (
@@ -73,6 +74,11 @@ class MiceFilter:
     def rejected(self) -> int:
         """Readings so far that gave no velocity, or whose time did not increase."""
         return int(self.state[0].rejected)
+
+    @property
+    def mouse_causes(self) -> dict[int, str]:
+        """Why mice were excluded so far (1 for the first; 0: all together)."""
+        return causes(self.state[0], self._mice)
 
     def process(self, block: Measurements) -> Floats:
         """Velocity in b and its standard deviations, pose in n, excluded mice, at each of the N samples: (N, 10).
@@ -148,7 +154,7 @@ def _show(state: Record, time_s: float, out: Record) -> None:
     chord = scaled(since, turned(turned_mean(turn), state.velocity))
     position = state.position + turned(unit(state.heading), chord)
     out.x, out.y, out.heading = position.real, position.imag, wrapped(state.heading + turn)
-    out.excluded = ~state.used & ((1 << state.count) - 1)
+    out.excluded = ~(state.used | state.held) & ((1 << state.count) - 1)
     if math.isnan(state.known_time):
         out.vx = out.vy = out.wz = out.vx_std = out.vy_std = out.wz_std = math.nan
         return

@@ -28,7 +28,17 @@ _DEAD_S, _DEAD_RATES = 0.4, 40
 # A mouse that gives the same counts for so many readings is stuck, if another one has been silent for so long (s), or
 # has changed its counts by so much in about the same time. Doubled: it spoils the path for twice as long.
 _STUCK_REPEATS, _STUCK_SILENT_S, _STUCK_CHANGE, _VARYING_REPEATS = 50, 0.3, 12.0, 10
+_STUCK_COUNTS = 2.0  # by which it differs from the motion of all. Doubled: slow stuck mice stay
+# A mouse that exceeds the speed limit by this factor has none. Doubled distance to 1: a wrong limit stays for longer.
+_NO_LIMIT = 1.15
 _CHANGE_KEPT = 0.98  # of the changes, from reading to reading
+# A mouse that reports at 25 to 80 Hz gives nothing between two reports. A reading without counts, where at least so
+# many are expected, is taken for a missing report for up to so long (s); the next counts cover all of this time.
+# Doubled: a lift is found 35 ms later; half: a mouse with 40 reports in a second is excluded.
+_EXPECTED_COUNTS, _HELD_S = 3.0, 0.035
+# A report covers a time that differs from whole steps by up to a step: σ of the counts of one step. Doubled: no visible
+# change.
+_UNTIMED = 0.4
 
 
 @inner
@@ -58,25 +68,53 @@ def follow_gyro(state: Record, sample: Record) -> None:
 @inner
 def read_counts(state: Record, mice: Records, sample: Record) -> None:
     """Motion of each mouse in b, and whether its counts cover this step."""
-    has_counts = at_limit = 0
+    has_counts = at_limit = held = 0
     for i in range(state.count):
         m = mice[i]
         moved = turned(m.axis, sample.counts[i])
         if math.isfinite(moved.real + moved.imag):
             has_counts |= 1 << i
-            m.moved = moved
-            if _is_at_limit(m, sample.counts[i]):
+            if _is_missing_report(state, m, moved):
+                held |= 1 << i
+                continue
+            _spread_report(state, m, moved)
+            if _is_at_limit(m, sample.counts[i]) or _is_too_fast(state, m):
                 at_limit |= 1 << i
             _watch_repeats(m, sample.counts[i])
     # The first counts of a mouse that was away cover an unknown time.
-    state.sound = has_counts & ~state.away
+    state.sound = has_counts & ~state.away & ~held
+    state.held = held
     state.away = ~has_counts & ((1 << state.count) - 1)
-    # A mouse whose counter ran over counts too little: it is left out, or all are lower bounds of the speed.
+    # A mouse at the limit of its counter or sensor counts too little: it is left out, or all are lower bounds.
     state.is_saturated = at_limit != 0 and state.sound & ~at_limit == 0
     if not state.is_saturated:
         state.sound &= ~at_limit
     _exclude_stuck(state, mice)
     state.used = state.sound & ~state.excluded
+
+
+@inner
+def _is_missing_report(state: Record, m: Record, moved: complex) -> bool:
+    """Whether a reading without counts lies between two reports of a mouse that moves."""
+    if square(moved) > 0.0 or not state.interval > 0.0 or m.held_s + state.interval > _HELD_S:
+        return False
+    expected = state.interval * math.sqrt(squared_speed(m, state.velocity, state.turn_rate))
+    if expected < _EXPECTED_COUNTS * m.metres_per_count:
+        return False
+    m.held_s += state.interval
+    m.missing += 1
+    return True
+
+
+@inner
+def _spread_report(state: Record, m: Record, moved: complex) -> None:
+    """The counts after missing reports cover their time too: the motion of one interval is a share of it."""
+    m.share = 1.0
+    if m.held_s > 0.0 and square(moved) > 0.0:
+        m.share = state.interval / (state.interval + m.held_s)
+        m.held_s = 0.0
+    m.moved = scaled(m.share, moved)
+    m.reports += square(moved) > 0.0
 
 
 @inner
@@ -89,6 +127,19 @@ def _is_at_limit(m: Record, counts: complex) -> bool:
 
 
 @inner
+def _is_too_fast(state: Record, m: Record) -> bool:
+    """Whether a mouse moves at the speed limit, if one has been found."""
+    if not (state.speed_limit > 0.0 and state.interval > 0.0):
+        return False
+    speed = math.sqrt(square(m.moved)) / state.interval
+    if speed > _NO_LIMIT * state.speed_limit:
+        state.speed_limit = 0.0
+    if state.window_s > 0.0:  # one step has the noise of its counts
+        speed = max(speed, math.sqrt(square(m.window)) / state.window_s)
+    return bool(speed > state.speed_limit > 0.0)
+
+
+@inner
 def _watch_repeats(m: Record, counts: complex) -> None:
     """How often a mouse has given the same counts, and by how much they have changed of late."""
     change = counts - m.counts
@@ -98,11 +149,22 @@ def _watch_repeats(m: Record, counts: complex) -> None:
 
 
 @inner
+def _moves_as_expected(state: Record, m: Record) -> bool:
+    """Whether a mouse repeats the counts of a robot at constant speed."""
+    if not state.interval > 0.0:
+        return False
+    off = m.moved - scaled(state.interval, state.velocity + scaled(state.turn_rate, m.arm))
+    return bool(square(off) < (_STUCK_COUNTS * m.metres_per_count) ** 2)
+
+
+@inner
 def _exclude_stuck(state: Record, mice: Records) -> None:
     """Exclude mice that repeat one count while another mouse rests or changes its counts."""
     for i in range(state.count):
         m = mice[i]
         if not (state.sound >> i & 1 and m.repeats >= _STUCK_REPEATS and square(m.counts) > 0.0):
+            continue
+        if _moves_as_expected(state, m):
             continue
         for k in range(state.count):
             other = mice[k]
@@ -144,9 +206,10 @@ def end_step(state: Record) -> None:
 
 @inner
 def variance(m: Record, step: float, speed2: float, scatter: float, noise_m_s: float) -> float:
-    """σ_i² of one mouse's velocity over a step ((m/s)²)."""
+    """σ_i² of one mouse's velocity over a step ((m/s)²). Reports that cover several steps are not in time with them."""
     count: float = m.metres_per_count / step
-    return ROUNDING * count * count + scatter * scatter * speed2 + noise_m_s * noise_m_s
+    share = scatter if m.share == 1.0 else _UNTIMED * m.share
+    return ROUNDING * count * count + share * share * speed2 + noise_m_s * noise_m_s
 
 
 @inner
@@ -187,6 +250,39 @@ def _fill_window(state: Record, mice: Records) -> None:
 
 
 @inner
+def _compare_excluded(state: Record, mice: Records) -> None:
+    """Add the motion of each excluded mouse, and the motion that the others show at its place, to its sums."""
+    for i in range(state.count):
+        if state.excluded & state.sound & 1 << i:
+            m = mice[i]
+            _compare(m.while_excluded, m.moved, scaled(state.step, state.velocity + scaled(state.turn_rate, m.arm)))
+
+
+@inner
+def _compare_with_gyro(state: Record, mice: Records) -> None:
+    """Add the motions of the mice relative to their mean, and those that the gyro's turn implies, to the sums."""
+    share, moved, arm = 1.0 / max(faults.number(state.sound), 1), 0j, 0j
+    for i in range(state.count):
+        if state.sound >> i & 1:
+            moved += scaled(share, mice[i].moved)
+            arm += scaled(share, mice[i].arm)
+    turn = (state.mean_rate - state.bias) * state.step
+    for i in range(state.count):
+        if state.sound >> i & 1:
+            _compare(state.while_excluded, mice[i].moved - moved, scaled(turn, mice[i].arm - arm))
+
+
+@inner
+def _compare(sums: Record, shown: complex, expected: complex) -> None:
+    sums.by_others += square(expected)
+    if square(shown) == 0.0:
+        sums.without_counts += square(expected)
+    sums.by_others_double += turned(expected, expected)
+    sums.direct += turned(shown, complex(expected.real, -expected.imag))
+    sums.mirrored += turned(shown, expected)
+
+
+@inner
 def _learn_bias(state: Record) -> None:
     """Gyro bias from mice that agree: the mean of gyro minus mice over the last ten seconds."""
     if faults.number(faults.trusted(state)) < 2 or not math.isfinite(state.mean_rate):
@@ -219,4 +315,8 @@ def correct(state: Record, mice: Records, p: Record, finds_bias: bool) -> bool:
         faults.readmit(state, mice, p.noise_m_s, p.mismatch)
         if finds_bias and is_known:
             _learn_bias(state)
+    if state.excluded and state.used:
+        _compare_excluded(state, mice)
+    elif state.excluded and math.isfinite(state.mean_rate):
+        _compare_with_gyro(state, mice)
     return is_known

@@ -43,6 +43,18 @@ SAMPLE = np.dtype(
     align=True,
 )
 
+# Sums of a motion s and of the motion p that was expected, for s = g p + h p*, see `causes`.
+_COMPARISON = np.dtype(
+    [
+        ("by_others", "f8"),  # Σ|p|² (m²)
+        ("without_counts", "f8"),  # part of it in which s was 0 (m²)
+        ("by_others_double", "c16"),  # Σp²
+        ("direct", "c16"),  # Σ s p*
+        ("mirrored", "c16"),  # Σ s p
+    ],
+    align=True,
+)
+
 MOUSE = np.dtype(
     [
         # Placement.
@@ -56,8 +68,18 @@ MOUSE = np.dtype(
         ("repeats", "i8"),  # readings in a row with the same counts
         ("change", "f8"),  # of the counts over about half a second: a forgetting sum
         ("silent_s", "f8"),  # time without a count (s)
+        ("held_s", "f8"),  # time for which readings without counts have been taken for missing reports (s)
+        ("reports", "i8"),  # readings with counts
+        ("missing", "i8"),  # readings taken for missing reports
+        ("creeps", "i8"),  # single counts at rest
+        ("is_lone", "?"),  # whether the last count came alone after a silence
+        ("share", "f8"),  # of the last counts that belongs to the last step
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)
+        ("while_excluded", _COMPARISON),  # its motion beside the motion that the others show at its place
+        ("snap_readings", "f8"),  # readings almost along an axis in which counts across it were expected
+        ("snap_empty", "f8"),  # and those of them without such counts
+        ("snaps", "?"),  # whether they show that the mouse snaps to its axes
         # Terms of a least-squares fit.
         ("sum", "c16"),  # motion (m) or velocity (m/s)
         ("weight", "f8"),  # 1 / its variance
@@ -96,11 +118,13 @@ STATE = np.dtype(
         ("bias", "f8"),  # of the gyro beyond the rig's (rad/s)
         ("bias_std", "f8"),
         ("bias_s", "f8"),  # how long agreeing mice have shown the bias (s)
-        ("is_saturated", "?"),  # whether the counters of all mice have run over in this step
+        ("is_saturated", "?"),  # whether all mice count a lower bound of their motion in this step
+        ("speed_limit", "f8"),  # above which a mouse counts too little (m/s); 0 until one has been found
         # Sets of mice as bit masks: bit 0 is the first mouse.
         ("sound", "i8"),  # have counts that cover this step
         ("used", "i8"),  # count for the estimate
         ("away", "i8"),  # had no counts
+        ("held", "i8"),  # had a reading without counts between two reports
         ("excluded", "i8"),  # not used until they agree again
         # The window: an exponentially forgetting sum.
         ("window_s", "f8"),  # its length (s)
@@ -112,6 +136,8 @@ STATE = np.dtype(
         ("suspects", "i8"),  # the mice that the last test found at fault
         ("suspected_s", "f8"),  # for how long it has found the same (s)
         ("disagree_s", "f8"),  # for how long the mice have disagreed (s)
+        # While no mouse is used: motions of the mice relative to their mean, beside the gyro's turn.
+        ("while_excluded", _COMPARISON),
         # Result of a least-squares fit: motion (m, rad) or velocity (m/s, rad/s), and variances.
         ("fit", "c16"),
         ("fit_turn", "f8"),
@@ -142,6 +168,7 @@ def mouse_records(mice: tuple[Mouse, ...]) -> Any:
         records[i].arm = complex(-mouse.y_m, mouse.x_m)
         records[i].axis = cmath.rect(metres, math.radians(mouse.angle_deg))
         records[i].metres_per_count = metres
+        records[i].share = 1.0
     return records
 
 

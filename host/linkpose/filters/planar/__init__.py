@@ -16,6 +16,7 @@ Source: [Thesis], equations (1)-(17); [Mice], (6), (7).
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ import numpy as np
 from linkpose.filters import GyroJumps, MovedMouse
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
+from linkpose.filters.mice.causes import causes
 from linkpose.filters.mice.reading import BIAS_STD
 from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, sample_records
 from linkpose.filters.planar.process import process
@@ -46,8 +48,18 @@ __all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
 
+_SPREAD = 0.02  # of the share of the turns that the mice show: reported from here on
+# A mouse is reported as snapping to its axes after so many readings, as creeping after so many counts at rest, and as
+# slow from this share of missing reports on.
+_SNAP_READINGS, _CREEPS, _MISSING = 50.0, 5, 0.15
 # A mouse is reported at another place beyond so much (m), and so many standard deviations.
 _MOVED_M, _MOVED_Z = 0.008, 5.0
+
+
+def _names(indices: Iterable[int]) -> str:
+    """Mice by their ports, such as "mice 1, 3"; empty for none."""
+    ports = [str(i + 1) for i in indices]
+    return f"{'mouse' if len(ports) == 1 else 'mice'} {', '.join(ports)}" if ports else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +117,11 @@ class _PlanarFilter:
         return int(self._mice_state[0].excluded)
 
     @property
+    def gyro_bias_rad_s(self) -> float:
+        """Bias of the gyro about the vertical so far, beyond the rig's."""
+        return float(self.state[0].at.bias)
+
+    @property
     def gyro_jumps(self) -> GyroJumps:
         """Jumps of the gyro's bias so far."""
         state = self.state[0]
@@ -124,6 +141,53 @@ class _PlanarFilter:
             if off_m > max(_MOVED_M, _MOVED_Z * found.position_std_m):
                 moved.append(MovedMouse(found.mouse, found.x_m, found.y_m, off_m))
         return tuple(moved)
+
+    @property
+    def mouse_causes(self) -> dict[int, str]:
+        """Why mice were excluded so far (1 for the first; 0: all together)."""
+        return causes(self._mice_state[0], self._mice)
+
+    @property
+    def mice_remarks(self) -> list[str]:
+        """Faults that all mice share, as the turns have shown them, and mice that count in an unusual way."""
+        return [*self._remarks_on_all(), *self._remarks_on_each()]
+
+    def _remarks_on_all(self) -> Iterator[str]:
+        state, limit = self.state[0], float(self._mice_state[0].speed_limit)
+        if limit > 0.0:
+            yield (
+                f"the mice show no speed above {limit:.2f} m/s, where the gyro shows faster turns: this is the limit "
+                "of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
+                "includes it. Drive slower, or use mice for higher speeds"
+            )
+        if state.resolution.changes:
+            yield (
+                f"all mice count {state.resolution.factor:.2f} times as much since a time before "
+                f"{state.resolution.time:.1f} s, compared with the gyro: their resolution was switched, and the path "
+                "since then was corrected"
+            )
+        if state.turn_spread > _SPREAD**2:
+            yield (
+                f"from turn to turn, the mice show {100 * math.sqrt(state.turn_spread):.0f} % more or less than the "
+                "gyro: they slip, or the floor changes. The σ of the position includes this share of the way"
+            )
+
+    def _remarks_on_each(self) -> Iterator[str]:
+        mice, causes = self._mice[: len(self._rig.mouse)], self.mouse_causes
+        slow = (i for i, m in enumerate(mice) if m["missing"] > _MISSING * m["reports"])
+        if names := _names(i for i in slow if i + 1 not in causes):
+            yield (
+                f"{names}: readings without counts during motion; the report rate is lower than the sample rate. The "
+                "motion between two reports is interpolated"
+            )
+        if names := _names(i for i, m in enumerate(mice) if m["creeps"] > _CREEPS):
+            yield f"{names}: single counts while the robot rests. They are not taken for motion. Check the surface"
+        snapping = (i for i, m in enumerate(mice) if m["snaps"] and m["snap_readings"] > _SNAP_READINGS)
+        if names := _names(i for i in snapping if i + 1 not in causes):
+            yield (
+                f"{names}: no counts across an axis while the motion is almost along the other one (angle "
+                "snapping). In bends, the position is less accurate. Use mice without this function"
+            )
 
     @property
     def scale_change(self) -> tuple[float, float]:

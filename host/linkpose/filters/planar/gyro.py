@@ -44,6 +44,14 @@ _PATIENCE_BLOCKS = 50
 # Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
 # both 1σ. Doubled: no visible change, as long as both are possible.
 _LOST_STD, _VEERING_STD = 0.25, 0.1
+# Mice whose resolution has changed show the same share of the gyro's turn in two turns in a row: each of at least so
+# much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
+# (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
+_RESOLVED_TURN, _RESOLVED_EQUAL, _RESOLVED_OFF, _STRAIGHT_RAD_S, _RESOLVED_STD = 0.3, 0.02, 0.2, 0.1, 0.01
+_RESOLVED_LEAST = 0.15  # a smaller share: mice that are lifted or mounted the other way round show no jump of the gyro
+# A mouse that a jump of the gyro has excluded differs from the expected motion by less than this share, and velocity
+# (m/s). Doubled: with two mice, one that slips passes for a jump of the gyro.
+_NEARLY_SHARE, _NEARLY_M_S = 0.15, 0.02
 _SILENT_S = 0.05  # a mouse without a count for so long does not move (s)
 _JUMP_SHARE = 0.03  # of a jump of the bias: its σ beyond that of the fit
 _REPAIR_SHARE = 0.3  # of a correction of the heading or the position: its σ
@@ -62,6 +70,7 @@ def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
     turn_rate = m.fit_turn if motion else 0.0
     _advance_other(state, m.fit if motion else 0j, turn_rate, m.step)
     if math.isfinite(m.mean_rate):
+        _watch_resolution(state, m, turn_rate)
         _add_step(state, m, mice, turn_rate, motion)
 
 
@@ -69,11 +78,12 @@ def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
 def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
     """Velocity and turn rate of the last step by the mice alone into `m.fit…`: 1; 0 where they rest; −1 without one.
 
-    Where fewer than two mice are trusted, all count: a wrong gyro makes the fault tests exclude sound mice.
+    Where fewer than two mice are trusted, excluded ones count too: a wrong gyro makes the fault tests exclude sound
+    mice.
     """
     counting, judges = NOBODY, trusted(m)
     if number(judges) < 2:
-        judges = m.sound
+        judges = judges | _nearly_sound(state, m, mice)
     if number(judges) < 2:
         return -1
     if judges != state.dispute.judges:  # a fault has been found or is over: compare anew
@@ -97,6 +107,69 @@ def _motion_by_mice(state: Record, m: Record, mice: Records, p: Record) -> int:
         return -1
     _add_gradient(state, m, mice, counting)
     return 1
+
+
+@inner
+def _nearly_sound(state: Record, m: Record, mice: Records) -> int:
+    """All mice; of two, the excluded one only where its motion differs no more than a jump of the gyro explains."""
+    everybody: int = m.sound
+    nearly: int = trusted(m)
+    if nearly == NOBODY or number(everybody) > 2:
+        return everybody
+    velocity, turn_rate = complex(state.at.vx, state.at.vy), state.at.wz
+    for i in range(m.count):
+        if everybody >> i & 1:
+            expected = velocity + scaled(turn_rate, mice[i].arm)
+            off2 = square(scaled(1.0 / m.step, mice[i].moved) - expected)
+            if off2 < _NEARLY_SHARE**2 * square(expected) + _NEARLY_M_S**2:
+                nearly |= 1 << i
+    return nearly
+
+
+@inner
+def _watch_resolution(state: Record, m: Record, by_mice: float) -> None:
+    """Find another resolution of all mice, by the share of the gyro's turn that they show; `by_mice` is their rate."""
+    seen, by_gyro = state.resolution, m.mean_rate - state.at.bias
+    if abs(by_gyro) < _STRAIGHT_RAD_S:
+        if seen.square > _RESOLVED_TURN:
+            _end_turn(state, m, seen.product / seen.square)
+        seen.square = seen.product = 0.0
+    seen.square += by_gyro * by_gyro * m.step
+    seen.product += by_gyro * by_mice * m.step
+
+
+@inner
+def _end_turn(state: Record, m: Record, share: float) -> None:
+    """A turn has ended, of which the mice have shown this share. Two wrong ones in a row are no lift or slip."""
+    seen, position = state.resolution, complex(state.at.x, state.at.y)
+    is_wrong, was_wrong = abs(share - 1.0) > _RESOLVED_OFF, abs(seen.share - 1.0) > _RESOLVED_OFF
+    if is_wrong and share > _RESOLVED_LEAST and abs(share - seen.share) < _RESOLVED_EQUAL * share:
+        _accept_resolution(state, m, share)
+        seen.share = 1.0
+        return
+    if is_wrong and was_wrong:  # exchanged or reversed axes, wrong angles
+        widen_way(state, min(abs(1.0 - share), 2.0), position - seen.start)
+    if was_wrong or not is_wrong:
+        seen.start = position
+    seen.share = share
+
+
+@inner
+def _accept_resolution(state: Record, m: Record, share: float) -> None:
+    """All mice count `share` times as much as before, from a time on since the last turn in which they did not."""
+    p = state.covariance
+    for a in range(MICE + SCALE, state.size, OF_MOUSE):
+        state.mean[a] -= math.log(share)
+        for b in range(MICE + SCALE, state.size, OF_MOUSE):
+            p[a, b] += _RESOLVED_STD**2
+    position = complex(state.at.x, state.at.y)
+    widen_way(state, 1.0 / share - 1.0, position - state.resolution.start)
+    state.resolution.start = position
+    m.excluded = NOBODY
+    state.resolution.changes += 1
+    state.resolution.factor, state.resolution.time = share, m.time
+    restart_turns(state)
+    agree(state)
 
 
 @inner
@@ -237,6 +310,7 @@ def _decide(state: Record, m: Record) -> None:
     by_mice = _cost_of_mice(dispute)
     variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
     is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
+    is_jump = is_jump and state.resolution.share > _RESOLVED_LEAST
     if is_jump and abs(jump) < _MOST_RAD_S and jump * jump > _JUMP_Z**2 * (variance + state.covariance[BIAS, BIAS]):
         _accept_jump(state, m, jump, variance)
     elif by_jump - by_mice > _BETTER or (
@@ -311,7 +385,9 @@ def take_other_pose(state: Record) -> None:
 def restart_turns(state: Record) -> None:
     """Begin again to compare the turns of gyro and mice."""
     state.turn_square = state.turn_product = state.turn_variance = 0.0
-    state.recent_square = state.recent_product = state.off_of_turn = state.off_of_turn_before = 0.0
+    state.recent_square = state.recent_product = state.recent_variance = 0.0
+    state.resolution.square = state.resolution.product = 0.0
+    state.off_of_turn = state.off_of_turn_before = 0.0
     for i in range(len(state.lever_of_each)):
         state.lever_of_each[i] = 0j
     state.is_off = False

@@ -68,7 +68,9 @@ def compare(state: Record, rate: float) -> None:
             seen = state.seen[i]
             r[row] += seen.velocity.real
             r[row + 1] += seen.velocity.imag
-            s[row, row] = s[row + 1, row + 1] = seen.variance
+            s[row, row] = seen.variance + seen.across.real * seen.across.real
+            s[row + 1, row + 1] = seen.variance + seen.across.imag * seen.across.imag
+            s[row, row + 1] = s[row + 1, row] = seen.across.real * seen.across.imag
             row += 2
 
 

@@ -13,8 +13,10 @@ from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.gyro import agree, is_undecided, restart_turns, watch_gyro, widen_way
+from linkpose.filters.planar.limit import watch_limit
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
+from linkpose.filters.planar.snapping import snapped_std, watch_snapping
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
 
 # How long mice that contradict the prediction are left out (s). Doubled: the velocity is held longer after a collision.
@@ -27,6 +29,12 @@ _PATIENCE_S = 0.5
 _JUMP_M_S2, _JUMP_Z = 3.0, 6.0
 _SATURATED_SHARE = 0.5  # of the speed that saturated mice show: by so much they may count too little (1σ)
 _SPREAD_S = 0.05  # a jump spreads over two or three readings
+# A stop of all mice shorter than this (s), before and after which they show one velocity within this share, is a bump:
+# no robot stops and starts so fast. Doubled time: a collision may pass for a bump.
+_SHORT_STOP_S, _SAME_SHARE = 1.0, 0.2
+# Below this speed (m/s) a robot rests. Mice that then begin at a higher one have missed the way of so long (s, 1σ):
+# they need 0.05 to 0.5 s to wake. Doubled: so is the σ of the position after such a start.
+_RESTING_M_S, _MISSED_START_S = 0.02, 0.3
 _UNCONFIRMED_S, _CONFIRMING_RAD, _AGREED_SHARE, _AGREED_RAD_S = 10.0, 0.2, 0.1, 0.05
 # Within one step a velocity changes by about this (m/s², rad/s²): the velocity is the mean over the step, the estimate
 # belongs to its end. Doubled: the stated ± of the velocity grows by half.
@@ -40,6 +48,10 @@ _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 
 # Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
 # (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
 _ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# Turns in which the mice show different shares of the gyro's turn: noise of a share (1σ, by positions, angles and the
+# bias), standard deviations from which a difference counts, and turns over which it is averaged. Doubled noise: slips
+# of 3 % do not widen the position.
+_TURN_NOISE, _TURN_Z, _TURNS = 0.003, 3.5, 6.0
 # A mouse is misplaced: after so much turning (rad²/s), by at least this much (m), with this share of the squared
 # differences left, once its scale and angle are known to this σ. Its new place has this share of the change as σ.
 # Doubled: a place is corrected later, or a wrong mouse is corrected.
@@ -52,6 +64,11 @@ _BIAS_MARGIN_RAD_S = 0.005
 # A mouse at fault whose scale or angle is further from the rig's than this (standard deviations to begin with) has
 # spoilt the calibration of all. Doubled: a mouse that is mounted wrong by 10° turns the path by 3°.
 _SPOILT_Z = 2.0
+_UNKNOWN_SHARE = 0.25  # of the variance to begin with: above it, nothing is lost. Doubled: a mouse wrong from the start
+# turns the others by a degree.
+# A single count of a mouse that has hardly changed its counts for half a second, with silence of so long (s) after it,
+# is creeping. After so many, one does not end a rest. Doubled: the gyro's bias is measured later.
+_CREEPING_CHANGE, _CREEPING_S, _KNOWN_CREEPS = 1.4, 0.3, 2
 _NOISE_S = 0.01  # over which noise common to all mice keeps its value (s)
 
 
@@ -80,7 +97,7 @@ def _move_on(state: Record, p: Record, dt: float) -> None:
 
 
 @inner
-def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) -> None:
+def _collect(state: Record, m: Record, mice: Records, rig: Records, sample: Record, p: Record) -> None:
     """The measurement of this step."""
     state.seen_by = 0
     if state.at_rest:
@@ -97,10 +114,14 @@ def _collect(state: Record, m: Record, rig: Records, sample: Record, p: Record) 
     velocity, per_s = complex(state.at.vx, state.at.vy), 1.0 / m.step
     for i in range(m.count):
         if m.used >> i & 1:
-            seen, place = state.seen[i], rig[i]
+            seen, place, mouse = state.seen[i], rig[i], mice[i]
             speed2 = squared_speed(place, velocity, state.at.wz)
-            seen.velocity = scaled(per_s, turned(place.axis, sample.counts[i]))
-            seen.variance = reading.variance(place, m.step, speed2, p.scatter, p.noise_m_s)
+            seen.velocity = scaled(per_s * mouse.share, turned(place.axis, sample.counts[i]))
+            seen.variance = reading.variance(mouse, m.step, speed2, p.scatter, p.noise_m_s)
+            if m.is_saturated:  # a lower bound shows no turn
+                seen.variance += _SATURATED_SHARE * _SATURATED_SHARE * speed2
+            is_snapped = state.snapped >> i & 1
+            seen.across = scaled(per_s, snapped_std(place, sample.counts[i])) if is_snapped else 0j
             state.rows += 2
     state.seen_by = m.used
 
@@ -119,8 +140,8 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     state.turn_square = keep * state.turn_square + turn * turn * m.step
     state.turn_product = keep * state.turn_product + turn * m.turn_rate * m.step
     state.turn_variance = keep * keep * state.turn_variance + (turn * m.step * m.turn_std) ** 2
-    _add_to_turn(state, turn, m.turn_rate, m.step)
     by_scales = _variance_by_scales(state, m, mice)
+    _add_to_turn(state, m, turn, by_scales)
     state.is_off = abs(_off_of_turn(state) or state.off_of_turn) > _FLOOR_SHARE + _OFF_Z * math.sqrt(by_scales)
     if is_undecided(state):
         return
@@ -244,26 +265,47 @@ def _off_of_turn(state: Record) -> float:
 
 
 @inner
-def _add_to_turn(state: Record, by_gyro: float, by_mice: float, dt: float) -> None:
-    """Add a step to the current turn: rates of both (rad/s). Another direction, or going straight, ends it."""
+def _add_to_turn(state: Record, m: Record, by_gyro: float, by_scales: float) -> None:
+    """Add a step to the current turn; `by_gyro` is its rate (rad/s). Another direction, or going straight, ends it."""
     if abs(by_gyro) < _TURN_END_RAD_S or by_gyro * state.turn_rate < 0.0:
         off = _off_of_turn(state)
         if off != 0.0:
+            _compare_turns(state, off, by_scales)
             state.off_of_turn, state.off_of_turn_before = off, state.off_of_turn
-        state.recent_square = state.recent_product = 0.0
+        state.recent_square = state.recent_product = state.recent_variance = 0.0
     state.turn_rate = by_gyro
-    state.recent_square += by_gyro * by_gyro * dt
-    state.recent_product += by_gyro * by_mice * dt
+    state.recent_square += by_gyro * by_gyro * m.step
+    state.recent_product += by_gyro * m.turn_rate * m.step
+    state.recent_variance += (by_gyro * m.step * m.turn_std) ** 2
+
+
+@inner
+def _compare_turns(state: Record, off: float, by_scales: float) -> None:
+    """Widen the position where this turn was off by another share than the last one: slips, or a floor that varies.
+
+    The way since the last turn is uncertain by the difference, and each way by the mean of the last differences.
+    """
+    position = complex(state.at.x, state.at.y)
+    if state.off_of_turn != 0.0:
+        noise2 = 2.0 * (by_scales + _TURN_NOISE**2) + state.recent_variance / state.recent_square**2
+        difference2 = (off - state.off_of_turn) ** 2
+        excess = difference2 - noise2 if difference2 > _TURN_Z**2 * noise2 else 0.0
+        state.turns += 1
+        state.turn_spread += (0.5 * excess - state.turn_spread) / min(float(state.turns), _TURNS)
+        widen_way(state, math.sqrt(max(excess, state.turn_spread)), position - state.turn_end)
+    state.turn_end = position
+    if abs(off) < _FLOOR_SHARE:
+        state.floor_start = position
 
 
 @inner
 def _correct_way(state: Record, off: float) -> None:
-    """The mice count by the share `off` too much; probably since the start when this is the first floor found."""
-    x, y = state.at.x, state.at.y
-    if state.floors == 0:
-        state.at.x -= off * x
-        state.at.y -= off * y
-    widen_way(state, off, complex(x, y))
+    """The mice count by the share `off` too much; probably since the last turn in which they did not."""
+    way = complex(state.at.x, state.at.y) - state.floor_start
+    state.at.x -= off * way.real
+    state.at.y -= off * way.imag
+    widen_way(state, off, way)
+    state.floor_start = complex(state.at.x, state.at.y)
 
 
 @inner
@@ -313,12 +355,14 @@ def _restart(state: Record, first: int, end: int, keep: float) -> None:
 @inner
 def _restart_spoilt(state: Record, excluded: int) -> None:
     """Start the calibration anew where the mice in `excluded`, found at fault just now, have been taken for sound mice
-    of another scale or angle: the error would be shared among all mice.
+    of another scale or angle: the error would be shared among all mice. A calibration that has hardly begun starts anew
+    in any case.
     """
     for i in range((state.size - MICE) // OF_MOUSE):
         if excluded >> i & 1:
             for at in range(MICE + OF_MOUSE * i, MICE + OF_MOUSE * i + POSITION):
-                if state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
+                is_unknown = state.covariance[at, at] > _UNKNOWN_SHARE * state.fresh[at, at]
+                if is_unknown or state.mean[at] ** 2 > _SPOILT_Z**2 * state.fresh[at, at]:
                     _restart(state, MICE, state.size, 0.0)
                     return
 
@@ -363,7 +407,7 @@ def _correct(
     if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
-    is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated)
+    is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated or state.snapped)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
     if not update(state, limit if is_patient else math.inf, limit if is_calibrating else 0.0):
         return False
@@ -385,13 +429,36 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
     if state.unconfirmed_s > 0.0:
         state.unconfirmed_s += dt
         is_back = is_jump and square(state.held - shown) < square(state.held - last)
+        if is_back:
+            _restore_way(state, shown)
         if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
             state.unconfirmed_s = -_SPREAD_S
     elif state.unconfirmed_s < 0.0:
         state.unconfirmed_s = min(state.unconfirmed_s + dt, 0.0)
     elif is_jump and square(shown - state.earlier) > limit * limit:
-        state.held, state.unconfirmed_s, state.unconfirmed_turn, state.unconfirmed_m = state.earlier, dt, 0.0, 0.0
+        if square(state.earlier) < _RESTING_M_S**2:
+            _add_missed_start(state, shown)
+        else:
+            state.held, state.unconfirmed_s, state.unconfirmed_turn = state.earlier, dt, 0.0
+            state.unconfirmed_m, state.unconfirmed_way = 0.0, 0j
     state.earlier = before
+
+
+@inner
+def _add_missed_start(state: Record, shown: complex) -> None:
+    """The mice begin to count at a speed to which no robot jumps from a rest: they slept, or were lifted."""
+    way = scaled(_MISSED_START_S, turned(unit(state.at.heading), shown))
+    widen_way(state, 1.0, way)
+
+
+@inner
+def _restore_way(state: Record, shown: complex) -> None:
+    """After a short stop of the mice from which they jump back to the velocity before it: the robot has gone on."""
+    is_same = square(shown - state.held) < _SAME_SHARE**2 * square(state.held)
+    if is_same and state.unconfirmed_s < _SHORT_STOP_S and square(state.earlier) < _SAME_SHARE**2 * square(state.held):
+        state.at.x += state.unconfirmed_way.real
+        state.at.y += state.unconfirmed_way.imag
+        state.dispute.position += state.unconfirmed_way
 
 
 @inner
@@ -407,6 +474,7 @@ def _add_unconfirmed_way(state: Record, m: Record, dt: float) -> None:
             return
     way = scaled(dt, turned(unit(state.at.heading), state.held - complex(state.at.vx, state.at.vy)))
     state.unconfirmed_m += _add_systematic(state, way, state.unconfirmed_m)
+    state.unconfirmed_way += way
 
 
 @inner
@@ -436,13 +504,43 @@ def _add_systematic(state: Record, way: complex, before_m: float) -> float:
 
 
 @inner
-def _scatter_way(state: Record, p: Record, dt: float, missed: float) -> None:
-    """Noise that mice do not show: common to all of them, and what a robot does while samples are lost."""
+def _scatter_way(state: Record, p: Record, q: Record, dt: float, missed: float) -> None:
+    """Noise that mice do not show: common to all of them, light slips, and what a robot does while samples are lost."""
     speed2 = state.at.vx**2 + state.at.vy**2
     unseen = 0.25 * _ACCEL_M_S2 * missed * missed
     variance = p.floor * p.floor * speed2 * dt * _NOISE_S + unseen * unseen
     state.covariance[X, X] += variance
     state.covariance[Y, Y] += variance
+    if speed2 > 0.0:
+        length = dt * math.sqrt(speed2)
+        way = scaled(dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+        widen_way(state, q.slip * math.sqrt(q.slip_m / length), way)
+
+
+@inner
+def _are_silent(m: Record, mice: Records) -> bool:
+    """Whether no mouse counts, but for single counts of a mouse that creeps at rest."""
+    judges = trusted(m) or m.sound
+    is_silent = judges != 0
+    for i in range(m.count):
+        if judges >> i & 1:
+            is_silent = is_silent & (_is_lone_count(mice[i]) or mice[i].silent_s > 0.0)
+    return bool(is_silent)
+
+
+@inner
+def _is_lone_count(mouse: Record) -> bool:
+    """Whether a mouse that is known to creep gives a single count after long silence; counts such counts.
+
+    A robot that starts gives a single count too, but more after it.
+    """
+    is_lone = square(mouse.counts) == 1.0 and mouse.change < _CREEPING_CHANGE
+    if is_lone or mouse.silent_s >= _CREEPING_S:
+        mouse.creeps += mouse.is_lone and mouse.silent_s >= _CREEPING_S
+        mouse.is_lone = is_lone
+    elif square(mouse.counts) > 0.0:
+        mouse.is_lone = False
+    return bool(is_lone and mouse.creeps >= _KNOWN_CREEPS)
 
 
 @inner
@@ -455,26 +553,25 @@ def _step(
         return
     dt, half = m.step + m.missed, 0.5 * m.missed if m.step > 0.0 else 0.0
     before = m.excluded
+    watch_snapping(state, m, mice, sample)
     if reading.correct(m, mice, p, False):
         m.known_time = sample.time
-    judges = trusted(m) or m.sound
-    is_silent = judges != 0
-    for i in range(m.count):
-        is_silent = is_silent and (not judges >> i & 1 or mice[i].silent_s > 0.0)
+    is_silent = _are_silent(m, mice)
     _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt, sample.time)
     is_good = half == 0.0 or _advance(state, tangent, points, half)
     _move_on(state, q, dt)
-    _collect(state, m, rig, sample, p)
+    _collect(state, m, mice, rig, sample, p)
     state.rejected += state.rows == 0 or (m.used == 0 and not state.at_rest)
     is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, tangent, points, dt - half)
     if not is_good:
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
         agree(state)
-    _scatter_way(state, p, dt, m.missed if m.step > 0.0 else 0.0)
+    _scatter_way(state, p, q, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
     _add_saturated_way(state, m, dt)
+    watch_limit(state, m, mice)
     _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)
@@ -507,8 +604,10 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
         lag += 0.5 * m.interval
     by_scale, by_angle = _common_errors(state, m, mice)
     other = state.dispute.position - complex(at.x, at.y)
-    out.x_std = _std(state, X, since, math.sqrt(by_scale * out.x**2 + by_angle * out.y**2 + other.real**2))
-    out.y_std = _std(state, Y, since, math.sqrt(by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2))
+    spread, last = state.turn_spread, complex(at.x, at.y) - state.turn_end
+    x_variance = by_scale * out.x**2 + by_angle * out.y**2 + other.real**2 + spread * last.real**2
+    y_variance = by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2 + spread * last.imag**2
+    out.x_std, out.y_std = _std(state, X, since, math.sqrt(x_variance)), _std(state, Y, since, math.sqrt(y_variance))
     out.heading_std = _std(state, HEADING, since, state.dispute.heading - at.heading)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)

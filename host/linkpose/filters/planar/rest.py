@@ -26,6 +26,9 @@ _LARGEST_RAD_S = 0.35  # a larger rate is a turn: the data sheet's bias is withi
 _UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
 _DRIFTED_Z = 5.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
 _GUARD_Z = 5.0  # standard normal quantile of the guards
+# A block that differs from those after it by so many σ is dropped: the robot came to rest in it, by turning less than a
+# count. Doubled: the bias takes up part of such a turn.
+_SETTLING_Z = 2.5
 # The gyro's noise may be three times the assumed one: the data sheet gives 0.05 °/s, real sensors reach 0.13 °/s.
 _NOISE_MARGIN = 9.0
 
@@ -82,7 +85,9 @@ def _finish_block(state: Record, time_s: float) -> bool:
         if abs(mean - last.mean) > _GUARD_Z * math.sqrt(2.0 * noise):
             return False
     if state.queued == QUEUE:
-        _use_oldest(state)
+        if not _is_settling(state):
+            _use_oldest(state)
+        _drop_oldest(state)
     block = state.queue[state.queued]
     block.mean, block.count = mean, count
     block.squares = max(0.0, state.block_squares - count * mean * mean)
@@ -124,8 +129,27 @@ def _widen_heading(state: Record, jump: float) -> None:
 
 
 @inner
+def _is_settling(state: Record) -> bool:
+    """Whether the rate of the oldest block differs from that of the blocks after it."""
+    first, total, count = state.queue[0], 0.0, 0.0
+    for k in range(1, state.queued):
+        total += state.queue[k].mean * state.queue[k].count
+        count += state.queue[k].count
+    variance = state.gyro_variance * (1.0 / first.count + 1.0 / count)
+    return bool((first.mean - total / count) ** 2 > _SETTLING_Z**2 * variance)
+
+
+@inner
+def _drop_oldest(state: Record) -> None:
+    for k in range(1, QUEUE):
+        to, block = state.queue[k - 1], state.queue[k]
+        to.mean, to.count, to.squares = block.mean, block.count, block.squares
+    state.queued -= 1
+
+
+@inner
 def _use_oldest(state: Record) -> None:
-    """Update bias and noise with the oldest block, and drop it from the queue. ω was 0 then, so its rate is b."""
+    """Update bias and noise with the oldest block. ω was 0 then, so its rate is b."""
     block, known = state.queue[0], state.gyro_samples
     more = block.count - 1.0
     state.gyro_samples = min(known + more, 1000.0)
@@ -145,7 +169,3 @@ def _use_oldest(state: Record) -> None:
         state.cross[0, k] = state.covariance[BIAS, k]
     update(state, math.inf, math.inf)
     state.since_rest_s = 0.0
-    for k in range(1, QUEUE):
-        to, block = state.queue[k - 1], state.queue[k]
-        to.mean, to.count, to.squares = block.mean, block.count, block.squares
-    state.queued -= 1

@@ -43,8 +43,24 @@ POINT = np.dtype(
         ("mice", _CALIBRATION, (MOST,)),
     ]
 )
-_SEEN = np.dtype([("velocity", "c16"), ("variance", "f8")])  # by a mouse, in b as the rig places it (m/s, (m/s)²)
+# By a mouse, in b as the rig places it: velocity (m/s), its variance along each axis ((m/s)²), and a further σ (m/s)
+# along the direction of this vector.
+_SEEN = np.dtype([("velocity", "c16"), ("variance", "f8"), ("across", "c16")])
 _REST_BLOCK = np.dtype([("mean", "f8"), ("count", "i8"), ("squares", "f8")])  # of the gyro's rate (rad/s)
+
+# Turns in which the mice show another share of the gyro's turn, see `gyro`.
+_RESOLUTION = np.dtype(
+    [
+        ("square", "f8"),  # of the current turn: ∫ ω² dt of the gyro (rad²/s)
+        ("product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
+        ("share", "f8"),  # of the gyro's turn that the mice showed in the last turn
+        ("start", "c16"),  # position in n (m) up to which the way is certain, or its uncertainty stated
+        ("changes", "i8"),  # how often the resolution has changed
+        ("factor", "f8"),  # counts after the last change over counts before it
+        ("time", "f8"),  # when it was found (s)
+    ],
+    align=True,
+)
 
 # Gyro and mice that turn by different amounts: sums since the last agreement, see `gyro`.
 _DISPUTE = np.dtype(
@@ -111,11 +127,17 @@ _FIELDS = [
     ("turn_rate", "f8"),  # of the gyro, less its bias, in the last step (rad/s)
     ("off_of_turn", "f8"),  # share by which the mice turned more than the gyro in the last turn
     ("off_of_turn_before", "f8"),  # and in the one before
+    ("recent_variance", "f8"),  # variance of recent_product ((rad²/s)²)
+    ("turn_end", "c16"),  # position at the end of the last turn, in n (m)
+    ("turn_spread", "f8"),  # mean square deviation of the share from turn to turn, beyond noise
+    ("turns", "i8"),  # number of turns that have been compared
     ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("dispute", _DISPUTE),
+    ("resolution", _RESOLUTION),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
     ("jump_time", "f8"),  # and when it was found (s)
+    ("floor_start", "c16"),  # position after the last turn in which the mice showed the gyro's turn, in n (m)
     ("floors", "i8"),  # how often the floor has changed
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
@@ -130,11 +152,19 @@ _FIELDS = [
     ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
     ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
     ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
+    ("unconfirmed_way", "c16"),  # the same as a vector in n (m)
     ("saturated_m", "f8"),  # way that saturated mice may have missed (m)
+    # A speed limit of the mice, see `limit`.
+    ("fastest", "f8"),  # largest speed of a mouse so far (m/s)
+    ("limited_x", "f8"),  # way at about that speed, along either axis of n (m)
+    ("limited_y", "f8"),
+    ("limit_s", "f8"),  # how long mice at that speed have contradicted the gyro (s)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
     ("seen_by", "i8"),  # bit mask
+    ("has_snapping", "?"),  # whether a mouse has been found that snaps to its axes
+    ("snapped", "i8"),  # bit mask of mice whose last counts were snapped to an axis
     ("rate_variance", "f8"),  # of the gyro's mean rate ((rad/s)²)
     ("seen", _SEEN, (MOST,)),
     # The innovation: z − ẑ, its covariance S, and its covariances with the state, row by row.
@@ -227,6 +257,10 @@ class PlanarParameters(NamedTuple):
     position_m: float = 0.0006
     scale_walk: float = 1e-4
     angle_walk: float = 1e-4
+    # Share of the way that all mice lose or add unnoticed, constant over so much way (m): light slips and a floor that
+    # varies. A slip of 10 % over 2 m of a drive of 24 m is 2.4 σ. Doubled: σ of the position on sound floors doubles.
+    slip: float = 0.01
+    slip_m: float = 3.0
     # Another floor: change of the common scale once the gyro has shown one.
     floor_scale: float = 0.05
 
@@ -237,6 +271,7 @@ def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
     state.gyro_variance, state.gyro_samples = gyro_variance, 20.0
+    state.resolution.share = 1.0
     covariance = state.covariance
     for index, std in (
         *((k, 1e-6) for k in (X, Y, HEADING)),

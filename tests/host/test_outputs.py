@@ -1,0 +1,182 @@
+"""Outputs of every kind in hostile places: planted links, disks, modes, files that are exchanged, failing systems."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from linkpose import outputs
+from linkpose.errors import CannotWrite, FileExists
+from linkpose.outputs import create, new_file, replace_file
+from linkpose.recording.csvfile import CsvFile
+from linkpose.sensors.rig import Rig
+
+STRANGER = 54321
+
+
+def with_owner(path: Path, entry: os.stat_result, owner: int) -> SimpleNamespace:
+    return SimpleNamespace(st_uid=owner, st_mode=entry.st_mode, st_dev=entry.st_dev, st_ino=entry.st_ino)
+
+
+def fill(path: Path) -> None:
+    with new_file(path, force=True) as file:
+        file.write(b"new")
+
+
+@pytest.fixture
+def planted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """A link that a stranger has put into a folder that all can write, and the file of this user behind it."""
+    (folder := tmp_path / "tmp").mkdir()
+    folder.chmod(0o1777)
+    target = tmp_path / "precious.csv"
+    target.write_text("precious")
+    link = folder / "e.csv"
+    link.symlink_to(target)
+    real = os.lstat
+    monkeypatch.setattr(
+        outputs.os, "lstat", lambda path: with_owner(path, real(path), STRANGER) if path == link else real(path)
+    )
+    return link, target
+
+
+def test_a_link_of_another_user_is_not_followed(planted: tuple[Path, Path]) -> None:
+    link, target = planted
+    writers: list[Callable[[], object]] = [
+        lambda: create(link, force=True),
+        lambda: CsvFile(link, "recording", {}, ["time_s"], force=True),
+        lambda: fill(link),
+        lambda: Rig().save(link),
+    ]
+    for write in writers:
+        with pytest.raises(CannotWrite, match="it is a link of another user in a folder that everybody can write"):
+            write()
+    assert target.read_text() == "precious" and link.is_symlink()
+
+
+def test_a_link_of_this_user_stays_a_link(tmp_path: Path) -> None:
+    link, target = tmp_path / "link.csv", tmp_path / "target.csv"
+    link.symlink_to(target)
+    target.write_text("old")
+    for write in (lambda: os.close(create(link, force=True)), lambda: Rig().save(link)):
+        write()
+        assert link.is_symlink() and target.read_text() != "old"
+
+
+def test_a_disk_is_not_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = Path.stat
+    disk = tmp_path / "sda"
+    disk.touch()
+
+    def as_disk(path: Path, **more: bool) -> object:
+        found = real(path, **more)
+        return SimpleNamespace(st_mode=stat.S_IFBLK | 0o660, st_uid=0) if path == disk else found
+
+    monkeypatch.setattr(Path, "stat", as_disk)
+    for write in (lambda: create(disk, force=False), lambda: create(disk, force=True), lambda: Rig().save(disk)):
+        with pytest.raises(CannotWrite, match="it is a disk"):
+            write()
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o664])
+def test_a_file_that_is_replaced_keeps_its_mode(tmp_path: Path, mode: int) -> None:
+    path = tmp_path / "a.csv"
+    for write in (
+        lambda: os.close(create(path, force=True)),
+        lambda: replace_file(path, "new"),
+        lambda: fill(path),
+    ):
+        path.write_text("old")
+        path.chmod(mode)
+        write()
+        assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+def test_the_mode_of_a_strangers_file_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """He could read and write the new one by it."""
+    path = tmp_path / "a.csv"
+    path.touch()
+    path.chmod(0o666)
+    user = os.geteuid()
+    monkeypatch.setattr(outputs.os, "geteuid", lambda: user + 1)
+    os.close(create(path, force=True))
+    umask = os.umask(0)
+    os.umask(umask)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o666 & ~umask
+
+
+def test_a_file_that_cannot_be_filled_is_removed(tmp_path: Path) -> None:
+    for failure, seen in ((OSError(errno.EIO, "Input/output error"), CannotWrite), (KeyboardInterrupt(), None)):
+        path = tmp_path / "a.csv"
+        with pytest.raises(seen or KeyboardInterrupt), new_file(path, force=False) as file:
+            file.write(b"half")
+            raise failure
+        assert not path.exists()
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EDQUOT, errno.ENOSPC, errno.ESTALE])
+@pytest.mark.parametrize("call", ["fsync", "close"])
+def test_what_a_network_file_system_reports_at_the_end_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, call: str
+) -> None:
+    real = getattr(os, call)
+
+    def fail(descriptor: int) -> None:
+        if call == "close":
+            real(descriptor)
+        raise OSError(code, os.strerror(code))
+
+    file = CsvFile(tmp_path / "a.csv", "recording", {}, ["time_s"], force=False)
+    file.write("1\n")
+    with monkeypatch.context() as patch, pytest.raises(CannotWrite, match=os.strerror(code)):
+        patch.setattr(os, call, fail)
+        file.close({})
+
+
+def test_what_cannot_be_synchronised_ends_well(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    outputs.synchronise(writing)
+    os.close(reading)
+    os.close(writing)
+
+
+def test_no_file_is_opened_twice_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the check and the writing, a stranger may put another file or a link in its place."""
+    from linkpose import plotting
+    from linkpose.convert import convert
+    from linkpose.localization.maps import save_map
+
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    source = tmp_path / "e.csv"
+    source.write_text("time_s,tilt_roll_deg,tilt_pitch_deg\n" + "".join(f"{i / 50},{i % 7},1\n" for i in range(60)))
+    real = outputs.create
+
+    def exchanged(path: Path, force: bool) -> int:
+        descriptor = real(path, force)
+        path.unlink()
+        path.symlink_to(precious)
+        return descriptor
+
+    monkeypatch.setattr(outputs, "create", exchanged)
+    for ending in ("sto", "trc", "tum", "c3d", "mot", "mcap", "parquet"):
+        convert(source, tmp_path / f"a.{ending}")
+    for ending in plotting.FORMATS:
+        plotting.save(plotting.new_figure(1, 1), tmp_path / f"a{ending}", False)
+    save_map(tmp_path / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0))
+    assert precious.read_text() == "precious"
+
+
+def test_an_existing_map_is_kept(tmp_path: Path) -> None:
+    from linkpose.localization.maps import save_map
+
+    (tmp_path / "m.pgm").write_text("mine")
+    with pytest.raises(FileExists):
+        save_map(tmp_path / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0))
+    assert (tmp_path / "m.pgm").read_text() == "mine"
