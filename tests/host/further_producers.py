@@ -19,7 +19,7 @@ from scripted_board import ScriptedBoard, install
 from test_calibrate_mag import recording as of_magnetometer
 from test_calibrate_mag import tumbled
 from test_calibrate_mice import LENGTH_M, broken, driven
-from test_calibration_chain import one_link_in_motion, recording
+from test_calibration_chain import recording
 from test_calibration_link import OFFSET, SIX_SIDES
 from test_flash import ScriptedPort
 
@@ -27,7 +27,6 @@ import linkpose as lp
 from linkpose import inputs
 from linkpose.calibration.chain import calibrate_chain
 from linkpose.calibration.imu import fit_sphere
-from linkpose.calibration.joint import calibrate_joint
 from linkpose.calibration.mag import calibrate_mag
 from linkpose.calibration.mice import calibrate_mice
 from linkpose.cli import group
@@ -498,13 +497,6 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
     },
     "Calibration: motion and mice": {
-        "…: nowhere is a second with … samples or more; record again": raises(
-            lambda: calibrate_joint([recording(LinkRun(1, 0, 5.0).measurements()[::10])], Rig())
-        ),
-        "the readings fit no joint between the two sensors (… m/s² rms are left over): fix each sensor firmly on its own link, on either side of one joint": "test_calibration_chain.py::test_sensors_on_no_common_joint_are_refused",
-        "only … s show motion; move both links for half a minute or more, in all directions that the joint allows": raises(
-            lambda: calibrate_chain([recording(one_link_in_motion()[:200])], Rig())
-        ),
         "the rests give an offset of … m/s² and a scale of …, which no MPU-6050 has: did it move slowly, or is the range set wrong?": raises(
             lambda: fit_sphere(2 * STANDARD_GRAVITY * SIX_SIDES)
         ),
@@ -517,13 +509,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "the motion is too slow or too short to find J2S: two of its three directions are known to … m or worse; swing the link faster and in all directions": "test_calibration_link.py::test_motion_that_is_too_slow_is_refused",
         "the readings fit no joint that stays in its place (… m/s² rms are left over): fix the joint, and the sensor firmly on the link": "test_calibration_link.py::test_a_sensor_on_no_joint_is_refused",
         "the fit needs an accelerometer with an offset of … m/s² and a scale of …, which no MPU-6050 has: is the joint fixed, and the range set right?": "test_calibration_link.py::test_a_sensor_that_cannot_be_is_refused",
-        "…: … magnetometer readings are too few; record half a minute or more": raises(
-            lambda: calibrate_mag([of_magnetometer(tumbled(0.1))], Rig())
-        ),
         "…, too little to calibrate the magnetometer: turn the sensor by hand through all attitudes, each axis up, down and sideways, for a minute, away from iron": raises(
             lambda: calibrate_mag([of_magnetometer(tumbled(5.0, about=(0.0, 0.0, 0.0)))], Rig())
         ),
-        "the field of … µT is not the earth's (… to … µT): a magnet or iron is near the sensor. … is unchanged; record elsewhere, or add --force": "test_calibrate_mag.py::test_the_command",
         "this was not a rest: …. … is unchanged; record again, or add --force to write the figures all the same": "test_calibrate_noise.py::test_what_is_no_rest_is_named_and_not_written",
         "no recording is of a straight line; drive … and add its recording": mice("no line"),
         "no recording is of a full turn; turn the robot once round and add its recording": mice("no turn"),
@@ -536,12 +524,14 @@ FURTHER: dict[str, dict[str, Producer]] = {
             _many_turns
         ),
         "… turns by …°, so it is neither a straight line nor full turns; drive it anew": mice("half a turn"),
-        "…: a mouse counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
+        "…: mouse … counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
         "…: mouse … is away at … s, while the robot moves; drive it anew": mice("a mouse away"),
         "…: samples were lost before … s, and their counts with them; drive it anew": mice("lost samples"),
         "… holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring": mice("no gyro"),
         "… begins in motion; stand still for a second, then drive": mice("no rest"),
-        "the … mice contradict one another (… standard deviations): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped": mice_of(
+        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then drive it anew": mice("a dead mouse"),
+        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and drive both anew on a floor on which no mouse slips": mice("a slippery floor"),
+        "the … mice contradict one another (… standard deviations…): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died": mice_of(
             _contradicting_mice
         ),
     },
@@ -596,6 +586,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… holds no estimates; type: linkpose estimate … -o OUT.csv": typed("plot --view {}/a.csv", a="time_s,b\n0,1\n1,1\n"),
     },
     "Simulation and Python values": {
+        "there is no motion called …: take …": raises(lambda: LinkRun(motion="dance")),
         "there is no joint …: take …": raises(lambda: ChainRun("knee")),  # type: ignore[arg-type]
         "there is no first joint …: take …": raises(lambda: ChainRun("ball", first_joint="loose")),
         "… s at … Hz are … samples, and … is the limit: simulate at most … s, or at a lower rate": raises(
@@ -627,6 +618,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
     "Wrong usage": {
         "There is no command …. Did you mean …?": typed("estimat"),
         "There is no command …. The commands are …": typed("quux"),
+        "--rests lays the sensor on its sides, --still keeps it at rest: leave out one of them": typed("simulate link --rests --still -o a.csv --truth t.csv"),
         "choose one of --prebuilt and --hex": typed("flash --prebuilt --hex a.hex"),
         "--view-host and --view-port go with --view": typed("estimate --live --view-port 8080"),
         "--view shows a page; leave out --output": typed("plot --view {}/a.csv -o {}/a.png"),
