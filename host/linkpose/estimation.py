@@ -20,11 +20,12 @@ from linkpose.precompile import TEXT
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, RecordingFile, load_recording
+from linkpose.recording.units import suspicions
 from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
 from linkpose.sensors.health import LEFT_OUT
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import CHAIN_JOINTS, UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
+from linkpose.sensors.rig import CHAIN_JOINTS, LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
 
 if TYPE_CHECKING:
     import pandas
@@ -492,7 +493,7 @@ class Estimates:
 
 def estimate(
     source: Recording | Measurements | str | PathLike[str],
-    filters: Sequence[str] | None = None,
+    filters: str | Sequence[str] | None = None,
     *,
     j2s_m: Sequence[float] | Literal["auto"] | None = None,
     j2s_std_m: float | None = None,
@@ -505,7 +506,7 @@ def estimate(
 
     Args:
         source: what `load` returned, `Measurements`, or the path of a recording.
-        filters: names such as "joint-inertial"; None: all that the sensors and the rig support.
+        filters: a name such as "joint-inertial", or several; None: all that the sensors and the rig support.
         j2s_m: J2S, the vector from the joint centre to the sensor in the sensor's axes (m); "auto" estimates it from
             the motion. None: the rig's.
         j2s_std_m: standard deviation of `j2s_m`, each axis (m). Default: 0.1 mm.
@@ -516,27 +517,28 @@ def estimate(
         mag: correct the yaw with the magnetometer. The rig must contain the magnetometer's calibration.
 
     Warns:
-        UserWarning where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
+        UserWarning where values contradict their unit (g in place of m/s², milliseconds), where the recording is
+        faulty, and where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
 
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
         NoMagnetometer, UncalibratedMagnetometer, CannotRun (no filter estimates a yaw).
     """
-    recording = load_recording(source) if isinstance(source, str | PathLike) else source
-    own, delay_s = (None, None) if isinstance(recording, Measurements) else (recording.rig, recording.imu_delay_s)
-    measurements = recording if isinstance(recording, Measurements) else recording.measurements
+    measurements, own, delay_s, remarks = _input(source)
     in_force = as_rig(rig, own).with_delay(delay_s)
     first_joint = _joint(j2s_m, j2s_std_m)
     if first_joint is not None:
         in_force = replace(in_force, joint=first_joint)
     in_force = with_chain_joint(in_force, joint)
-    estimator = Estimator.for_measurements(filters or (), in_force, measurements)
+    estimator = Estimator.for_measurements(
+        [filters] if isinstance(filters, str) else filters or (), in_force, measurements
+    )
     if smooth:
         estimator.smooth()
     if mag:
         estimator.hold_heading()
     values = estimator.process(measurements)
-    remarks = tuple(estimator.remarks)
+    remarks = list(dict.fromkeys([*remarks, *estimator.remarks]))
     for remark in remarks:
         warnings.warn(remark, stacklevel=2)
     return Estimates(
@@ -549,8 +551,26 @@ def estimate(
         estimator.found_j2s,
         estimator.magnetic_field,
         in_force,
-        remarks,
+        tuple(remarks),
     )
+
+
+def _input(
+    source: Recording | Measurements | str | PathLike[str],
+) -> tuple[Measurements, Rig | None, float | None, list[str]]:
+    """Measurements, their own rig and delay (s), and remarks on them. Raises InvalidValue, and FileError for a path."""
+    recording = load_recording(source) if isinstance(source, str | PathLike) else source
+    if isinstance(recording, Recording):
+        return recording.measurements, recording.rig, recording.imu_delay_s, [*recording.remarks]
+    if not isinstance(recording, Measurements):
+        raise InvalidValue(
+            "source",
+            f"is of the type {type(source).__name__}; it must be a path, a Recording or Measurements: "
+            "Measurements.from_imu(time_s, accel_m_s2, gyro_rad_s) makes them from arrays",
+        )
+    if not len(recording):
+        raise InvalidValue("source", "holds no sample")
+    return recording, None, None, suspicions(recording)
 
 
 def with_chain_joint(rig: Rig, joint: str | None) -> Rig:
@@ -570,9 +590,14 @@ def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | N
         if j2s_m not in (None, "auto"):
             raise InvalidValue("j2s_m", f'is {j2s_m!r}; it must be three numbers (m) or "auto"')
         return None if j2s_m is None else UNKNOWN_JOINT
-    vector = np.asarray(j2s_m, dtype=np.float64)
+    try:
+        vector = np.asarray(j2s_m, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise InvalidValue("j2s_m", f"is {j2s_m!r}; it must be three finite numbers (m)")
+    if np.linalg.norm(vector) > LONGEST_LINK_M:
+        raise InvalidValue("j2s_m", f"is {j2s_m!r}, longer than {LONGEST_LINK_M:.0f} m; it must be in metres")
     if j2s_std_m is None:
         return Joint(to_vector(vector))
     if not 0 < j2s_std_m < np.inf:

@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,10 +67,68 @@ def test_measurements_of_ones_own_sensor_are_checked() -> None:
         ((time[::-1], vectors, vectors), "time_s is 0.03 at index 1; times must"),
         (([0, 1, np.nan, 3, 4], vectors, vectors), "time_s is nan at index 2"),
         ((time[:, None], vectors, vectors), "time_s has the shape"),
+        ((time.astype("datetime64[s]"), vectors, vectors), "time_s has the type datetime64"),
+        ((time, vectors + 0j, vectors), "accel_m_s2 is complex"),
+        ((time, vectors, [["1", "2", "x"]] * 5), "gyro_rad_s is no array of numbers"),
+        ((time, vectors, [[1.0], [2.0, 3.0]]), "gyro_rad_s is no array of numbers"),
     ):
         with pytest.raises(errors.InvalidValue, match=named) as raised:
             lp.Measurements.from_imu(*bad)
         assert isinstance(raised.value, ValueError) and raised.value.name in named
+
+
+def test_a_masked_reading_is_missing() -> None:
+    masked = np.ma.MaskedArray(np.ones((5, 3)), mask=np.arange(15).reshape(5, 3) == 4)
+    block = lp.Measurements.from_imu(np.arange(5) / 100, masked, np.ones((5, 3)))
+    assert np.argwhere(np.isnan(block.accel_m_s2)).tolist() == [[1, 1]]
+    assert (block.flags != 0).tolist() == [True, False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("factors", "remark"),
+    [
+        ((1, 1, 1), None),
+        ((1, 1 / 9.80665, 1), "is it in g?"),
+        ((1000, 1, 1), "is it in milliseconds?"),
+        ((1, 1, 180 / np.pi), "is it in °/s?"),
+    ],
+)
+def test_values_of_another_unit_are_remarked_on(swing: Path, factors: tuple[float, ...], remark: str | None) -> None:
+    """The same for arrays as for a file, whose own remarks reach the estimates."""
+    own = lp.load(swing).measurements
+    gyro = own.gyro_rad_s + np.array([1.0, 0.0, 0.0])
+    arrays = (own.time_s, own.accel_m_s2, gyro)
+    measurements = lp.Measurements.from_imu(*(a * factor for a, factor in zip(arrays, factors, strict=True)))
+    if remark is None:
+        assert not lp.estimate(measurements, "tilt").remarks
+        return
+    with pytest.warns(UserWarning, match=re.escape(remark)):
+        estimates = lp.estimate(measurements, "tilt")
+    assert remark in "".join(estimates.remarks)
+
+
+def test_remarks_of_a_file_reach_its_estimates(swing: Path, tmp_path: Path) -> None:
+    *lines, _closing = swing.read_text().splitlines()
+    cut = tmp_path / "cut.csv"
+    cut.write_text("\n".join(lines) + "\n")
+    with pytest.warns(UserWarning, match=re.escape("cut.csv")):
+        estimates = lp.estimate(cut, "tilt")
+    assert list(estimates.remarks) == lp.load(cut).remarks
+
+
+@pytest.mark.parametrize(
+    ("source", "more", "sentence"),
+    [
+        (None, {}, "source is of the type NoneType; it must be a path, a Recording or Measurements"),
+        (np.ones((5, 7)), {}, "source is of the type ndarray"),
+        (lp.Measurements.from_imu([], np.empty((0, 3)), np.empty((0, 3))), {}, "source holds no sample"),
+        ("swing", {"j2s_m": (9, 4, 165)}, "longer than 10 m; it must be in metres"),
+        ("swing", {"j2s_m": (0, 0, "a")}, "it must be three finite numbers"),
+    ],
+)
+def test_wrong_arguments_of_estimate_are_named(swing: Path, source: Any, more: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(errors.InvalidValue, match=sentence):
+        lp.estimate(swing if isinstance(source, str) else source, "tilt", **more)
 
 
 def test_errors_carry_their_facts(swing: Path, tmp_path: Path) -> None:

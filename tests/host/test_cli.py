@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -351,3 +352,26 @@ def test_a_person_reads_one_device_a_line_with_units(linkpose):
 def test_a_slower_bus_is_put_in_force(linkpose, tmp_path):
     assert linkpose("record", tmp_path / "r.csv", "--port", SIM, "--duration", 0.2, "--i2c", 100).status == 0
     assert len(read_table(tmp_path / "r.csv", "recording")) == 20
+
+
+def test_ctrl_c_while_modules_are_imported_ends_without_a_traceback():
+    """A finder of modules sends the signal when the first one of the command line is imported."""
+    code = """
+import os, signal, sys
+from linkpose.__main__ import main
+
+class Presses:
+    def find_spec(self, name, *_):
+        if name.startswith("linkpose.cli"):
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Presses())
+main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_a_wrong_address_of_a_live_output_names_the_option(linkpose):
+    done = linkpose("estimate", "--live", "--port", "sim://link", "--duration", 1, "--to", "127.0.0.1:9870")
+    assert done.status == 2 and "--to is '127.0.0.1:9870'; it must be udp://HOST:PORT" in done.err

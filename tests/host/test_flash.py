@@ -183,6 +183,9 @@ def test_a_port_that_cannot_be_opened_is_said_before_anything_is_built(
 ) -> None:
     assert "there is no port /dev/ttyNONE" in refused("flash", "--port", "/dev/ttyNONE")
     assert "sim://link is not a board that can be flashed" in refused("flash", "--port", "sim://link")
+    with monkeypatch.context() as patch:
+        patch.setenv("LINKPOSE_PORT", "sim://mice")
+        assert "sim://mice is not a board that can be flashed" in refused("flash", "--prebuilt")
     with serial.Serial(port, exclusive=True):
         assert "is in use by another program. Close it" in refused("flash", "--port", port)
     monkeypatch.setattr(ports, "holder", lambda name: "screen (process 123)")

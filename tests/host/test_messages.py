@@ -217,6 +217,7 @@ PRODUCERS: list[Producer] = [
     table("0,1\n2,3\n"),
     table("time_s;a;a\n0;1;2\n"),
     parquet(["a", "a"]),
+    recording(b"PK\x03\x04\n1\n"),
     table("[joint]\nj2s_m = [1, 2, 3]\n"),
     table("time_s;a\n0;1\n1;2;3\n"),
     table("time_s,a\n0,5,1,5\n"),

@@ -79,7 +79,7 @@ def fast_remarks(change: Callable[[dict[str, np.ndarray]], object]) -> str:
     change(table)
     time_s, *values = table.values()
     accel, gyro = np.split(np.stack(values, axis=1), 2, axis=1)
-    return "\n".join(suspicions(Path("r.csv"), Measurements.from_imu(time_s, accel, gyro)))
+    return "\n".join(suspicions(Measurements.from_imu(time_s, accel, gyro)))
 
 
 def exchange(one: str, other: str) -> Callable[[dict[str, np.ndarray]], None]:

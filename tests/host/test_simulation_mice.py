@@ -127,7 +127,7 @@ def test_the_gyro_sees_the_turn():
         ({"mice": ring(5)}, "5 mice cannot be"),
         ({"path": "zigzag"}, "no path called 'zigzag'"),
         ({"path": "line", "duration_s": 3.0}, "a duration of 3.0 s"),
-        ({"path": "turn", "duration_s": None}, "a duration of None s"),
+        ({"path": "turn", "duration_s": None}, "the path .turn. needs a duration"),
         ({"errors": "some"}, "no errors called 'some'"),
         ({"faults": (Fault("lift", 4, 1.0, 2.0),)}, "no mouse 4"),
     ],

@@ -7,6 +7,7 @@ import decimal
 import io
 import itertools
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -341,3 +342,18 @@ def test_a_file_of_settings_is_no_table(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(FileFormatError, match="holds settings, no table"):
         read_table(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("beginning", "what"),
+    [
+        (b"\x89PNG\r\n\x1a\n", "a picture"),
+        (b"\x02P\x13\0\x04\0\0\0\n1\n", "a C3D file, which only `evaluate` and `plot` read"),
+        (b"PK\x03\x04\n", "a workbook of a spreadsheet or an archive; save its table as CSV"),
+        (b'{"kind": "estimate",\n', "JSON"),
+    ],
+)
+def test_a_file_of_another_format_is_named(tmp_path: Path, beginning: bytes, what: str) -> None:
+    (tmp_path / "a.csv").write_bytes(beginning + bytes(range(256)))
+    with pytest.raises(FileFormatError, match=re.escape(f"a.csv is no table but {what}")):
+        read_table(tmp_path / "a.csv")

@@ -128,7 +128,11 @@ def _report_field(estimator: Estimator, console: Console) -> None:
         )
         return
     console.report(
-        f"The magnetometer held the heading for {found.used_s:.0f} s; for {found.rejected_s:.0f} s the field was "
-        f"disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+        f"The magnetometer held the heading for {found.used_s:.0f} s."
+        + (
+            f" For {found.rejected_s:.0f} s the field was disturbed, by {found.largest_disturbance_uT:.1f} µT at most."
+            if found.rejected_s >= 0.5  # which rounds to 1 s
+            else ""
+        )
         + ("" if found.north_deg is None else f" Magnetic north is at yaw {found.north_deg:.0f}°.")
     )

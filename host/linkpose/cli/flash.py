@@ -70,9 +70,9 @@ def _usable_port(named: str | None) -> str:
     """The board's port. An obstacle to opening it is reported before anything is built."""
     from linkpose.device.ports import choose_port, open_port
 
-    if named is not None and "://" in named:
-        raise LinkposeError(f"{named} is not a board that can be flashed. Pass a device such as /dev/ttyACM0 or COM3")
     port = named or choose_port(simulated_will_do=False)
+    if "://" in port:
+        raise LinkposeError(f"{port} is not a board that can be flashed. Pass a device such as /dev/ttyACM0 or COM3")
     open_port(port).close()
     return port
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from linkpose.sensors.rig import UNKNOWN_JOINT, Joint, Rig, as_rig
+from linkpose.sensors.rig import LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
     from linkpose.recording.reader import Recording
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-LONGEST_LINK_M = 10.0
 ERROR_LEVELS = ("calibrated", "datasheet", "none")
 
 

@@ -4,12 +4,28 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+import click
+
+from linkpose.errors import InvalidValue
 
 if TYPE_CHECKING:
     from linkpose.cli.estimate import Request
     from linkpose.estimation import EstimateWriter, Estimator
     from linkpose.sensors.measurements import Floats
+    from linkpose.streams import Output
+
+
+def _output(target: str, columns: Sequence[str]) -> Output:
+    """The output of a --to. Raises UsageError where the address is wrong."""
+    from linkpose.streams import open_output
+
+    try:
+        return open_output(target, columns)
+    except InvalidValue as error:
+        raise click.UsageError(f"--{error}") from None
 
 
 class Sink:
@@ -18,10 +34,9 @@ class Sink:
     def __init__(self, estimator: Estimator, request: Request, head: dict[str, Any]) -> None:
         from linkpose.estimation import EstimateWriter
         from linkpose.recording.csvfile import head as csv_head
-        from linkpose.streams import open_output
 
         self._estimator = estimator
-        self._outputs = [open_output(target, estimator.columns) for target in request.targets]
+        self._outputs = [_output(target, estimator.columns) for target in request.targets]
         self._json = request.json_lines
         self._file: EstimateWriter | None = None
         if request.output is not None:

@@ -123,7 +123,8 @@ def _filters(estimate: Table) -> dict[str, dict[Quantity, str]]:
         raise LinkposeError(
             f"{estimate.path} holds no estimates: type `linkpose estimate {estimate.path} -o ESTIMATE.csv` first"
             if estimate.kind == "recording"
-            else f"{estimate.path} holds no estimates: no column is named like joint_height_m or mice_vx_m_s"
+            else f"{estimate.path} holds no estimates: no column is named like joint_height_m or mice_vx_m_s; the "
+            "estimate comes first, then the reference"
         )
     return found
 

@@ -389,7 +389,7 @@ def check(
         )
     if settings.estimate and not kinds & set(NAMED):
         raise NothingToEstimate(origin)
-    if name == "mcl" and "scan" not in kinds:
+    if name in ("mcl", "scan-match") and "scan" not in kinds:
         raise NeedsScans(origin, name)
     if not _has_start(log, name, settings, beacons, kinds):
         raise MissingStart

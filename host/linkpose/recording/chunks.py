@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -12,6 +13,17 @@ from linkpose.recording.delimited import codec_of
 
 # Twice of it doubles the memory of a run (about ten times as much) and saves no time.
 CHUNK_BYTES = 8_000_000
+
+# How files of other formats begin.
+_FORMATS = (
+    (rb"\x89PNG|\xff\xd8\xff|GIF8|BM.{4}\0\0\0\0", "a picture"),
+    (rb"%PDF", "a PDF document"),
+    (rb"PK\x03\x04|\xd0\xcf\x11\xe0", "a workbook of a spreadsheet or an archive; save its table as CSV"),
+    (rb"\x1f\x8b|BZh|\xfd7zXZ|\x28\xb5\x2f\xfd", "a compressed file; unpack it"),
+    (rb"MATLAB 5|\x89HDF", "a file of MATLAB or HDF5; save its table as CSV"),
+    (rb"[\x02-\x0f]P[\0-\xff]{4}", "a C3D file, which only `evaluate` and `plot` read, as a reference"),
+    (rb"\s*\{\s*\"", "JSON"),
+)
 
 
 class Chunk(NamedTuple):
@@ -26,10 +38,11 @@ class Chunk(NamedTuple):
 def read_chunks(path: Path, file: BinaryIO) -> Iterator[Chunk]:
     """The file from its start. The last piece may be empty, or end without a line end.
 
-    Raises FileFormatError for a line that is longer than a piece.
+    Raises FileFormatError for a line that is longer than a piece, and for a file of another format.
     """
     file.seek(0)
     raw = file.read(CHUNK_BYTES).removeprefix(b"\xef\xbb\xbf")
+    _refuse_other_formats(path, raw)
     to_utf8 = _converter(raw)
     rest, line = b"", 1
     while True:
@@ -46,6 +59,13 @@ def read_chunks(path: Path, file: BinaryIO) -> Iterator[Chunk]:
             yield Chunk(data[:end], line, False, file.tell() - len(following) - len(rest))
             line += data.count(b"\n") or data.count(b"\r")
         raw = following
+
+
+def _refuse_other_formats(path: Path, data: bytes) -> None:
+    """Raises FileFormatError for a file that begins with these bytes as a picture, a workbook or the like does."""
+    for beginning, what in _FORMATS:
+        if re.match(beginning, data):
+            raise FileFormatError(path, f"{path} is no table but {what}")
 
 
 def _converter(start: bytes) -> Callable[[bytes, bool], bytes]:

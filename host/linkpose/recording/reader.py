@@ -24,7 +24,7 @@ from linkpose.recording.ahead import ahead
 from linkpose.recording.survey import Survey
 from linkpose.recording.table import TableFile, require
 from linkpose.recording.textfile import Part
-from linkpose.recording.units import is_negated, suspicions
+from linkpose.recording.units import UNIT_ROWS, is_negated, suspicions
 from linkpose.sensors import mpu6050
 from linkpose.sensors.conversion import (
     COUNT_FIELDS,
@@ -49,7 +49,6 @@ MOST_CHANGES = 10  # of sensors' states, in the remarks
 # Rows that stay in memory: 83 min at 100 Hz, 70 MB without a second sensor. Twice of it doubles that memory, and files
 # of that length are read once instead of twice.
 KEPT_ROWS = 500_000
-UNIT_ROWS = 100_000  # by which units are judged: a unit is wrong in all rows or in none
 Progress = Callable[[float], None]
 _T_WRAP = 1 << 32
 _SEQ_WRAP = 1 << 16
@@ -219,7 +218,8 @@ class RecordingFile:
                 self._changes.append(change)
 
     def _judge_units(self, first: list[Measurements]) -> None:
-        self._remarks_on_values = suspicions(self.path, _joined(first), self._source.stated_rate_hz)
+        found = suspicions(_joined(first), self._source.stated_rate_hz)
+        self._remarks_on_values = [f"{self.path}: {suspicion}" for suspicion in found]
 
     def _faults(self) -> list[str]:
         """The changes of sensors' states, as remarks."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from linkpose.recording.consistency import contradiction
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
+UNIT_ROWS = 100_000  # by which units are judged: a unit is wrong in all rows or in none
 _AIR_PA = 1e5
 _ACCEL_UNITS = (
     ("g", f"{STANDARD_GRAVITY}"),
@@ -34,11 +34,12 @@ _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _LONGEST_STEP_S = 0.5
 
 
-def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = None) -> list[str]:
+def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list[str]:
     """One sentence, with its cure, for each quantity whose values are implausible in the unit of its column.
 
-    `rate_hz` is the sample rate in the file's metadata, if it has one.
+    The first UNIT_ROWS samples are judged. `rate_hz` is the sample rate in the file's metadata, if it has one.
     """
+    measurements = measurements[:UNIT_ROWS]
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
     unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     time = _time(_median(np.diff(measurements.time_s)), rate_hz)
@@ -50,7 +51,7 @@ def suspicions(path: Path, measurements: Measurements, rate_hz: float | None = N
         _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
         _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
     ]
-    return [f"{path}: {suspicion}" for suspicion in found if suspicion]
+    return [suspicion for suspicion in found if suspicion]
 
 
 def is_negated(measurements: Measurements, j2s_m: Sequence[float]) -> bool:

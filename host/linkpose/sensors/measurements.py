@@ -95,8 +95,8 @@ class Measurements:
                 reading.
 
         Raises:
-            InvalidValue: an array has another shape, only one of accel2_m_s2 and gyro2_rad_s is given, or a time is
-                missing, infinite or earlier than the one before it.
+            InvalidValue: an array has another shape or holds no real numbers, only one of accel2_m_s2 and gyro2_rad_s
+                is given, or a time is missing, infinite or earlier than the one before it.
         """
         time = _checked_times(time_s)
         accel = _checked_vectors("accel_m_s2", accel_m_s2, len(time))
@@ -143,8 +143,26 @@ def _others(size: int, accel2: ArrayLike | None, gyro2: ArrayLike | None, mag: A
     return fields
 
 
+def _numbers(name: str, values: ArrayLike) -> Floats:
+    """The values as float64; a masked one is missing. Raises InvalidValue for dates, complex numbers and text."""
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.where(np.ma.getmaskarray(values), np.nan, values.data)
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind in "mM":
+            raise InvalidValue(
+                name,
+                f"has the type {array.dtype}; it must be numbers, in seconds: (t - t[0]) / numpy.timedelta64(1, 's')",
+            )
+        if array.dtype.kind == "c":
+            raise InvalidValue(name, "is complex; it must be real numbers")
+        return np.ascontiguousarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidValue(name, f"is no array of numbers: {error}") from None
+
+
 def _checked_times(time_s: ArrayLike) -> Floats:
-    time = np.ascontiguousarray(time_s, dtype=np.float64)
+    time = _numbers("time_s", time_s)
     if time.ndim != 1:
         raise InvalidValue("time_s", f"has the shape {time.shape}; it must be (N,)")
     if not np.isfinite(time).all() or (np.diff(time) < 0).any():
@@ -154,7 +172,7 @@ def _checked_times(time_s: ArrayLike) -> Floats:
 
 
 def _checked_vectors(name: str, values: ArrayLike, rows: int) -> Floats:
-    vectors = np.ascontiguousarray(values, dtype=np.float64)
+    vectors = _numbers(name, values)
     if vectors.shape != (rows, 3):
         raise InvalidValue(name, f"has the shape {vectors.shape}; it must be ({rows}, 3), one row per time")
     return vectors

@@ -33,6 +33,7 @@ _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
 # A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
 _GUESS_M = 0.1
+LONGEST_LINK_M = 10.0  # of a J2S that a user gives: a longer one is in centimetres or millimetres
 
 
 @dataclass(frozen=True, slots=True)
