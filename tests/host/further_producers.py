@@ -608,6 +608,11 @@ FURTHER: dict[str, dict[str, Producer]] = {
             lambda: MiceRun(faults=(Fault("lift", 9, 1.0, 2.0),))
         ),
         "six rests do not fit … s: simulate … s or more": raises(lambda: SixSides(3.0)),
+        "source is of the type …; it must be a path, a Recording or Measurements: Measurements.from_imu(time_s, accel_m_s2, gyro_rad_s) makes them from arrays": raises(lambda: lp.estimate(3, ["tilt"])),
+        "j2s_m is …, longer than … m; it must be in metres": raises(lambda: lp.estimate(LinkRun(duration_s=1.0).measurements(), ["tilt"], j2s_m=(900.0, 0.0, 0.0))),
+        "… has the type …; it must be numbers, in seconds: (t - t[0]) / numpy.timedelta64(1, 's')": measured(np.arange(3).astype("datetime64[s]"), np.zeros((3, 3))),
+        "… is complex; it must be real numbers": measured(np.arange(3), np.zeros((3, 3), complex)),
+        "… is no array of numbers: …": measured(np.arange(3), "text"),
         "accel2_m_s2 and gyro2_rad_s belong together: give both or neither": measured(
             np.arange(3), np.zeros((3, 3)), accel2_m_s2=np.zeros((3, 3))
         ),
