@@ -529,9 +529,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "…: samples were lost before … s, and their counts with them; drive it anew": mice("lost samples"),
         "… holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring": mice("no gyro"),
         "… begins in motion; stand still for a second, then drive": mice("no rest"),
-        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then drive it anew": mice("a dead mouse"),
-        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and drive both anew on a floor on which no mouse slips": mice("a slippery floor"),
-        "the … mice contradict one another (… standard deviations…): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died": mice_of(
+        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then drive it anew": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and drive both anew on a floor on which no mouse slips": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "the … mice contradict one another (… standard deviations, mouse … most of all): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died": mice_of(
             _contradicting_mice
         ),
     },
@@ -618,6 +618,11 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "time_s has the shape …; it must be (N,)": measured(np.zeros((3, 3)), np.zeros((3, 3))),
         "time_s is … at index …; times must be finite and must not decrease": measured([0, 2, 1], np.zeros((3, 3))),
+        "… has the type …; it must be numbers, in seconds: (t - t[0]) / numpy.timedelta64(1, 's')": "test_api.py::test_measurements_of_ones_own_sensor_are_checked",
+        "… is complex; it must be real numbers": "test_api.py::test_measurements_of_ones_own_sensor_are_checked",
+        "… is no array of numbers: …": "test_api.py::test_measurements_of_ones_own_sensor_are_checked",
+        "source is of the type …; it must be a path, a Recording or Measurements: Measurements.from_imu(time_s, accel_m_s2, gyro_rad_s) makes them from arrays": "test_api.py::test_wrong_arguments_of_estimate_are_named",
+        "j2s_m is …, longer than … m; it must be in metres": "test_api.py::test_wrong_arguments_of_estimate_are_named",
         "… has the shape …; it must be (…, 3), one row per time": measured(np.arange(3), np.zeros((3, 2))),
     },
     "Wrong usage": {
