@@ -586,7 +586,6 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… holds no estimates; type: linkpose estimate … -o OUT.csv": typed("plot --view {}/a.csv", a="time_s,b\n0,1\n1,1\n"),
     },
     "Simulation and Python values": {
-        "there is no motion called …: take …": raises(lambda: LinkRun(motion="dance")),
         "there is no joint …: take …": raises(lambda: ChainRun("knee")),  # type: ignore[arg-type]
         "there is no first joint …: take …": raises(lambda: ChainRun("ball", first_joint="loose")),
         "… s at … Hz are … samples, and … is the limit: simulate at most … s, or at a lower rate": raises(
@@ -608,11 +607,6 @@ FURTHER: dict[str, dict[str, Producer]] = {
             lambda: MiceRun(faults=(Fault("lift", 9, 1.0, 2.0),))
         ),
         "six rests do not fit … s: simulate … s or more": raises(lambda: SixSides(3.0)),
-        "source is of the type …; it must be a path, a Recording or Measurements: Measurements.from_imu(time_s, accel_m_s2, gyro_rad_s) makes them from arrays": raises(lambda: lp.estimate(3, ["tilt"])),
-        "j2s_m is …, longer than … m; it must be in metres": raises(lambda: lp.estimate(LinkRun(duration_s=1.0).measurements(), ["tilt"], j2s_m=(900.0, 0.0, 0.0))),
-        "… has the type …; it must be numbers, in seconds: (t - t[0]) / numpy.timedelta64(1, 's')": measured(np.arange(3).astype("datetime64[s]"), np.zeros((3, 3))),
-        "… is complex; it must be real numbers": measured(np.arange(3), np.zeros((3, 3), complex)),
-        "… is no array of numbers: …": measured(np.arange(3), "text"),
         "accel2_m_s2 and gyro2_rad_s belong together: give both or neither": measured(
             np.arange(3), np.zeros((3, 3)), accel2_m_s2=np.zeros((3, 3))
         ),
@@ -628,7 +622,6 @@ FURTHER: dict[str, dict[str, Producer]] = {
     "Wrong usage": {
         "There is no command …. Did you mean …?": typed("estimat"),
         "There is no command …. The commands are …": typed("quux"),
-        "--rests lays the sensor on its sides, --still keeps it at rest: leave out one of them": typed("simulate link --rests --still -o a.csv --truth t.csv"),
         "choose one of --prebuilt and --hex": typed("flash --prebuilt --hex a.hex"),
         "--view-host and --view-port go with --view": typed("estimate --live --view-port 8080"),
         "--view shows a page; leave out --output": typed("plot --view {}/a.csv -o {}/a.png"),
