@@ -57,6 +57,7 @@ _SOURCES = (
     "compiling.py",
     "errors.py",
     "inputs.py",
+    "outputs.py",
     "presentation.py",
     "quantities.py",
     "rotations.py",

@@ -586,6 +586,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… holds no estimates; type: linkpose estimate … -o OUT.csv": typed("plot --view {}/a.csv", a="time_s,b\n0,1\n1,1\n"),
     },
     "Simulation and Python values": {
+        "there is no motion called …: take …": raises(lambda: LinkRun(motion="dance")),
         "there is no joint …: take …": raises(lambda: ChainRun("knee")),  # type: ignore[arg-type]
         "there is no first joint …: take …": raises(lambda: ChainRun("ball", first_joint="loose")),
         "… s at … Hz are … samples, and … is the limit: simulate at most … s, or at a lower rate": raises(
@@ -622,6 +623,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
     "Wrong usage": {
         "There is no command …. Did you mean …?": typed("estimat"),
         "There is no command …. The commands are …": typed("quux"),
+        "--rests lays the sensor on its sides, --still keeps it at rest: leave out one of them": typed(
+            "simulate link --rests --still -o a.csv --truth t.csv"
+        ),
         "choose one of --prebuilt and --hex": typed("flash --prebuilt --hex a.hex"),
         "--view-host and --view-port go with --view": typed("estimate --live --view-port 8080"),
         "--view shows a page; leave out --output": typed("plot --view {}/a.csv -o {}/a.png"),

@@ -311,6 +311,7 @@ def pattern(message: str) -> str:
 def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     more = {message: produce for section in (*MORE.values(), *FURTHER.values()) for message, produce in section.items()}
     shown = messages()
+    assert len(set(shown)) == len(shown), "a message has two rows"
     first = len(shown) - len(more)
     assert shown[first:] == list(more)
     assert first == len(PRODUCERS)

@@ -378,7 +378,8 @@ def test_an_evaluation_draws_what_matters_first(tmp_path):
     assert {"tilt", "chain"} <= set(cells)
 
 
-@pytest.mark.parametrize("name", ["a$\\frac$", "escape\x1b[31m", "no UTF-8 \udcff", "$(x)`"])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", ["a$\\frac$", "escape\x1b[31m", "no UTF-8 \udcff", "$(x)`", "추정"])
 def test_any_name_of_a_file_or_a_column_is_drawn_as_it_is(tmp_path, name):
     path = tmp_path / f"{name}.csv"
     path.write_text("time_s,$\\frac$_height_m\n0,1\n1,2\n2,3\n")

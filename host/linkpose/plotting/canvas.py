@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import io
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,6 +34,11 @@ REFERENCES = ("truth", "reference")  # labels of what is drawn as TRUTH
 BAND_ALPHA = 0.18
 _BEST = ("joint-inertial", "planar-ekf", "chain")  # drawn thick
 _BESIDES = ("-", ":", "-.")  # the second and third file
+# Fonts of Linux, Windows and macOS with Korean, Japanese and Chinese characters, which matplotlib's own lacks.
+_FURTHER_FONTS = (
+    "Noto Sans CJK KR", "NanumGothic", "Malgun Gothic", "Apple SD Gothic Neo", "AppleGothic",
+    "Noto Sans CJK JP", "Yu Gothic", "Hiragino Sans", "Noto Sans CJK SC", "Microsoft YaHei", "PingFang SC",
+)  # fmt: skip
 
 
 def new_figure(width_inches: float, height_inches: float) -> Figure:
@@ -160,6 +166,21 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     # Two pictures of the same data are the same file.
     metadata = {"pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, "svg": {"Date": None}}
     # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
-    figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
+    _add_fonts(figure)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # without a font, a file's name has boxes
+        figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
     with new_file(path, force) as file:
         file.write(picture.getvalue())
+
+
+def _add_fonts(figure: Figure) -> None:
+    """Lets texts, such as names of files, take characters from other fonts that are installed."""
+    from matplotlib.font_manager import fontManager
+    from matplotlib.text import Text
+
+    texts = [text for text in figure.findobj(Text) if isinstance(text, Text) and not text.get_text().isascii()]
+    installed = fontManager.get_font_names() if texts else []
+    further = [name for name in _FURTHER_FONTS if name in installed]
+    for text in texts:
+        text.set_fontfamily([*text.get_fontfamily(), *further])
