@@ -19,21 +19,17 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import viser
 import zstandard
 from browser import Browser
-from viser._messages import ViewerCameraMessage
-from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidStatus
-from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
-from websockets.uri import parse_uri
 
 from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
 from linkpose.page import Page, PageStatus, geometry
+from linkpose.page.changes import Changes
 from linkpose.page.history import PATH_POINTS, SPAN_S, History
 from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
@@ -319,37 +315,22 @@ def test_without_a_browser_nothing_waits_and_old_blocks_are_dropped() -> None:
         assert page.url.startswith("http://127.0.0.1:")
 
 
-def connect_unread(page: Page, raw: socket.socket) -> None:
-    """Opens a connection as a browser does: the handshake, and the camera with which viser counts it as a client."""
-    protocol = ClientProtocol(
-        parse_uri(page.url.replace("http", "ws")), subprotocols=[Subprotocol(f"viser-v{viser.__version__}")]
-    )
-    protocol.send_request(protocol.connect())
-    raw.sendall(b"".join(protocol.data_to_send()))
-    while protocol.state is not State.OPEN:
-        protocol.receive_data(raw.recv(4096))
-    turn, up = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
-    camera = ViewerCameraMessage(turn, up, 1.0, 0.1, 9.0, 10, 10, up, up)
-    protocol.send_binary(msgspec.msgpack.encode(camera.as_serializable_dict()))
-    raw.sendall(b"".join(protocol.data_to_send()))
-
-
 def test_a_browser_that_reads_nothing_gets_no_more_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What waits for it stays small; the kernel's buffers take the first megabytes."""
-    monkeypatch.setattr("linkpose.page.page.UPDATE_INTERVAL_S", 0.001)
-    monkeypatch.setattr("linkpose.page.page.CHART_INTERVAL", 1)
-    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
-        with socket.create_connection(("127.0.0.1", int(page.url.rpartition(":")[2]))) as raw:
-            connect_unread(page, raw)
-            waiting: list[int] = []  # bytes, from the first that wait on
-            while len(waiting) < 50:
-                page.show(link_rows(), status())
-                page.stopped.wait(0.002)
-                connections = page._server._websock_server._live_connections.values()
-                size = max((c.transport.get_write_buffer_size() for c in connections), default=0)
-                waiting += [size] if size or waiting else []
-            assert 100_000 < max(waiting) < 300_000
-        page.raise_if_stopped()
+    sent: list[list[Any]] = []
+    monkeypatch.setattr("websockets.asyncio.server.broadcast", lambda connections, _: sent.append(connections))
+    waiting = {1: 0, 2: 1_000_000}  # bytes that each browser has not read
+
+    def connection(client: int) -> Any:
+        return SimpleNamespace(transport=SimpleNamespace(get_write_buffer_size=lambda: waiting[client]))
+
+    connections = {client: connection(client) for client in waiting}
+    server: Any = SimpleNamespace(_websock_server=SimpleNamespace(_live_connections=connections))
+    changes, element = Changes(server), SimpleNamespace(_impl=SimpleNamespace(uuid="text"))
+    for left in (1_000_000, 0):
+        waiting[2] = left
+        changes.write(element, "1.5 m")
+        changes.broadcast({1, 2})
+    assert sent == [[connections[1]], list(connections.values())]
 
 
 def test_no_file_of_the_machine_is_served_and_the_page_has_its_title() -> None:
