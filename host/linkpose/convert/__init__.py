@@ -38,10 +38,10 @@ _OF_TABLE: dict[str, Callable[[BinaryIO, Path, Source], None]] = {
 }
 ENDINGS = (*_OF_MOTION, *_OF_TABLE)
 
-
 # Passes over the source: the first finds what a head states, the last of .mcap writes the poses.
 _PASSES = dict.fromkeys(ENDINGS, 2) | {".mcap": 3}
 _WITH_TIMES = (".mot", ".mcap")
+_WITH_POSES = (*_OF_MOTION, ".mcap")
 
 
 def convert(
@@ -65,7 +65,7 @@ def convert(
     with contextlib.closing(TableFile(source)) as file:
         if ending in _WITH_TIMES:
             file.require("time_s")
-        table = Source(file, wanted, _PASSES[ending], progress)
+        table = Source(file, wanted, ending in _WITH_POSES, _PASSES[ending], progress)
         if ending not in _OF_MOTION:
             with new_file(output, force) as written:
                 _OF_TABLE[ending](written, output, table)

@@ -30,18 +30,18 @@ class Motion:
                 f"{source.path}: {kind} has no orientation (roll_deg and pitch_deg, heading_rad, or qw to qz); "
                 "a recording must be estimated before it has one"
             )
-        times = {prefix: source.times_of(prefix) for prefix in source.oriented}
-        prefix = next((prefix for prefix, known in times.items() if len(known) >= 2), None)
-        if prefix is None:
-            name = source.oriented[0].replace("_", "-") or str(source.path)
-            raise LinkposeError(f"{source.path} has no two poses of {name if len(times) == 1 else 'any filter'}")
+        candidates = ((prefix, source.times_of(prefix)) for prefix in source.oriented)
+        prefix, known = next((found for found in candidates if len(found[1]) >= 2), (source.oriented[0], np.empty(0)))
+        name, is_only = prefix.replace("_", "-") or str(source.path), len(source.oriented) == 1
+        if not len(known):
+            raise LinkposeError(f"{source.path} has no two poses of {name if is_only else 'any filter'}")
         self._source, self._prefix, self.label = source, prefix, label
-        known, name = times[prefix], prefix.replace("_", "-") or str(source.path)
-        self._first_s, self._last_s, self._count = float(known[0]), float(known[-1]), len(known)
+        self.start_s = float(known[0])  # of the first pose, and of the first frame
+        self._last_s, self._count = float(known[-1]), len(known)
         steps = np.diff(known)
         steps = steps[steps > 0]
         self.rate_hz = float(np.round(1 / np.median(steps), 3)) if len(steps) else 1.0  # the usual one
-        self.remarks = [f"{source.path}: the motion is the one of the filter {name}"] if len(times) > 1 else []
+        self.remarks = [f"{source.path}: the motion is the one of the filter {name}"] if not is_only else []
         self.remarks += [f"{name} does not estimate {missing}" for missing in not_estimated(source.names, prefix)]
         if self._count < source.rows:
             self.remarks.append(f"{source.path}: {source.rows - self._count} rows without an estimate left out")
@@ -59,14 +59,9 @@ class Motion:
         """The names of the three markers."""
         return [f"{self.label}_{end}" for end in ("O", "X", "Y")]
 
-    @property
-    def start_s(self) -> float:
-        """The time of the first pose, and of the first frame."""
-        return self._first_s
-
     def frames(self) -> int:
         """Frames at the motion's rate. Raises LinkposeError where nearly all of them would be empty."""
-        count = round((self._last_s - self._first_s) * self.rate_hz) + 1
+        count = round((self._last_s - self.start_s) * self.rate_hz) + 1
         if count > _MOST_EMPTY * self._count:
             raise LinkposeError(
                 f"{self.label}: {count} frames at {self.rate_hz:g} Hz would hold {self._count} poses only: "
@@ -81,9 +76,9 @@ class Motion:
         for part in self.parts():
             left -= len(part)
             poses = part if before is None else before.then(part)
-            reached = math.floor((float(poses.time_s[-1]) - self._first_s) * self.rate_hz) + 1
+            reached = math.floor((float(poses.time_s[-1]) - self.start_s) * self.rate_hz) + 1
             end = min(reached, count) if left else count
-            yield self._interpolated(poses, self._first_s + np.arange(done, end) / self.rate_hz)
+            yield self._interpolated(poses, self.start_s + np.arange(done, end) / self.rate_hz)
             before, done = poses[-1:], max(done, end)
 
     def _interpolated(self, poses: Poses, time_s: Floats) -> Floats:

@@ -18,24 +18,24 @@ from linkpose.sensors.measurements import Floats
 class Source:
     """A table after a first pass over its rows; `blocks` reads them once more.
 
-    `wanted` keeps the columns of one filter, and raises UnknownFilter if it has none. `progress` is called with the
-    share that is done of `passes` passes. Raises as TableFile does.
+    `wanted` keeps the columns of one filter, and raises UnknownFilter if it has none. `has_poses` is whether the first
+    pass also finds the poses that are estimated, as a Motion needs it. `progress` is called with the share that is done
+    of `passes` passes. Raises as TableFile does.
     """
 
-    def __init__(self, file: TableFile, wanted: str | None, passes: int, progress: Progress) -> None:
+    def __init__(self, file: TableFile, wanted: str | None, has_poses: bool, passes: int, progress: Progress) -> None:
         self._file, self._passes, self._progress = file, passes, progress
         self._passes_done = 0
         self.path, self.kind, self.metadata, self.remarks = file.path, file.kind, file.metadata, list(file.remarks)
         self.names = file.names if wanted is None else _columns_of(file.names, wanted)
-        prefixes = dict.fromkeys(part.prefix for name in self.names if (part := split(name)))
-        # Prefixes of the filters with an orientation, in the order of their columns.
-        self.oriented = [prefix for prefix in prefixes if has_orientation(self.names, prefix)]
+        # Prefixes of the filters whose poses are found, in the order of their columns.
+        self.oriented = _oriented(self.names) if has_poses else []
         self.rows = 0
         times: list[Floats] = []
         known: dict[str, list[NDArray[np.bool_]]] = {prefix: [] for prefix in self.oriented}
         for block in self.blocks():
             self.rows += len(block[self.names[0]])
-            if "time_s" in block:
+            if has_poses and "time_s" in block:
                 times.append(block["time_s"].copy())  # a view would hold all columns of the block
                 for prefix, rows in known.items():
                     rows.append(poses_of(block, prefix).is_known)
@@ -60,6 +60,12 @@ class Source:
         for part in ahead(self._file.parts(note)):
             yield {name: part.columns[name] for name in self.names}
         self._passes_done += 1
+
+
+def _oriented(names: list[str]) -> list[str]:
+    """Prefixes of the filters with an orientation."""
+    prefixes = dict.fromkeys(part.prefix for name in names if (part := split(name)))
+    return [prefix for prefix in prefixes if has_orientation(names, prefix)]
 
 
 def _columns_of(names: list[str], wanted: str) -> list[str]:
