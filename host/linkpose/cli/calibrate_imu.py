@@ -42,8 +42,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
             f"Offset and scale of the accelerometer are unchanged: {counted(found.attitudes, 'attitude')} recorded, "
             f"{FEWEST_ATTITUDES} needed."
         )
-    record = options.record_command("swing.csv", loaded[0], "swing")
-    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "joint", record[1], "--rig", rig_file))
+    options.show_next_recording(rig_file, quiet, loaded[0], "joint")
 
 
 def _show(found: FoundImuErrors) -> None:

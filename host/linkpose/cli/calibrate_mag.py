@@ -57,8 +57,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             "the sensor faster, about all axes."
         )
     with_calibration(rig, found).save(rig_file)
-    record = options.record_command("swing.csv", loaded[0], "swing")
-    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "joint", record[1], "--rig", rig_file))
+    options.show_next_recording(rig_file, quiet, loaded[0], "joint")
 
 
 def _show(found: MagCalibration) -> None:

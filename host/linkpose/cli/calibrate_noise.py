@@ -47,8 +47,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, force: bool, json_line
             "--force to write the figures all the same"
         )
     with_calibration(rig, found).save(rig_file)
-    record = options.record_command("rests.csv", loaded[0], "sides")
-    options.show_rig_written(rig_file, quiet, *record, then=("calibrate", "imu", record[1], "--rig", rig_file))
+    options.show_next_recording(rig_file, quiet, loaded[0], "imu")
 
 
 def _show(found: NoiseCalibration) -> None:

@@ -10,7 +10,7 @@ import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
@@ -293,24 +293,6 @@ def plot_command(estimates: Path) -> tuple[object, ...]:
     return "plot", estimates, *(("-o", new_file(str(picture))) if picture.exists() else ())
 
 
-def record_command(name: str, before: Recording, motion: str) -> tuple[object, ...]:
-    """The command that records a new file of this name, to propose after the recording `before`.
-
-    A simulated board is simulated again, with another motion ("swing" or "sides").
-    """
-    device = str(before.metadata.get("device"))
-    port = ("--port", _with_motion(device, motion)) if device.startswith("sim://link") else ()
-    return "record", new_file(name), *port
-
-
-def _with_motion(address: str, motion: str) -> str:
-    """The address of a simulated link with this motion."""
-    rig, _, query = address.partition("?")
-    options = [option for option in query.split("&") if option and not option.startswith("motion=")]
-    options += [f"motion={motion}"] * (motion != "swing")
-    return "?".join(filter(None, (rig, "&".join(options))))
-
-
 def new_file(name: str) -> Path:
     """A file to propose: of this name, or estimate-2.csv and so on where estimate.csv exists."""
     from linkpose.outputs import numbered
@@ -374,6 +356,30 @@ def recordings_and_rig(
     for remark in (remark for recording in loaded for remark in recording.remarks):
         report(remark)
     return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+
+
+# The recording that a calibration needs: its file, and the motion of the simulated link.
+_RECORDINGS = {"imu": ("rests.csv", "sides"), "joint": ("swing.csv", "swing")}
+
+
+def show_next_recording(rig_file: Path, quiet: bool, before: Recording, calibration: Literal["imu", "joint"]) -> None:
+    """Where the rig was written, the command that records for the next calibration, and that calibration.
+
+    Where the recording `before` is of a simulated board, this board is simulated again.
+    """
+    name, motion = _RECORDINGS[calibration]
+    recording, device = new_file(name), str(before.metadata.get("device"))
+    port = ("--port", _with_motion(device, motion)) if device.startswith("sim://link") else ()
+    then = ("calibrate", calibration, recording, "--rig", rig_file)
+    show_rig_written(rig_file, quiet, "record", recording, *port, then=then)
+
+
+def _with_motion(address: str, motion: str) -> str:
+    """The address of a simulated link with this motion."""
+    rig, _, query = address.partition("?")
+    options = [option for option in query.split("&") if option and not option.startswith("motion=")]
+    options += [f"motion={motion}"] * (motion != "swing")
+    return "?".join(filter(None, (rig, "&".join(options))))
 
 
 def show_rig_written(rig_file: Path, quiet: bool, *words: object, then: Sequence[object] = ()) -> None:

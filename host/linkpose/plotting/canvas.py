@@ -165,8 +165,8 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     ending = "png" if path == STDOUT else path.suffix[1:].lower()
     # Two pictures of the same data are the same file.
     metadata = {"pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, "svg": {"Date": None}}
-    # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
     _add_fonts(figure)
+    # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from")  # without a font, a file's name has boxes
         figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
