@@ -84,7 +84,8 @@ def _wander(rng: np.random.Generator, std_uT: float, correlation_s: float) -> Fi
 
     def at(time_s: Floats) -> Floats:
         tones = zip(frequency, phase, strict=True)
-        return scale * np.column_stack([np.cos(np.outer(time_s, 2 * np.pi * f) + p).sum(axis=1) for f, p in tones])
+        components = [np.cos(np.outer(time_s, 2 * np.pi * f) + p).sum(axis=1) for f, p in tones]
+        return np.asarray(scale * np.column_stack(components))
 
     return at
 
