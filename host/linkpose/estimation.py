@@ -439,18 +439,30 @@ class Estimates:
 
     `estimates["joint_inertial_height_m"]` and `estimates.joint_inertial.height_m` are the same column, (N,) float64.
     NaN means that the value is not known. Each quantity has its standard deviation beside it (`height_std_m`).
+
+    Attributes:
+        columns: names of the columns: time_s, then <filter>_<quantity>_<unit>.
+        values: (N, len(columns)), all columns.
+        filters: names of the filters that ran, the most accurate one first.
+        rejected: number of samples that each filter could not use.
+        left_out: for each filter that did not run, the error that explains why.
+        excluded_mice: for "mouse1", ..., the number of valid samples that a filter excluded.
+        found_j2s: the estimated J2S (m) and its standard deviation; None if J2S was known.
+        magnetic_field: what was found of the magnetic field; None without `mag`.
+        rig: sensor placement and calibration in force.
+        remarks: faults of the measurements, one sentence each.
     """
 
-    columns: tuple[str, ...]  # time_s, then <filter>_<quantity>_<unit>
-    values: Floats  # (N, len(columns))
-    filters: tuple[str, ...]  # that ran, best first
-    rejected: dict[str, int]  # filter -> samples that it could not use
-    left_out: dict[str, CannotRun]  # filter -> why it did not run
-    excluded_mice: dict[str, int]  # "mouse1", ... -> samples whose valid counts a filter excluded
-    found_j2s: FoundJ2s | None  # J2S where it was to be estimated
-    magnetic_field: FieldRecord | None  # where the magnetometer held the yaw
-    rig: Rig  # that was in force
-    remarks: tuple[str, ...] = ()  # what is wrong with the measurements
+    columns: tuple[str, ...]
+    values: Floats
+    filters: tuple[str, ...]
+    rejected: dict[str, int]
+    left_out: dict[str, CannotRun]
+    excluded_mice: dict[str, int]
+    found_j2s: FoundJ2s | None
+    magnetic_field: FieldRecord | None
+    rig: Rig
+    remarks: tuple[str, ...] = ()
 
     @property
     def time_s(self) -> Floats:

@@ -298,7 +298,7 @@ def command(
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     if map_path is None and beacons_path is None:
-        raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
+        raise click.UsageError("nothing to localize against; add --map MAP.yaml or --beacons BEACONS.csv")
     console = Console(quiet, verbose=False)
     methods = cast("tuple[Method, ...]", filters)
     chosen = LocalizationOptions(**settings)

@@ -41,5 +41,5 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, q
         variants = [variant for case in cases for variant in case.variants]
         labels = [underwater.label(variant) for variant in variants]
         figures = plotting.underwater_figures(underwater.dive(0), BEACONS)
-        figures[VARIANTS] = plotting.variants("Underwater localisation", variants, labels)
+        figures[VARIANTS] = plotting.variants("Underwater localization", variants, labels)
         rendering.save_figures(figures, files, force, quiet)

@@ -57,16 +57,27 @@ _HIGHEST_RATE_HZ = 1e6
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A recording in memory."""
+    """A recording in memory.
+
+    Attributes:
+        path: the file.
+        measurements: all samples in SI units, in the sensors' axes.
+        rig: sensor placement and calibration during the recording; None for a raw capture.
+        sample_rate_hz: the rate in the metadata, or else that of the usual interval.
+        metadata: all settings of the run.
+        remarks: anomalies, one sentence each: a truncated file, corrupt frames, faulty sensors.
+        health: state and counts of each sensor.
+        unusable: why no filter can use the recording; "" if one can.
+    """
 
     path: Path
     measurements: Measurements
-    rig: Rig | None  # in force during the recording; None for a raw capture
+    rig: Rig | None
     sample_rate_hz: float
     metadata: dict[str, Any]
-    remarks: list[str]  # anomalies, one sentence each: a truncated file, corrupt frames, faulty sensors
-    health: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts by sensor (sensors.health)
-    unusable: str = ""  # why no filter can use the recording; "" if one can
+    remarks: list[str]
+    health: dict[str, dict[str, Any]] = field(default_factory=dict)
+    unusable: str = ""
 
     @property
     def imu_delay_s(self) -> float | None:
