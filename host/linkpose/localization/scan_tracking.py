@@ -20,7 +20,12 @@ from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, S
 # thickness of the walls suggests. SHARED_BEAMS neighbouring beams of a full scan end in one piece of wall and share its
 # error, and all walls may be nearer by as much, as smeared ones are. Where the walls do not bind a direction, the error
 # is at most UNBOUND (m, m, rad). Twice SHARED_BEAMS widens the stated deviations by 1.4.
-GRID_ERROR = np.array([0.02, 0.02, 0.012])
+#
+# A drawn map has exact walls but for its cells and for what is not built as drawn. Neighbouring beams share those
+# errors, and not the noise of the beams, which is in the filter's covariance already. Hence only the shared part of the
+# misfit counts, at least LEAST_DRAWN_STD_M. Twice it nearly doubles σ across a simulated corridor, of 0.0035 m.
+GRID_ERROR, NO_GRID_ERROR = np.array([0.02, 0.02, 0.012]), np.zeros(3)
+LEAST_DRAWN_STD_M = 0.005
 SHARED_BEAMS, LEAST_WALL_STD_M = 18.0, 0.025
 UNBOUND = np.array([0.5, 0.5, 0.2])
 CANDIDATES = 60  # poses of a global search that compete
@@ -60,7 +65,10 @@ class ScanTracker:
         self.was_known = False
         self.wait = BAD_SCANS
         self.usual, self.fall = -2.0, 2.0  # before the first scan: an old map
-        self.map_error = np.diag(GRID_ERROR**2)
+        is_drawn = self.matcher.field.is_drawn
+        self.grid_error = np.diag(np.square(NO_GRID_ERROR if is_drawn else GRID_ERROR))
+        self.least_std_m = LEAST_DRAWN_STD_M if is_drawn else LEAST_WALL_STD_M
+        self.map_error = self.grid_error
         self.misfit2 = LEAST_WALL_STD_M**2  # the usual one (m²)
 
     def _below(self, falls: float) -> float:
@@ -114,13 +122,13 @@ class ScanTracker:
 
     def _bind(self, fit: Fit) -> None:
         """Estimates how the errors of the walls in this scan move the pose: the covariance of a fit to them alone."""
-        self.misfit2 += (fit.misfit_m**2 - self.misfit2) / RISE
-        std = max(LEAST_WALL_STD_M, self.matcher.field.wall_std_m, math.sqrt(self.misfit2))
+        self.misfit2 += (fit.misfit_m2 - self.misfit2) / RISE
+        std = max(self.least_std_m, self.matcher.field.wall_std_m, math.sqrt(max(self.misfit2, 0.0)))
         shared = SHARED_BEAMS * fit.beams / MOST_BEAMS
         bound = fit.walls / (shared * std**2) + np.diag(1.0 / UNBOUND**2)
         error = np.asarray(np.linalg.inv(bound), dtype=np.float64)
         common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
-        self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
+        self.map_error = error + np.outer(common, common) * std**2 + self.grid_error
 
     def _open(
         self, run: KalmanFilter, beams: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
