@@ -21,12 +21,12 @@ from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, S
 # error, and all walls may be nearer by as much, as smeared ones are. Where the walls do not bind a direction, the error
 # is at most UNBOUND (m, m, rad). Twice SHARED_BEAMS widens the stated deviations by 1.4.
 #
-# A drawn map has exact walls but for its cells and for what is not built as drawn. Neighbouring beams share those
-# errors, and not the noise of the beams, which is in the filter's covariance already. Hence only the shared part of the
-# misfit counts, at least LEAST_DRAWN_STD_M. Twice it nearly doubles σ across a simulated corridor, of 0.0035 m.
-GRID_ERROR, NO_GRID_ERROR = np.array([0.02, 0.02, 0.012]), np.zeros(3)
-LEAST_DRAWN_STD_M = 0.005
-SHARED_BEAMS, LEAST_WALL_STD_M = 18.0, 0.025
+# In a drawn map, the noise of single beams is no error of the walls: the filter's covariance has it already. There only
+# the part of the misfit counts that neighbouring beams share, at least LEAST_DRAWN_STD_M. A face between the borders of
+# two cells moves the path by up to half a cell and shows in no misfit; GRID_ERROR has it. Twice LEAST_DRAWN_STD_M
+# widens σ along a simulated corridor by less than a tenth.
+GRID_ERROR = np.array([0.02, 0.02, 0.012])
+SHARED_BEAMS, LEAST_WALL_STD_M, LEAST_DRAWN_STD_M = 18.0, 0.025, 0.005
 UNBOUND = np.array([0.5, 0.5, 0.2])
 CANDIDATES = 60  # poses of a global search that compete
 CANDIDATE_STD = np.array([0.2, 0.2, 0.1])  # of a pose that the search found (m, m, rad)
@@ -65,10 +65,8 @@ class ScanTracker:
         self.was_known = False
         self.wait = BAD_SCANS
         self.usual, self.fall = -2.0, 2.0  # before the first scan: an old map
-        is_drawn = self.matcher.field.is_drawn
-        self.grid_error = np.diag(np.square(NO_GRID_ERROR if is_drawn else GRID_ERROR))
-        self.least_std_m = LEAST_DRAWN_STD_M if is_drawn else LEAST_WALL_STD_M
-        self.map_error = self.grid_error
+        self.least_std_m = LEAST_DRAWN_STD_M if self.matcher.field.is_drawn else LEAST_WALL_STD_M
+        self.map_error = np.diag(GRID_ERROR**2)
         self.misfit2 = LEAST_WALL_STD_M**2  # the usual one (m²)
 
     def _below(self, falls: float) -> float:
@@ -128,7 +126,7 @@ class ScanTracker:
         bound = fit.walls / (shared * std**2) + np.diag(1.0 / UNBOUND**2)
         error = np.asarray(np.linalg.inv(bound), dtype=np.float64)
         common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
-        self.map_error = error + np.outer(common, common) * std**2 + self.grid_error
+        self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
 
     def _open(
         self, run: KalmanFilter, beams: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
