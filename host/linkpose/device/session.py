@@ -51,7 +51,7 @@ SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 3.0  # self-test up to 1.5 s, set-up of a slow mouse 0.6 s
 LOW_SUPPLY_MV = 4500  # below it an ATmega328P at 16 MHz is out of its specification, and 5 V mice are too
 SENSORS_TIMEOUT_S = 1.0  # the slowest sensor is set up 0.3 s after the firmware starts
-SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
+SETTLE_S = 0.15  # for the sensors to be set up again and their filters to settle
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
@@ -60,14 +60,14 @@ RECEIVE_TIMEOUT_S = 0.1
 MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 RETRY_INTERVAL_S = 0.25
 WAIT_STEP_S = 0.05
-OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
+OWN_TOKENS = 1000  # a PONG to one of this many latest PINGs is a late answer to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
 class _TimeLimit:
-    """A time to wait, of which a suspended program uses up no more than one step."""
+    """A time to wait. The time for which the program is suspended counts as one step at most."""
 
     def __init__(self, seconds: float) -> None:
         self._left_s = seconds
@@ -128,7 +128,7 @@ class Session:
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = random.getrandbits(32)  # another program's differ
-        self._intruder_reported = False
+        self._other_program_reported = False
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
@@ -168,7 +168,7 @@ class Session:
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
-        """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
+        """Sends GET_INFO until HELLO arrives; a board that is still streaming for a killed host is stopped first."""
         connection = self._connection
         received, refused = bytearray(), 0
         limit, ask_at = _TimeLimit(HANDSHAKE_TIMEOUT_S), 0.0
@@ -262,9 +262,9 @@ class Session:
         return result
 
     def _command(self, message: Message, command: Command) -> Arrival:
-        """Sends a command, again where its answer is lost; the arrival that holds the ACK, from behind the ACK on.
+        """Sends a command, and repeats it if the answer is lost. Returns what arrived after the ACK.
 
-        A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
+        A SAMPLE also confirms START. Raises LinkposeError on a NAK, and if no answer arrives.
         """
         for _ in range(ATTEMPTS):
             self._connection.send(message)
@@ -312,17 +312,17 @@ class Session:
             if self.timeline.stamps.is_trusted:
                 self._clock.pong(t_us, sent, time_s)
         elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
-            self._report_intruder()
+            self._report_other_program()
 
-    def _report_intruder(self) -> None:
-        """An answer came that this program has not asked for: a port such as socket:// serves several programs."""
-        if not self._intruder_reported:
-            self._intruder_reported = True
+    def _report_other_program(self) -> None:
+        """Reports an answer to another program's command: a port such as socket:// serves several programs."""
+        if not self._other_program_reported:
+            self._other_program_reported = True
             self.notify(
                 f"another program also sends commands to the board at {self.port}; close it, or the data will have gaps"
             )
 
-    def _tie_clocks(self) -> None:
+    def _synchronise_clocks(self) -> None:
         """A few round trips before the first sample."""
         for _ in range(FIRST_PINGS):
             self._ping()
@@ -377,11 +377,11 @@ class Session:
         timeline.end_if_past(timeline.duration_s + self._connection.now() - self._arrived_s - LATE_S)
 
     def _begin(self) -> None:
-        """Ties the clocks anew and starts the stream."""
+        """Synchronises the clocks again and starts the stream."""
         wanted = self._wanted
         for _ in range(ATTEMPTS):
             self._clock = DeviceClock()
-            self._tie_clocks()
+            self._synchronise_clocks()
             self._unhandled = self._start(wanted)
             if self._unhandled is not None:
                 break
@@ -488,7 +488,7 @@ class Session:
         if isinstance(message, Pong):
             self._handle_pong(message, arrival.time_s)
         elif isinstance(message, Ack | Nak) and message.command in (Command.STOP, Command.CONFIGURE):
-            self._report_intruder()  # the board answers in order: START was the last command of this program
+            self._report_other_program()  # the board answers in order: START was the last command of this program
         elif isinstance(message, Status):
             self.status = message
             self._check_supply(message)
@@ -508,7 +508,7 @@ class Session:
         return False
 
     def _resume(self, hello: Hello) -> None:
-        """Puts the settings of before in force again and goes on streaming."""
+        """Restores the settings and continues streaming."""
         self.hello, before = hello, self._first_hello
         if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")

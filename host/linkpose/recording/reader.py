@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from linkpose.sensors.health import Change, HealthMonitor
 
 MOST_CHANGES = 10  # of sensors' states, in the remarks
-# Rows that stay in memory: 83 min at 100 Hz, 70 MB without a second sensor. Twice of it doubles that memory, and files
+# Rows that stay in memory: 83 min at 100 Hz, 70 MB without a second sensor. Doubling it doubles that memory, and files
 # of that length are read once instead of twice.
 KEPT_ROWS = 500_000
 
@@ -153,7 +153,7 @@ class RecordingFile:
         return [name for name in self._source.sensors if name in seen or name in self._source.listed_sensors]
 
     def blocks(self, progress: Progress | None = None) -> Iterator[Measurements]:
-        """The measurements from the first to the last, with NaN for readings that are worth nothing."""
+        """The measurements from the first to the last, with NaN for invalid readings."""
         if self._kept is not None:
             yield from self._kept
             return

@@ -22,15 +22,15 @@ Bools = NDArray[np.bool_]
 
 # A burst of the MPU-6050 that repeats to the last bit. Its accelerometer's noise at the slowest low-pass filter and the
 # widest range is 2.3 counts (data sheet: 400 µg/√Hz, 5 Hz, 16 g), so that three axes repeat 10 times by chance once in
-# 10²⁷ bursts. The firmware uses the same time. Twice of it lets twice as many repeated readings into the filters.
+# 10²⁷ bursts. The firmware uses the same time. Doubling it lets twice as many repeated readings into the filters.
 FROZEN_S = 0.2
 FROZEN_REPEATS = 10  # for sensors slower than 50 Hz
-# One axis that repeats while the other two change. Twice of it exceeds the second within which a fault is reported.
+# One axis that repeats while the other two change. Doubling it exceeds the second within which a fault is reported.
 STUCK_S = 0.5
 STUCK_REPEATS = 25
 LIVELY_REPEATS = 5  # an axis that repeats so often is too quiet to compare another axis with it
-# A block of at least so many samples is tested as a whole for repeats that matter: more than STUCK_REPEATS, so that the
-# repeats at its end began in it. With twice of it, more blocks are followed sample by sample.
+# A block of at least this many samples is tested as a whole for repeats that matter: more than STUCK_REPEATS, so that
+# the repeats at its end began in it. Doubled, more blocks are followed sample by sample.
 _LIVELY_BLOCK = 64
 _SHORT_RUN = 8  # repeats of an axis at the end of the block before, up to which a block is tested as a whole
 # BMP180: noise 3 to 6 Pa, one new reading in 30 ms.

@@ -20,8 +20,8 @@ from linkpose.wire.messages import DeviceState, Hello, SampleFlags
 
 DEVICE_NAMES = ("imu", "imu2", "baro", "mag")  # in the order of HELLO's devices
 
-REPORT_AFTER_S = 0.25  # a state that lasts so long is reported: one lost reading is counted only
-SET_UP_S = 3.0  # a sensor that HELLO announces as being set up may take so long
+REPORT_AFTER_S = 0.25  # a state that lasts this long is reported; single lost readings are only counted
+SET_UP_S = 3.0  # longest set-up of a sensor that HELLO reports as being set up
 USABLE_S = 0.25  # a frozen sensor passes as valid for FROZEN_S
 
 LEFT_OUT = "left out"  # state of a sensor whose valid readings are not used
