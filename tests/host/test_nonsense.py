@@ -186,8 +186,9 @@ def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.nd
         (put("time_s", N - 1, np.inf), f"line {N + 3}: time_s is inf; it must be a number of seconds"),
         (put("time_s", N - 1, 1e300), f"line {N + 3}: time_s is 1e"),
         (put("baro_fresh", 10, 2.0), "line 14: baro_fresh is 2; it must be 0 or 1"),
+        (lambda table: table.update(flags=np.full(N, 0.5)), "line 4: flags must be a whole number"),
     ],
-    ids=["one stamp", "inf", "huge", "fresh"],
+    ids=["one stamp", "inf", "huge", "fresh", "flags"],
 )
 def test_an_impossible_value_is_refused_with_its_line(
     tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str
@@ -195,6 +196,32 @@ def test_an_impossible_value_is_refused_with_its_line(
     with pytest.raises(FileFormatError) as caught:
         remarks(tmp_path, change)
     assert sentence in str(caught.value)
+
+
+IMU2 = {f"imu2_{name}": name for name in NAMES[1:7]}
+BOTH_VALID = 65_537.0
+
+
+def with_second_sensor(table: dict[str, np.ndarray], flags: np.ndarray | None = None) -> None:
+    table.update({second: table[first] for second, first in IMU2.items()})
+    if flags is not None:
+        table["flags"] = flags
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_flags_that_contradict_the_readings_are_named(tmp_path: Path, factor: float) -> None:
+    """A wrong factor in `flags` made the filters leave out all readings without a word."""
+    found = remarks(tmp_path, lambda table: with_second_sensor(table, np.full(N, factor * BOTH_VALID)))
+    for sensor in ("the IMU", "the second IMU"):
+        named = f"flags marks {sensor} as invalid in 600 rows with a reading" in found
+        assert named == (factor != 1)
+    assert found.count("If the column was changed, delete it") == (0 if factor == 1 else 2)
+
+
+def test_without_flags_every_reading_is_valid(tmp_path: Path) -> None:
+    """Those of the second sensor, too: chains were blank without the column."""
+    assert remarks(tmp_path, with_second_sensor) == ""
+    assert (load_recording(tmp_path / "r.csv").measurements.flags == BOTH_VALID).all()
 
 
 @pytest.mark.parametrize("pressure", [500.0, 200_000.0])
