@@ -631,7 +631,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "--view shows a page; leave out --output": typed("plot --view {}/a.csv -o {}/a.png"),
         "… is not …, numbers separated by commas": typed("localize a.csv --start 1"),
         "… is neither off nor a probability between 0 and 1, such as 0.997": typed("localize a.csv --gate 2"),
-        "nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv": typed("localize a.csv"),
+        "nothing to localize against; add --map MAP.yaml or --beacons BEACONS.csv": typed("localize a.csv"),
         "a stream from standard input does not use …; leave it out": typed("localize - --beacons b.csv --json"),
         "standard input takes --beacons, one --filter ekf or ukf, and no --smooth": typed(
             "localize - --beacons b.csv --smooth"
