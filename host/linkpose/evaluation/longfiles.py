@@ -16,6 +16,7 @@ import numpy as np
 
 from linkpose.errors import FileFormatError
 from linkpose.evaluation.errors import CommonStart, errors_of
+from linkpose.evaluation.mismatches import mismatches
 from linkpose.evaluation.references import read_take
 from linkpose.evaluation.scores import (
     SCORED,
@@ -23,7 +24,6 @@ from linkpose.evaluation.scores import (
     common_offset,
     comparable,
     evaluate,
-    mismatches,
     pairs_of,
     window_of,
 )
@@ -272,7 +272,7 @@ class _Comparison:
         tables = self._stretches(stamps[np.isfinite(stamps)], near)
         compared = pairs_of(*tables)
         offset_s, residual = common_offset(compared.values(), near)
-        remarks = mismatches(*tables, compared.values(), offset_s, residual)
+        remarks = mismatches(*tables, compared, offset_s, residual)
         return {name: list(both.pairs) for name, both in compared.items()}, offset_s, remarks
 
     def _most_telling(self) -> tuple[list[str], list[str]]:

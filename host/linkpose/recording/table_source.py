@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import FileFormatError
+from linkpose.presentation import counted
 from linkpose.recording import columns
 from linkpose.recording.table import Progress, TableFile, require
 from linkpose.recording.textfile import Part
@@ -46,6 +47,7 @@ class TableSource:
         self.listed_sensors = [names.get(str(name), str(name)) for name in listed] if isinstance(listed, list) else []
         self.sensors = self._possible_sensors()
         self._rows = 0
+        self._contradicted: dict[str, int] = {}  # sensor -> rows with a reading that `flags` marks as invalid
 
     @property
     def closing(self) -> dict[str, Any] | None:
@@ -54,6 +56,7 @@ class TableSource:
     def blocks(self, progress: Progress | None) -> Iterator[Measurements]:
         """Measurements as they were recorded. Raises FileFormatError for values that no recording has."""
         self._rows, first_s, last_s = 0, np.nan, np.nan
+        self._contradicted = {}
         previous: dict[str, float] = {}
         for part in self._file.parts(progress):
             time_s = part.columns["time_s"]
@@ -74,10 +77,18 @@ class TableSource:
             )
         elif not self._file.closing:
             found.append(f"{self._path} has no closing line: it was cut; its {self._rows} whole rows are used")
+        found += [
+            f"{self._path}: flags marks {sensor} as invalid in {counted(rows, 'row')} with a reading, which is left "
+            "out. If the column was changed, delete it: every reading then counts as valid"
+            for sensor, rows in self._contradicted.items()
+        ]
         return found
 
     def _measurements(self, part: Part, previous: dict[str, float]) -> Measurements:
         """The rows as measurements; `previous` holds the values of the row before them."""
+        flags = _flags(self._path, part)
+        for sensor, rows in _contradicted(part, flags):
+            self._contradicted[sensor] = self._contradicted.get(sensor, 0) + rows
         return Measurements(
             part.columns["time_s"],
             _vectors(part, columns.ACCEL),
@@ -87,7 +98,7 @@ class TableSource:
             _column(part, "baro_temp_degC"),
             _fresh(self._path, part, previous),
             _mice(part, self._mouse_ports),
-            _flags(self._path, part),
+            flags,
             **_other_sensors(part, previous),
         )
 
@@ -180,15 +191,41 @@ def _mice(part: Part, ports: int) -> Floats:
 def _flags(path: Path, part: Part) -> NDArray[np.uint32]:
     """Column `flags`; without this column, every value that is present is valid."""
     if "flags" not in part.columns:
-        imu = np.isfinite(_vectors(part, columns.ACCEL + columns.GYRO)).all(axis=1)
-        return np.where(imu, SampleFlags.IMU_VALID, 0).astype(np.uint32)
+        assumed = np.zeros(len(part), np.uint32)
+        for names, bit in _VALID.values():
+            assumed |= np.where(_present(part, names), np.uint32(bit), np.uint32(0))
+        return assumed
     flags = part.columns["flags"]
-    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFFFFFF)))
+    wrong = np.flatnonzero(~((flags >= 0) & (flags <= 0xFFFFFFFF) & (flags == np.floor(flags))))
     if len(wrong):
         raise FileFormatError(
-            path, f"{path}, line {part.first_line + int(wrong[0])}: flags must be a number from 0 to 4294967295"
+            path, f"{path}, line {part.first_line + int(wrong[0])}: flags must be a whole number from 0 to 4294967295"
         )
     return flags.astype(np.uint32)
+
+
+# A reading is blank in a recording where its bit of `flags` is 0: the converter writes no invalid reading. The
+# barometer's and the mice's bits are not used after that.
+_VALID = {
+    "the IMU": (columns.ACCEL + columns.GYRO, int(SampleFlags.IMU_VALID)),
+    "the second IMU": (columns.ACCEL2 + columns.GYRO2, int(SampleFlags.IMU2_VALID)),
+    "the magnetometer": (columns.MAG, int(SampleFlags.MAG_VALID)),
+}
+
+
+def _contradicted(part: Part, flags: NDArray[np.uint32]) -> Iterator[tuple[str, int]]:
+    """The sensors with readings in rows that mark them as invalid, and the number of these rows."""
+    for sensor, (names, bit) in _VALID.items():
+        if names[0] in part.columns and (rows := np.count_nonzero(_present(part, names) & (flags & bit == 0))):
+            yield sensor, int(rows)
+
+
+def _present(part: Part, names: tuple[str, ...]) -> NDArray[np.bool_]:
+    """Rows (N,) with values in all of these columns."""
+    present = np.ones(len(part), np.bool_)
+    for name in names:
+        present &= np.isfinite(_column(part, name))
+    return present
 
 
 def _usual_step(time_s: Floats) -> float:
