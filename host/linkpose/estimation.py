@@ -112,10 +112,11 @@ class ExcludedMice:
         return merged
 
 
-# Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Twice of it changes nothing
+# Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Doubling it changes nothing
 # that can be measured.
 _LONG_BLOCK = 1000
-# A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
+# A scale of the mice is reported if it differs from 1 by more than this many standard deviations, and by more than the
+# gyro's scale error.
 _SCALE_Z, _SCALE_LEAST = 3.0, 0.01
 
 
@@ -177,7 +178,7 @@ class Estimator:
         return self._rig
 
     def smooth(self) -> None:
-        """Puts a smoother in the place of each filter that has one: from here on, `process` takes a whole recording.
+        """Replaces each filter that has a smoother by it. `process` then requires a whole recording.
 
         Raises LinkposeError where none of the filters has one.
         """
@@ -189,9 +190,9 @@ class Estimator:
         self.filters = [filters.create_smoother(f.name, self._rig) if f.name in smoothable else f for f in self.filters]
 
     def hold_heading(self, port: str | None = None) -> None:
-        """Lets the magnetometer hold the yaw of each filter that estimates one; after `smooth`, before `process`.
+        """Corrects the yaw of all filters with the magnetometer. Call it after `smooth` and before `process`.
 
-        `port` is that of the board whose stream is estimated; None for a recording.
+        `port` is the port of the board; None for a recording.
         Raises NoMagnetometer, UncalibratedMagnetometer, and CannotRun where no filter estimates a yaw.
         """
         from linkpose.filters.magnetic_heading import MagneticHeading, has_yaw
@@ -205,7 +206,7 @@ class Estimator:
 
     @property
     def magnetic_field(self) -> FieldRecord | None:
-        """What the first filter that the magnetometer holds has found of the field; None without any."""
+        """The magnetic field as recorded by the first filter that uses it; None if no filter does."""
         from linkpose.filters.magnetic_heading import MagneticHeading
 
         return next((f.found for f in self.filters if isinstance(f, MagneticHeading)), None)
@@ -229,7 +230,7 @@ class Estimator:
 
     @property
     def found_j2s(self) -> FoundJ2s | None:
-        """J2S as the filters have found it so far; None where it was known, or where none of them looks for it."""
+        """J2S as estimated so far; None where it was known, or where no filter estimates it."""
         if self._rig.joint.known_j2s_m is not None:
             return None
         for f in self.filters:
@@ -283,7 +284,7 @@ class Estimator:
 
     @property
     def mice_remarks(self) -> list[str]:
-        """What the mice did wrong together, by the first filter that compares them with the gyro."""
+        """Faults that all mice share, by the first filter that compares them with the gyro."""
         for f in self.filters:
             if isinstance(f, filters.RemarksOnMice):
                 return f.mice_remarks

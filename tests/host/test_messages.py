@@ -255,6 +255,7 @@ PRODUCERS: list[Producer] = [
     scored(rows("time_s,length_m"), rows("time_s,height_m")),
     scored(rows(ESTIMATE), rows("time_s,length_m")),
     scored(rows(ESTIMATE), rows("time_s,vx_m_s")),
+    scored(rows("time_s,tilt_height_m,tilt_height_std_m"), rows("time_s,height_m")),
     # filters and rig
     unknown_filter,
     with_filter("joint", NO_J2S, Sensors.MPU6050),

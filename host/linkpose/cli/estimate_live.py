@@ -128,7 +128,7 @@ class _LiveRun:
         show_newest(self._page, rows, lambda: self.health, self._estimator, self._compiling)
 
     def follow_keys(self) -> None:
-        """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
+        """Carries out the keys pressed since the last call. Raises KeyboardInterrupt to end the run."""
         self._keys.follow({"m": self._marker, "f": self._view.next_filter})
 
     def finish(self, ended: str) -> None:

@@ -47,7 +47,7 @@ def _number(
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
-    """So many finite numbers, separated by commas."""
+    """Finite numbers separated by commas, one for each name."""
 
     def __init__(self, names: str) -> None:
         self.name = names

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """What --view, --view-host and --view-port ask for."""
+    """The values of --view, --view-host and --view-port."""
 
     is_wanted: bool
     host: str

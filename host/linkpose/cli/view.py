@@ -74,7 +74,7 @@ class View:
         self._screen.next_filter()
 
     def add(self, rows: LiveRows) -> None:
-        """Adds the newest row of estimates, or begins anew with all rows so far where a filter has caught up.
+        """Adds the newest row of estimates, or restarts with all rows so far where a filter has caught up.
 
         The screen takes all waiting rows at once before it is drawn: a filter that catches up delays no sample.
         """

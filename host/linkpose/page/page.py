@@ -35,8 +35,8 @@ FIRST_PORT = 8080
 # halves the cost, and a sample takes up to 0.12 s more to the screen.
 UPDATE_INTERVAL_S = 0.12
 CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
-STATUS_INTERVAL = 25  # blocks between two looks at the health, which counts over all sensors
-J2S_GOAL_M = 0.03  # 1σ in the worst direction from which on the guide asks for no other motion
+STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
+J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
 _PORTS_TRIED = 100
 
@@ -307,7 +307,7 @@ def serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
     import viser
 
     class Server(viser.ViserServer):
-        """A server that opens no tunnel to the network, whatever a browser asks for."""
+        """A server that never opens a tunnel to the network, even if a browser requests one."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None

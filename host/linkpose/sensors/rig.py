@@ -31,7 +31,8 @@ FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
-# A J2S with a larger standard deviation (m, each axis) is only a first guess: filters that need a known one refuse it.
+# A J2S with a larger standard deviation (m, each axis) is only an initial value; filters that require a known
+# J2S do not run.
 _GUESS_M = 0.1
 LONGEST_LINK_M = 10.0  # of a J2S that a user gives: a longer one is in centimetres or millimetres
 
@@ -45,7 +46,7 @@ class Joint:
 
     @property
     def known_j2s_m(self) -> Vector | None:
-        """J2S; None if it is unknown or only a first guess."""
+        """J2S; None if it is unknown or only an initial value."""
         return self.j2s_m if self.largest_std_m <= _GUESS_M else None
 
     @property
