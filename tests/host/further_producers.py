@@ -505,7 +505,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "the motion is too slow or too short to find J2S: two of its three directions are known to … m or worse; swing the link faster and in all directions": "test_calibration_link.py::test_motion_that_is_too_slow_is_refused",
         "the readings fit no joint that stays in its place (… m/s² rms are left over): fix the joint, and the sensor firmly on the link": "test_calibration_link.py::test_a_sensor_on_no_joint_is_refused",
-        "the fit needs an accelerometer with an offset of … m/s² and a scale of …, which no MPU-6050 has: is the joint fixed, and the range set right?": "test_calibration_link.py::test_a_sensor_that_cannot_be_is_refused",
+        "the fit needs an accelerometer with an offset of … m/s² and a scale of …, which no MPU-6050 has: is the joint fixed, the sensor firmly on the link, and the range right?": "test_calibration_link.py::test_a_sensor_that_cannot_be_is_refused",
         "…, too little to calibrate the magnetometer: turn the sensor by hand through all attitudes, each axis up, down and sideways, for a minute, away from iron": raises(
             lambda: calibrate_mag([of_magnetometer(tumbled(5.0, about=(0.0, 0.0, 0.0)))], Rig())
         ),
