@@ -132,7 +132,8 @@ def _sums(recording: Recording, mice: int) -> _DriveSums:
         )
     if abs(turn - turns * FULL_TURN) > TURN_TOLERANCE_RAD + GYRO_SCALE * abs(turn):
         raise LinkposeError(
-            f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; repeat the drive"
+            f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; repeat the "
+            "drive"
         )
     total = counts[first:last].sum(axis=0)
     if not turns:
