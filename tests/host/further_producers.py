@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from message_producers import raises
 from scripted_board import ScriptedBoard, install
 from test_calibrate_mag import recording as of_magnetometer
 from test_calibrate_mag import tumbled
@@ -65,10 +66,6 @@ from linkpose.wire.messages import Configure, GetInfo, Message, Ping
 
 Producer = Callable[[Path], object] | str  # a str names the test that asserts the message
 SIM = "sim://link?speed=0"
-
-
-def raises(function: Callable[[], object]) -> Producer:
-    return lambda folder: function()
 
 
 def written(read: Callable[[Path], object], text: str | bytes, name: str = "a.csv") -> Producer:

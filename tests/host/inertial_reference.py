@@ -341,9 +341,12 @@ def check_the_reported_stds(rng):
         propagate.rotate_attitude(s, vec.turn_of(tuple(rotation)))
         row = empty_row()
         report.report(s, 1.0, IMU, row)
-        expected = np.sqrt(np.diag(gradient @ begin[0].covariance @ gradient.T))
-        np.testing.assert_allclose(row.std, expected, rtol=1e-6)
-        s.span = 0.01  # from here on the covariance is that of an earlier sample
+        turn = np.zeros((SIZE, 3))  # by a rotation about each axis, as in `add_noise`
+        turn[Z:V], turn[PSI] = skew(begin[0].nominal[Z:V]), begin[0].nominal[Z:V]
+        gained = s.rotation_variance + s.span**2 * np.trace(begin[0].covariance[BG:BA, BG:BA]) / 3
+        whole = begin[0].covariance + gained * turn @ turn.T
+        np.testing.assert_allclose(row.std, np.sqrt(np.diag(gradient @ whole @ gradient.T)), rtol=1e-6)
+        s.span, s.rotation_variance = 0.01, 1e-5  # from here on the covariance is that of an earlier sample
 
 
 if __name__ == "__main__":

@@ -78,6 +78,7 @@ _GROUPS = (
     (np.concatenate([ACCEL_MATRIX + _OFF_DIAGONAL, GYRO_MATRIX + _OFF_DIAGONAL]), 0.02),
 )
 _ACCEL_SCALES = _GROUPS[0][0]
+_FEWEST_BLOCKS = 4  # into which the recording is cut to measure how far residuals are correlated
 _FREE_PASSES = 2  # before the residuals are small enough to measure their correlation
 # Largest changes of a calibrated sensor's gyro bias (rad/s), accelerometer offset (m/s²) and scale.
 _AS_CALIBRATED = (0.01, 0.15, 0.01)
@@ -272,7 +273,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
         sums = _normal_equations([equations(p, unknowns) for part in parts for p in pieces(part, longest_s)], scale)
         normal, prior = sums.normals.sum(axis=0), _prior(spread)
         first = number < _FREE_PASSES
-        worth = 1.0 if first else correlation(sums, normal + worth * np.diag(prior))
+        worth = 1.0 if first else correlation(sums, normal + worth * np.diag(prior), _FEWEST_BLOCKS)
         # The readings' density: without it, a fit could reduce its residuals by shrinking the readings.
         volume = np.zeros(UNKNOWNS)
         volume[_ACCEL_SCALES] = sums.equations / (1 - unknowns[_ACCEL_SCALES])

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
     from linkpose.device.session import Health
-    from linkpose.estimation import Estimator, LiveRows
+    from linkpose.estimation import Estimator
+    from linkpose.live_estimation import LiveRows
     from linkpose.localization.surroundings import Surroundings
     from linkpose.page import Page
     from linkpose.page.history import Replay
@@ -103,7 +104,8 @@ class PageOptions:
         if not self.is_wanted:
             yield lambda _: None
             return
-        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.estimation import Estimator
+        from linkpose.live_estimation import LiveEstimator
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board((), board)

@@ -16,7 +16,7 @@ from linkpose.device.session import Health
 if TYPE_CHECKING:
     from rich.live import Live
 
-    from linkpose.estimation import LiveRows
+    from linkpose.live_estimation import LiveRows
     from linkpose.sensors.measurements import Floats
 
 REDRAW_INTERVAL_S = 0.1

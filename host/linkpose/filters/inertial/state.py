@@ -146,7 +146,8 @@ ESTIMATE = np.dtype(
         ("value", "f8", (6,)),  # height Zᵀd, x, y (m); roll, pitch, yaw (rad)
         ("std", "f8", (6,)),
         ("tilt", *_VECTOR),
-        ("distance", "f8"),  # of the state, as are the levels
+        ("unmoved", "b1"),  # of the state, as are distance and levels
+        ("distance", "f8"),
         ("tilt_level", "f8"),
         ("heading_level", "f8"),
         ("unknown", "f8"),  # share of the accelerometer's bias variance across Z that the motion has not resolved
