@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PRELOADED = [
-    "linkpose.cli", "linkpose.estimation", "linkpose.plotting", "linkpose.cli.live", "linkpose.localization.paths",
+    "linkpose.cli", "linkpose.live_estimation", "linkpose.plotting", "linkpose.cli.live", "linkpose.localization.paths",
     "linkpose.simulation.export", "linkpose.device.session", "linkpose.evaluation.longfiles", "matplotlib.figure",
     "matplotlib.backends.backend_agg", "linkpose.plotting.tables", "linkpose.localization.localizer",
     "linkpose.localization.tuning", "linkpose.calibration.joint", "linkpose.filters.tilt", "scipy.optimize",

@@ -520,14 +520,14 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… has … full turns; more than … cannot be counted with a gyro that may be … % off. Drive … turns or fewer.": mice_of(
             _many_turns
         ),
-        "… turns by …°, so it is neither a straight line nor full turns; drive it anew": mice("half a turn"),
+        "… turns by …°, so it is neither a straight line nor full turns; repeat the drive": mice("half a turn"),
         "…: mouse … counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
-        "…: mouse … is away at … s, while the robot moves; drive it anew": mice("a mouse away"),
-        "…: samples were lost before … s, and their counts with them; drive it anew": mice("lost samples"),
+        "…: mouse … is away at … s, while the robot moves; repeat the drive": mice("a mouse away"),
+        "…: samples were lost before … s, and their counts with them; repeat the drive": mice("lost samples"),
         "… holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring": mice("no gyro"),
         "… begins in motion; stand still for a second, then drive": mice("no rest"),
-        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then drive it anew": "test_calibrate_mice.py::test_what_is_missing_is_named",
-        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and drive both anew on a floor on which no mouse slips": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then repeat the drive": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and repeat both on a floor on which no mouse slips": "test_calibrate_mice.py::test_what_is_missing_is_named",
         "the … mice contradict one another (… standard deviations, mouse … most of all): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died": mice_of(
             _contradicting_mice
         ),

@@ -90,8 +90,8 @@ class _LiveRun:
     ) -> None:
         from linkpose.cli.keys import Marker
         from linkpose.cli.view import View
-        from linkpose.estimation import LiveEstimator
         from linkpose.extremes import Extremes
+        from linkpose.live_estimation import LiveEstimator
 
         self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
         self._console, self._keys = console, keys
