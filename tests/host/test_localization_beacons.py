@@ -1,4 +1,4 @@
-"""Localisation among beacons: noises from the log, robots that are carried, slow fixes, constants of the ranges."""
+"""Localization among beacons: noises from the log, robots that are carried, slow fixes, constants of the ranges."""
 
 from __future__ import annotations
 

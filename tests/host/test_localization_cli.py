@@ -294,7 +294,7 @@ def test_an_interrupted_stream_ends_well(streamed):
         (
             [*START, *(f"{i % 15},range,A1,5,\n" for i in range(30))],
             [],
-            "line 28: the clock jumps back from 14 to 9 s; start the stream anew",
+            "line 28: the clock jumps back from 14 to 9 s; restart the stream",
         ),
         (START, ["--plot", "a.png", "--json"], "does not use --plot, --json"),
         (START, ["--smooth"], "no --smooth"),

@@ -49,12 +49,12 @@ if TYPE_CHECKING:
     from linkpose.localization.scan_tracking import ScanTracker
 
 Method = Literal["scan-match", "ekf", "ukf", "mcl"]
-# When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
+# When most of this many measurements of a kind were rejected, the pose is assumed to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
 
 # Standard deviation (rad/s) of a vehicle's turn rate at one instant around the mean rate that attitudes show: waves and
-# thrusters turn it unevenly. That of the simulated commands of Table 2.2. Twice it doubles the stated σ of wz.
+# thrusters turn it unevenly. Value of the simulated commands of Table 2.2. Doubling it doubles the stated σ of wz.
 UNEVEN_TURN_RAD_S = 0.01
 
 # An unscented filter predicts longer intervals (s) by linearisation: the headings of its sigma points spread around the

@@ -1,4 +1,4 @@
-"""What a user may choose about a localisation. This module is cheap to import: the command line's help reads it."""
+"""What a user may choose about a localization. This module is cheap to import: the command line's help reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Localisation from Python: a log and a map or beacons in, paths out. `linkpose localize` is its first client."""
+"""Localization from Python: a log and a map or beacons in, paths out. `linkpose localize` is its first client."""
 
 from __future__ import annotations
 
@@ -54,12 +54,18 @@ class Paths:
 
     `paths["ekf_x_m"]` is a column of the file that `save` writes, (N,) float64; NaN while the pose is not known.
     `paths.ekf` is the filter's `Track`, with `position_m`, `heading_rad`, `std` and `covariance` as arrays.
+
+    Attributes:
+        tracks: the `Track` of each filter by its name.
+        log: the log's file.
+        remarks: what was changed in the log, assumed, and estimated from it; one sentence each.
+        settings: the settings of the first filter.
     """
 
-    tracks: dict[str, Track]  # by name of the filter
-    log: Path  # the log's file
-    remarks: tuple[str, ...]  # what was changed in the log, assumed, and estimated from it; one sentence each
-    settings: Settings  # of the first filter
+    tracks: dict[str, Track]
+    log: Path
+    remarks: tuple[str, ...]
+    settings: Settings
 
     @property
     def filters(self) -> tuple[str, ...]:
@@ -159,7 +165,7 @@ def _check_names(options: Iterable[str]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PreparedLog:
-    """A log with all that its localisation needs, read and checked."""
+    """A log with all that its localization needs, read and checked."""
 
     log: Log
     origin: Path

@@ -30,7 +30,7 @@ from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import MeasurementBuilder
 from linkpose.rotations import wrapped
 
-# Of the latest so many measurements, so many contradict the pose: fewer are outliers, more delay the recovery.
+# Of the LATEST measurements, this many must contradict the pose: fewer are outliers, more delay the recovery.
 LATEST, CONTRADICTIONS = 4, 3
 CONTRADICTS = 0.997  # probability below which the χ² test calls an innovation possible
 EXPLAINS = 0.95  # the same for the sum of squares of a fit: it replaces a pose only if it is good

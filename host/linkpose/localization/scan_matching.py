@@ -41,7 +41,7 @@ CERTAIN_M, CERTAIN_RAD = 0.15, 0.1
 # in a corridor of an old map pull the pose to a place that looks alike.
 SLIP, SLIP_LEAD = (0.3, 0.3, 0.3), 1.0
 NEARBY = 12  # starts of that fit
-# Weight of one scan when hypotheses are compared: its beams count as so many independent ones. Too many, and two
+# Weight of one scan when hypotheses are compared: its beams count as this many independent ones. Too many, and two
 # the map's errors decide between corridors that look alike.
 COMPARED_BEAMS = 10.0
 NO_WALL = 0.1  # probability that a beam meets what the map does not have

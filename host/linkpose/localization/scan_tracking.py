@@ -34,8 +34,8 @@ CANDIDATE_STD = np.array([0.2, 0.2, 0.1])  # of a pose that the search found (m,
 # It follows better scans within RISE of them and worse ones within FALL: a lost robot must not become the usual. The
 # usual misfit follows within RISE.
 RISE, FALL = 20.0, 200.0
-# A scan that is so many usual falls (and at least so much) below the usual is suspect, and bad. A suspect one is
-# fitted again as after a slip; so many bad ones in a row make the pose suspect.
+# A scan that is SUSPECT (BAD) usual falls, and at least LEAST_FALL, below the usual is suspect (bad). A suspect scan is
+# fitted again as after a slip; BAD_SCANS bad ones in a row make the pose suspect.
 SUSPECT, BAD, LEAST_FALL = 1.5, 2.5, 1.0
 BAD_SCANS, MOST_BAD_SCANS = 3, 100  # a search that finds nothing better doubles the wait for the next one
 # A pose elsewhere must explain the scan by this much more (log-likelihood, see hypotheses.LEAD) to start a contest.

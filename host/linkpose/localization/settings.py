@@ -1,4 +1,4 @@
-"""Settings of a localisation: how good the sensors are, and how the filter treats them."""
+"""Settings of a localization: how good the sensors are, and how the filter treats them."""
 
 from __future__ import annotations
 

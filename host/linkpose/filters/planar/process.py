@@ -381,19 +381,16 @@ def _calibrate(state: Record, m: Record, mice: Records, rig: Records) -> None:
 
 
 @inner
-def _advance(state: Record, tangent: Records | None, points: Records | None, dt: float) -> bool:
-    """Carry the pose on by `dt` (s) with the velocity. The compiler drops the branch of the other filter."""
-    if tangent is not None:
-        linear.advance(state, dt)
-    if points is not None:
+def _advance(state: Record, points: Records, dt: float) -> bool:
+    """Carry the pose on by `dt` (s) with the velocity; False where the covariance is not positive definite."""
+    if len(points):
         return sigma.advance(state, points[0], dt)
+    linear.advance(state, dt)
     return True
 
 
 @inner
-def _correct(
-    state: Record, tangent: Records | None, points: Records | None, rig: Records, m: Record, dt: float
-) -> bool:  # fmt: skip
+def _correct(state: Record, tangent: Records, points: Records, rig: Records, m: Record, dt: float) -> bool:
     """Update with the measurement, for a while without mice that contradict the prediction.
 
     Mice that slip or are lifted contradict at once; the fault tests take a few steps to find them, in which they would
@@ -402,9 +399,9 @@ def _correct(
     if state.rows == 0:
         return True
     limit = fault_limit(state.rows)
-    if tangent is not None:
+    if not len(points):
         linear.moments(state, tangent[0], rig, m.mean_rate)
-    if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
+    elif not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
     is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated or state.snapped)
@@ -545,8 +542,8 @@ def _is_lone_count(mouse: Record) -> bool:
 
 @inner
 def _step(
-    state: Record, tangent: Records | None, points: Records | None, m: Record, mice: Records, rig: Records, p: Record,
-    q: Record, sample: Record,
+    state: Record, tangent: Records, points: Records, m: Record, mice: Records, rig: Records, p: Record, q: Record,
+    sample: Record,
 ) -> None:  # fmt: skip
     """One reading of the mice."""
     if not reading.begin_step(m, sample.time):
@@ -559,11 +556,11 @@ def _step(
     is_silent = _are_silent(m, mice)
     _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt, sample.time)
-    is_good = half == 0.0 or _advance(state, tangent, points, half)
+    is_good = half == 0.0 or _advance(state, points, half)
     _move_on(state, q, dt)
     _collect(state, m, mice, rig, sample, p)
     state.rejected += state.rows == 0 or (m.used == 0 and not state.at_rest)
-    is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, tangent, points, dt - half)
+    is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, points, dt - half)
     if not is_good:
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
@@ -599,9 +596,8 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     way = scaled(since, turned(turned(unit(at.heading), turned_mean(turn)), velocity))
     out.x, out.y, out.heading = at.x + way.real, at.y + way.imag, wrapped(at.heading + turn)
     out.vx, out.vy, out.wz = at.vx, at.vy, at.wz
-    lag = since
-    if not state.at_rest and math.isfinite(m.interval):
-        lag += 0.5 * m.interval
+    # At rest too: the robot starts before the first count, and before its rate exceeds the noise of the gyro.
+    lag = since + (0.5 * m.interval if math.isfinite(m.interval) else 0.0)
     by_scale, by_angle = _common_errors(state, m, mice)
     other = state.dispute.position - complex(at.x, at.y)
     spread, last = state.turn_spread, complex(at.x, at.y) - state.turn_end
@@ -616,12 +612,13 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
 @compiled
 def process(
     samples: Records, parameters: Records, planar: Records, rig: Records, mice: Records, mice_states: Records,
-    tangent: Records | None, points: Records | None, states: Records, out: Records,
+    tangent: Records, points: Records, states: Records, out: Records,
 ) -> None:  # fmt: skip
     """Every sample of a block: estimates (N,) of ESTIMATE into `out`.
 
     `parameters` are MiceParameters, `planar` PlanarParameters, `rig` the mice as the rig places them, `mice` as the
-    filter has calibrated them. The extended filter has a `tangent`, the unscented one has `points`; the other is None.
+    filter has calibrated them. The extended filter has one `tangent`, the unscented one has one `points`; the other
+    array is empty. Both run the same machine code, which is therefore compiled once.
     """
     state, m, p, q = states[0], mice_states[0], parameters[0], planar[0]
     for k in range(len(samples)):

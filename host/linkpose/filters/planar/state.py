@@ -116,6 +116,7 @@ _FIELDS = [
     ("block_count", "i8"),
     ("queue", _REST_BLOCK, (QUEUE,)),  # finished blocks
     ("queued", "i8"),
+    ("queued_at_rest", "i8"),  # those of them during which the filter took the robot to stand still
     # Common scale of the mice against the gyro: sums over the last turns.
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
@@ -244,6 +245,7 @@ class PlanarParameters(NamedTuple):
     turn_s: float = 1.0
     # Gyro: random walk of the bias (rad/s per √s) with an Allan deviation of 0.0023 °/s at 100 s; the axes of a real
     # MPU-6050 had 0.003, 0.0013 and 0.0007 °/s. Doubled: a rest is trusted a quarter as long.
+    noise_factor: float = 2.5  # of the rig's gyro noise, until the first rest shows it: real sensors reach 0.13 °/s
     bias_rad_s: float = 0.35  # never calibrated: ±20 °/s (data sheet)
     bias_walk: float = math.radians(4e-4)
     # Mice: what `calibrate mice` leaves common to all mice: its line of 2 m, measured and driven straight to 2 mm ...
@@ -266,11 +268,11 @@ class PlanarParameters(NamedTuple):
 
 
 def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
-    """An array of one state record before the first sample."""
+    """An array of one state record before the first sample; `gyro_variance` is the rig's, of one sample ((rad/s)²)."""
     records = zeros(1, STATE)
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
-    state.gyro_variance, state.gyro_samples = gyro_variance, 20.0
+    state.gyro_variance, state.gyro_samples = p.noise_factor**2 * gyro_variance, 20.0
     state.resolution.share = 1.0
     covariance = state.covariance
     for index, std in (
