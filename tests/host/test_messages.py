@@ -255,6 +255,7 @@ PRODUCERS: list[Producer] = [
     scored(rows("time_s,length_m"), rows("time_s,height_m")),
     scored(rows(ESTIMATE), rows("time_s,length_m")),
     scored(rows(ESTIMATE), rows("time_s,vx_m_s")),
+    scored(rows("time_s,tilt_height_m,tilt_height_std_m"), rows("time_s,height_m")),
     # filters and rig
     unknown_filter,
     with_filter("joint", NO_J2S, Sensors.MPU6050),
@@ -380,7 +381,12 @@ PROMISES = {
         "test_health.py::test_a_faulty_imu_is_left_out_counted_and_reported",
         "test_health.py::test_a_sensor_that_freezes_while_recording_is_reported_and_stored",
     ],
-    "the disk is full": ["test_recording.py::test_a_full_disk_leaves_whole_rows_and_says_so"],
+    "the disk is full or fails, or a network folder goes away": [
+        "test_recording.py::test_a_full_disk_leaves_whole_rows_and_says_so",
+        "test_outputs.py::test_a_check_that_fails_does_not_end_the_recording",
+        "test_outputs.py::test_a_folder_that_is_removed_meanwhile_is_one_sentence",
+    ],
+    "the computer's date and time are set": ["test_time.py::test_the_date_that_is_set_meanwhile_changes_no_time"],
     "the recording is removed, replaced, emptied or written by another program": [
         "test_device.py::test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file",
         "test_device.py::test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence",
