@@ -13,7 +13,7 @@ from scipy.signal import butter, lfilter
 
 from linkpose import filters
 from linkpose.calibration.imu import calibrate_imu, with_calibration
-from linkpose.calibration.joint import JointCalibration, calibrate_joint, is_calibrated
+from linkpose.calibration.joint import LARGE_RESIDUAL_M_S2, JointCalibration, calibrate_joint, is_calibrated
 from linkpose.calibration.joint import with_calibration as joint_with_calibration
 from linkpose.cli import calibrate_imu as imu_command
 from linkpose.cli import calibrate_joint as joint_command
@@ -235,6 +235,20 @@ def test_play_in_the_joint_shows_in_the_std():
     assert loose.residual_m_s2 > 5 * found.residual_m_s2
     assert loose.std_m.max() > 3 * found.std_m.max()
     assert np.abs(normalised(run, loose)).max() <= 3
+
+
+def test_a_step_of_the_temperature_shows_in_the_std():
+    """Bias, offset and scale change halfway. Residuals are then correlated for half the recording, not for a second."""
+    run = LinkRun(2, 41, 60.0, errors="datasheet")
+    block, rng, late = run.measurements(), np.random.default_rng(1), slice(3000, None)
+    accel, gyro = block.accel_m_s2.copy(), block.gyro_rad_s.copy()
+    accel[late] += rng.normal(0, 0.3, 3)
+    gyro[late] += np.radians(rng.normal(0, 2, 3))
+    accel[late] *= 1 + rng.normal(0, 0.005, 3)
+    found = calibrate_joint([recording(replace(block, accel_m_s2=accel, gyro_rad_s=gyro))], Rig())
+    error = found.j2s_m - run.j2s_m
+    assert error @ np.linalg.solve(found.covariance_m2, error) < 9.0
+    assert found.residual_m_s2 > LARGE_RESIDUAL_M_S2  # which the command names
 
 
 def test_a_sensor_on_no_joint_is_refused():
