@@ -54,6 +54,8 @@ class Stream:
         self.report = report
         self.method, self.options, self.beacons = method, options, beacons
         self.settings = options.settings(options.estimate or ())
+        # A filter under way has no states for the constants of the water.
+        self._free = tuple(name for name in options.free if name not in ("current", "sound"))
         self.run: Localizer | None = None
         self.last: Row | None = None
         self.late = self.negative = 0
@@ -127,7 +129,7 @@ class Stream:
         """The measurements of the lines."""
         ended = _Ended()
         try:
-            for event in stream_events(ended.watch(lines), Path("-")):
+            for event in stream_events(ended.watch(lines), Path(ORIGIN)):
                 if event.beacon and event.beacon not in self.beacons:
                     raise LinkposeError(f"{ORIGIN} line {event.line}: beacon {event.beacon} is not in the beacon file")
                 if is_negative(event):
@@ -157,7 +159,7 @@ class Stream:
             return
         self._sightings += 1
         if self._sightings in TUNED_AFTER:
-            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self.options.free)
+            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self._free)
         elif self._tuning is not None and self._sightings in [int(USED_AFTER * after) for after in TUNED_AFTER]:
             tuned = self._tuning.result()
             run.use(tuned)
