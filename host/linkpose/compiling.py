@@ -119,7 +119,7 @@ def _folder_name(package: Path) -> str:
 def _roots(package: Path) -> Iterator[Path]:
     if _config.CACHE_DIR:
         yield Path(_config.CACHE_DIR)
-    with contextlib.suppress(RuntimeError):  # nobody's home
+    with contextlib.suppress(RuntimeError):  # the user has no home directory
         yield _user_cache()
     yield package / "__pycache__"
 
@@ -153,14 +153,14 @@ def _make(folder: Path) -> None:
 
 
 def _is_private(entry: os.stat_result) -> bool:
-    """Whether a file or folder belongs to this user and nobody else can write it; Windows keeps its own lists."""
+    """Whether a file or folder belongs to this user and no other user can write it; Windows keeps its own lists."""
     if not hasattr(os, "geteuid"):
         return True
     return entry.st_uid == os.geteuid() and not entry.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _is_as_safe(entry: os.stat_result, package: Path) -> bool:
-    """Whether whoever can write a file or folder can write the package's sources as well.
+    """Whether only users who can write the package's sources can write a file or folder.
 
     It belongs to their owner or to this user, and its group and others may write it only if they may write the sources:
     with umask 002, pip makes both writable by the group.

@@ -86,7 +86,7 @@ class CannotWrite(FileError):
 
 
 class FileChanged(CannotWrite):
-    """Another program removed, replaced, cut or wrote into a file while it was being written. `reason` says which."""
+    """Another program removed, replaced, truncated or changed a file during writing. `reason` states which."""
 
 
 class MissingLibrary(LinkposeError):
@@ -192,7 +192,7 @@ def describe_ports(ports: Sequence[Any]) -> str:
 
 
 class BoardError(LinkposeError):
-    """The board does not do what it should: it refuses a command, is silent, or is another one."""
+    """The board refuses a command, is silent, or is a different board."""
 
 
 class NoFirmware(BoardError):
@@ -237,7 +237,7 @@ class MissingJ2S(CannotRun):
 
 
 class UncertainJ2S(CannotRun):
-    """The filter needs a J2S that is known; the rig's is a first guess. `estimators` estimate it."""
+    """The filter requires a known J2S; the rig's is only an initial value. `estimators` estimate it."""
 
     def __init__(self, name: str, estimators: Sequence[str]) -> None:
         super().__init__(f"{name} needs a J2S that is known; {', '.join(estimators)} is the filter that estimates it")
@@ -278,7 +278,7 @@ class NoMagnetometer(CannotRun):
 
 
 class FilterCannotRun(LinkposeError):
-    """A filter that was asked for cannot run. `filter` is its name, `reason` the error that explains it."""
+    """A filter that was named cannot run. `filter` is its name, `reason` the error that explains it."""
 
     def __init__(self, name: str, reason: CannotRun) -> None:
         super().__init__(f"the filter {name} cannot run: {reason}")
@@ -330,6 +330,15 @@ class MissingStart(LinkposeError):
 
     def __init__(self) -> None:
         super().__init__("the log does not state where the robot starts")
+
+
+class AmbiguousStart(LinkposeError):
+    """The beacons are near one line, and the log fits two starts on its two sides; `places` are their x and y (m)."""
+
+    def __init__(self, *places: tuple[float, float]) -> None:
+        words = " and ".join(f"({x:.1f}, {y:.1f})" for x, y in places)
+        super().__init__(f"the beacons are near one line, and the first ranges fit a start at {words} m")
+        self.places = places
 
 
 class NothingToEstimate(LinkposeError):

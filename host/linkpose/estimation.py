@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -16,14 +15,13 @@ import numpy as np
 
 from linkpose import filters, quantities
 from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns, NoMagnetometer
-from linkpose.precompile import TEXT
+from linkpose.exclusions import ExcludedMice
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, RecordingFile, load_recording
 from linkpose.recording.units import suspicions
 from linkpose.sensors.conversion import TIME_DECIMALS, BoardSettings
 from linkpose.sensors.devices import Sensors, found
-from linkpose.sensors.health import LEFT_OUT
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import CHAIN_JOINTS, LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig, to_vector
 
@@ -63,59 +61,11 @@ class FoundJ2s(NamedTuple):
         return FoundJ2s(mean_m, np.sqrt(np.diag(covariance_m2)), float(np.sqrt(values[-1])), axis)
 
 
-_LONGEST_STEP_S = 0.1  # the longest time that one sample counts for, where others were lost
-
-
-class ExcludedMice:
-    """The mice whose valid counts a filter excluded.
-
-    For each: samples, time of the first one and total time (s), and whether it is excluded at the last sample.
-    """
-
-    def __init__(self, estimator_columns: Sequence[str]) -> None:
-        self._columns = [
-            at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
-        ]
-        self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
-        self.first_s: dict[str, float] = {}
-        self.total_s: dict[str, float] = {}
-        self.now: set[str] = set()
-        self._last_s = math.nan
-
-    def count(self, block: Measurements, estimates: Floats) -> None:
-        """Count the exclusions in the estimates (N, columns) of a block of N samples."""
-        if not self._columns or not len(block):
-            return
-        last_s, self._last_s = self._last_s, float(block.time_s[-1])
-        masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
-        self.now = set()
-        if not masks.any():
-            return
-        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=last_s)), 0.0, _LONGEST_STEP_S)
-        valid = np.isfinite(block.mice_counts).all(axis=2)
-        excluded = valid & (masks[:, None] >> np.arange(valid.shape[1]) & 1 != 0)
-        for port in np.flatnonzero(excluded.any(axis=0)).tolist():
-            name = f"mouse{port + 1}"
-            self.samples[name] = self.samples.get(name, 0) + int(excluded[:, port].sum())
-            self.total_s[name] = self.total_s.get(name, 0.0) + float(step_s[excluded[:, port]].sum())
-            self.first_s.setdefault(name, float(block.time_s[np.argmax(excluded[:, port])]))
-            if excluded[-1, port]:
-                self.now.add(name)
-
-    def added_to(self, sensors: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        """Health of sensors with the number of excluded samples; the state is "left out" while a mouse is excluded."""
-        merged = dict(sensors)
-        for name, samples in self.samples.items():
-            if name in merged:
-                of = merged[name] | {"left_out": merged[name].get("left_out", 0) + samples}
-                merged[name] = of | {"state": LEFT_OUT} if name in self.now and of["state"] == "ok" else of
-        return merged
-
-
-# Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Twice of it changes nothing
+# Samples: a filter takes about 1 ms for them, ten times as long as a thread needs to start. Doubling it changes nothing
 # that can be measured.
 _LONG_BLOCK = 1000
-# A scale of the mice is reported beyond so many standard deviations, and beyond what the gyro's scale may be off.
+# A scale of the mice is reported if it differs from 1 by more than this many standard deviations, and by more than the
+# gyro's scale error.
 _SCALE_Z, _SCALE_LEAST = 3.0, 0.01
 
 
@@ -177,7 +127,7 @@ class Estimator:
         return self._rig
 
     def smooth(self) -> None:
-        """Puts a smoother in the place of each filter that has one: from here on, `process` takes a whole recording.
+        """Replaces each filter that has a smoother by it. `process` then requires a whole recording.
 
         Raises LinkposeError where none of the filters has one.
         """
@@ -189,9 +139,9 @@ class Estimator:
         self.filters = [filters.create_smoother(f.name, self._rig) if f.name in smoothable else f for f in self.filters]
 
     def hold_heading(self, port: str | None = None) -> None:
-        """Lets the magnetometer hold the yaw of each filter that estimates one; after `smooth`, before `process`.
+        """Corrects the yaw of all filters with the magnetometer. Call it after `smooth` and before `process`.
 
-        `port` is that of the board whose stream is estimated; None for a recording.
+        `port` is the port of the board; None for a recording.
         Raises NoMagnetometer, UncalibratedMagnetometer, and CannotRun where no filter estimates a yaw.
         """
         from linkpose.filters.magnetic_heading import MagneticHeading, has_yaw
@@ -205,7 +155,7 @@ class Estimator:
 
     @property
     def magnetic_field(self) -> FieldRecord | None:
-        """What the first filter that the magnetometer holds has found of the field; None without any."""
+        """The magnetic field as recorded by the first filter that uses it; None if no filter does."""
         from linkpose.filters.magnetic_heading import MagneticHeading
 
         return next((f.found for f in self.filters if isinstance(f, MagneticHeading)), None)
@@ -223,13 +173,13 @@ class Estimator:
         else:
             with ThreadPoolExecutor(workers) as pool:
                 parts = list(pool.map(lambda f: f.process(block), self.filters))
-        estimates = _side_by_side(block.time_s, parts)
+        estimates = side_by_side(block.time_s, parts)
         self.excluded.count(block, estimates)
         return estimates
 
     @property
     def found_j2s(self) -> FoundJ2s | None:
-        """J2S as the filters have found it so far; None where it was known, or where none of them looks for it."""
+        """J2S as estimated so far; None where it was known, or where no filter estimates it."""
         if self._rig.joint.known_j2s_m is not None:
             return None
         for f in self.filters:
@@ -283,7 +233,7 @@ class Estimator:
 
     @property
     def mice_remarks(self) -> list[str]:
-        """What the mice did wrong together, by the first filter that compares them with the gyro."""
+        """Faults that all mice share, by the first filter that compares them with the gyro."""
         for f in self.filters:
             if isinstance(f, filters.RemarksOnMice):
                 return f.mice_remarks
@@ -323,86 +273,6 @@ class Estimator:
         ]
 
 
-class LiveRows(NamedTuple):
-    """What a live run shows and writes after a block."""
-
-    complete: Floats  # (N, columns) rows that all filters have processed, in order, each one once
-    newest: Floats  # (columns,) of the last sample, NaN for filters that are not ready; empty after an empty block
-    caught_up: Floats  # (M, columns) all rows so far if a filter has just caught up with them; otherwise M = 0
-
-
-class LiveEstimator:
-    """An estimator whose filters may become ready while measurements arrive already.
-
-    A filter that is not ready yet catches up from the buffered measurements, so every estimate is the same, to the last
-    digit, as if all filters had run from the first sample on. Rows are complete when all filters have processed them.
-    """
-
-    def __init__(self, estimator: Estimator, is_ready: Callable[[str], bool]) -> None:
-        """`is_ready(name)` is True once that filter (or precompile.TEXT) is compiled, and stays True."""
-        self._estimator, self._filters = estimator, estimator.filters
-        self._width = [len(f.columns) for f in estimator.filters]
-        self._is_ready = is_ready
-        self._blocks: list[Measurements] = []  # not yet processed by all filters
-        self._results: list[list[Floats]] = [[] for _ in self._filters]  # of these blocks, filter by filter
-
-    def process(self, block: Measurements) -> LiveRows:
-        """Takes the next block, which may be empty."""
-        if len(block) and not self._blocks and self._are_all_ready():
-            rows = self._estimator.process(block)
-            return LiveRows(rows, rows[-1], rows[:0])
-        if len(block):
-            self._blocks.append(block)
-        has_caught_up = False
-        for f, results in zip(self._filters, self._results, strict=True):
-            waiting = self._blocks[len(results) :]
-            if waiting and self._is_ready(f.name):
-                has_caught_up |= len(waiting) > 1
-                results.extend(f.process(each) for each in waiting)
-        caught_up = self._rows(0, len(self._blocks) if has_caught_up else 0)
-        complete = self._take_complete()
-        last = self._rows(len(self._blocks) - 1, len(self._blocks)) if self._blocks else complete
-        return LiveRows(complete, last[-1] if len(block) else np.empty(0), caught_up)
-
-    def _are_all_ready(self) -> bool:
-        return self._is_ready(TEXT) and all(self._is_ready(f.name) for f in self._filters)
-
-    def finish(self) -> Floats:
-        """The rows that were not complete yet. All filters must be ready, or are compiled now."""
-        self._is_ready = lambda _: True
-        return self.process(Measurements.from_imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)))).complete
-
-    def _take_complete(self) -> Floats:
-        """The rows that all filters have processed; they are kept no longer."""
-        count = min((len(results) for results in self._results), default=0)
-        if not count or not self._is_ready(TEXT):
-            return self._rows(0, 0)
-        rows, first = self._rows(0, count), 0
-        for block in self._blocks[:count]:
-            self._estimator.excluded.count(block, rows[first : first + len(block)])
-            first += len(block)
-        del self._blocks[:count]
-        for results in self._results:
-            del results[:count]
-        return rows
-
-    def _rows(self, start: int, end: int) -> Floats:
-        """Rows (N, columns) of the blocks from `start` to `end`, with NaN for filters that have not processed them."""
-        rows = [
-            _side_by_side(
-                block.time_s,
-                [
-                    results[at] if at < len(results) else np.full((len(block), width), np.nan)
-                    for width, results in zip(self._width, self._results, strict=True)
-                ],
-            )
-            for at, block in enumerate(self._blocks[start:end], start)
-        ]
-        if len(rows) == 1:
-            return rows[0]
-        return np.concatenate(rows) if rows else np.empty((0, 1 + sum(self._width)))
-
-
 class EstimateWriter(CsvFile):
     """An estimate CSV under way. Raises LinkposeError as `CsvFile` does."""
 
@@ -439,18 +309,30 @@ class Estimates:
 
     `estimates["joint_inertial_height_m"]` and `estimates.joint_inertial.height_m` are the same column, (N,) float64.
     NaN means that the value is not known. Each quantity has its standard deviation beside it (`height_std_m`).
+
+    Attributes:
+        columns: names of the columns: time_s, then <filter>_<quantity>_<unit>.
+        values: (N, len(columns)), all columns.
+        filters: names of the filters that ran, the most accurate one first.
+        rejected: number of samples that each filter could not use.
+        left_out: for each filter that did not run, the error that explains why.
+        excluded_mice: for "mouse1", ..., the number of valid samples that a filter excluded.
+        found_j2s: the estimated J2S (m) and its standard deviation; None if J2S was known.
+        magnetic_field: what was found of the magnetic field; None without `mag`.
+        rig: sensor placement and calibration in force.
+        remarks: faults of the measurements, one sentence each.
     """
 
-    columns: tuple[str, ...]  # time_s, then <filter>_<quantity>_<unit>
-    values: Floats  # (N, len(columns))
-    filters: tuple[str, ...]  # that ran, best first
-    rejected: dict[str, int]  # filter -> samples that it could not use
-    left_out: dict[str, CannotRun]  # filter -> why it did not run
-    excluded_mice: dict[str, int]  # "mouse1", ... -> samples whose valid counts a filter excluded
-    found_j2s: FoundJ2s | None  # J2S where it was to be estimated
-    magnetic_field: FieldRecord | None  # where the magnetometer held the yaw
-    rig: Rig  # that was in force
-    remarks: tuple[str, ...] = ()  # what is wrong with the measurements
+    columns: tuple[str, ...]
+    values: Floats
+    filters: tuple[str, ...]
+    rejected: dict[str, int]
+    left_out: dict[str, CannotRun]
+    excluded_mice: dict[str, int]
+    found_j2s: FoundJ2s | None
+    magnetic_field: FieldRecord | None
+    rig: Rig
+    remarks: tuple[str, ...] = ()
 
     @property
     def time_s(self) -> Floats:
@@ -605,7 +487,7 @@ def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | N
     return Joint(to_vector(vector), j2s_std_m)
 
 
-def _side_by_side(time_s: Floats, parts: Sequence[Floats]) -> Floats:
+def side_by_side(time_s: Floats, parts: Sequence[Floats]) -> Floats:
     """Times (N,) and the columns (N, K) of each filter as one table."""
     return np.concatenate([time_s[:, None], *parts], axis=1)
 

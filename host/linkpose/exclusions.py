@@ -1,16 +1,18 @@
-"""The mice that filters leave out, as live views show them."""
+"""The mice that filters leave out: their counts for the summary of a run, and their times for live views."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from linkpose import quantities
+from linkpose.sensors.health import LEFT_OUT
 
 if TYPE_CHECKING:
-    from linkpose.sensors.measurements import Floats
+    from linkpose.sensors.measurements import Floats, Measurements
 
 
 class Exclusions:
@@ -46,3 +48,52 @@ class Exclusions:
         return [
             f"mouse {mouse} LEFT OUT since {since:.1f} s (disagrees)" for mouse, since in sorted(self._since_s.items())
         ]
+
+
+_LONGEST_STEP_S = 0.1  # the longest time that one sample counts for, where others were lost
+
+
+class ExcludedMice:
+    """The mice whose valid counts a filter excluded.
+
+    For each: samples, time of the first one and total time (s), and whether it is excluded at the last sample.
+    """
+
+    def __init__(self, estimator_columns: Sequence[str]) -> None:
+        self._columns = [
+            at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
+        ]
+        self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
+        self.first_s: dict[str, float] = {}
+        self.total_s: dict[str, float] = {}
+        self.now: set[str] = set()
+        self._last_s = math.nan
+
+    def count(self, block: Measurements, estimates: Floats) -> None:
+        """Count the exclusions in the estimates (N, columns) of a block of N samples."""
+        if not self._columns or not len(block):
+            return
+        last_s, self._last_s = self._last_s, float(block.time_s[-1])
+        masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
+        self.now = set()
+        if not masks.any():
+            return
+        step_s = np.clip(np.nan_to_num(np.diff(block.time_s, prepend=last_s)), 0.0, _LONGEST_STEP_S)
+        valid = np.isfinite(block.mice_counts).all(axis=2)
+        excluded = valid & (masks[:, None] >> np.arange(valid.shape[1]) & 1 != 0)
+        for port in np.flatnonzero(excluded.any(axis=0)).tolist():
+            name = f"mouse{port + 1}"
+            self.samples[name] = self.samples.get(name, 0) + int(excluded[:, port].sum())
+            self.total_s[name] = self.total_s.get(name, 0.0) + float(step_s[excluded[:, port]].sum())
+            self.first_s.setdefault(name, float(block.time_s[np.argmax(excluded[:, port])]))
+            if excluded[-1, port]:
+                self.now.add(name)
+
+    def added_to(self, sensors: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Health of sensors with the number of excluded samples; the state is "left out" while a mouse is excluded."""
+        merged = dict(sensors)
+        for name, samples in self.samples.items():
+            if name in merged:
+                of = merged[name] | {"left_out": merged[name].get("left_out", 0) + samples}
+                merged[name] = of | {"state": LEFT_OUT} if name in self.now and of["state"] == "ok" else of
+        return merged

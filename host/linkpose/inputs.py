@@ -13,10 +13,10 @@ from typing import Any, BinaryIO
 
 from linkpose.errors import CannotRead
 
-# A program that writes into a named pipe must start within this time. Twice of it: a forgotten pipe is reported later.
+# A program that writes into a named pipe must start within this time. Doubled, a forgotten pipe is reported later.
 PIPE_WAIT_S = 3.0
 # What is read as a whole: a pipe, and files of kinds that are small or cannot be read in parts. Reading takes several
-# times as much memory; twice of it takes more than 1 GB.
+# times as much memory; doubled, it takes more than 1 GB.
 MOST_BYTES = 200_000_000
 _POLL_S = 0.02
 _READ_SIZE = 1 << 20

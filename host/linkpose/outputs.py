@@ -108,7 +108,10 @@ def check_unchanged(fd: int, path: Path) -> None:
 
     A pipe or a device has no size, and other programs may write what is behind the standard output.
     """
-    of = os.fstat(fd)
+    try:
+        of = os.fstat(fd)
+    except OSError:  # a network folder is gone: the next write reports it
+        return
     if path == STDOUT or not stat.S_ISREG(of.st_mode):
         return
     if of.st_nlink == 0:

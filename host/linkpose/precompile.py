@@ -109,7 +109,7 @@ def _needs_second_sensor(name: str) -> bool:
 
 
 def prepare(names: Sequence[str], report: Callable[[str], object]) -> None:
-    """Returns when the filters, or methods of localisation, are compiled. Does nothing where all are.
+    """Returns when the filters, or methods of localization, are compiled. Does nothing where all are.
 
     `report` receives lines such as "Compiling filters (first run only) 3/6 joint-inertial".
     """
@@ -123,7 +123,7 @@ def prepare(names: Sequence[str], report: Callable[[str], object]) -> None:
 
 
 def compile_here(name: str) -> None:
-    """Compiles a filter, a method of localisation, TEXT, NOISES or FILES in this process, and marks it as stored."""
+    """Compiles a filter, a method of localization, TEXT, NOISES or FILES in this process, and marks it as stored."""
     _run_once(name)
     compiling.mark_compiled(name)
 

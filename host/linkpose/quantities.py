@@ -19,7 +19,7 @@ _TO_DEGREES = math.degrees(1.0)
 
 
 class Shown(NamedTuple):
-    """How a value is presented: `scale` times the stored value is in `unit`, with so many decimals."""
+    """How a value is presented: `scale` times the stored value is in `unit`, with `decimals` decimals."""
 
     unit: str
     scale: float = 1.0
@@ -28,7 +28,7 @@ class Shown(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """One quantity: its column, and how a person and a score see it."""
+    """One quantity: its column, how it is shown, and how it is scored."""
 
     name: str  # without unit: height
     unit: str  # as columns write it: m, m_s, rad_s; "" of a number without unit

@@ -21,7 +21,7 @@ from linkpose.sensors.rig import Rig
 
 
 class Recorder:
-    """Converts a session's samples to measurements, and writes them to a recording if one is asked for.
+    """Converts a session's samples to measurements, and writes them to a recording if one is requested.
 
     A context manager: leaving it without `close` marks the recording as ended by a failure.
     """
@@ -49,7 +49,7 @@ class Recorder:
             self._writer = RecordingWriter(path, head, layout_of(settings, mouse_ports), force, plain)
 
     def convert(self, placements: list[Placement]) -> Measurements:
-        """The samples as a block of measurements, with NaN for readings that are worth nothing.
+        """The samples as a block of measurements, with NaN for invalid readings.
 
         The recording keeps all readings as they came. Its rows are with the operating system when this returns.
         """
@@ -137,7 +137,7 @@ class _RawCapture(io.FileIO):
 
 @contextlib.contextmanager
 def raw_capture(path: Path | None, force: bool = False) -> Iterator[BinaryIO | None]:
-    """A new unbuffered file for every received byte, or None where no file is asked for.
+    """A new unbuffered file for every received byte, or None without a path.
 
     Raises FileExists (unless `force`) and CannotWrite.
     """

@@ -1,4 +1,4 @@
-"""Speed of the localisation filters against filterpy's UKF with the same models in NumPy.
+"""Speed of the localization filters against filterpy's UKF with the same models in NumPy.
 
     python tests/bench/localization.py [--json]
 

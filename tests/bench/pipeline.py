@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from _report import Row, report
 
-from linkpose.estimation import EstimateWriter, Estimator, LiveEstimator
+from linkpose.estimation import EstimateWriter, Estimator
+from linkpose.live_estimation import LiveEstimator
 from linkpose.recording.writer import RecordingWriter, layout_of, metadata
 from linkpose.sensors.conversion import BoardSettings, Converter
 from linkpose.sensors.devices import found

@@ -4,7 +4,7 @@
 
 FOLDER (../shared/data beside the checkout) holds plaza, mrclam, uwb_labyrinth, uwb_tag, auv_lbl, laser_maps and wean. A
 recording that is not there is named and left out. Each recording is run with the default options, smoothed, and with
-options from the sensors' data sheets. Beside them run filterpy's extended Kalman filter, Monte-Carlo localisation
+options from the sensors' data sheets. Beside them run filterpy's extended Kalman filter, Monte-Carlo localization
 (laser), and the batch optimum of GTSAM, which takes some minutes and is left out with --quick.
 """
 
@@ -242,7 +242,7 @@ def auv_lbl(folder: Path, out: Path) -> list[Case]:
 
 
 def laser_maps(folder: Path, out: Path) -> Iterable[dict[str, object]]:
-    """Two buildings, with the start given and without, beside Monte-Carlo localisation in the same run."""
+    """Two buildings, with the start given and without, beside Monte-Carlo localization in the same run."""
     for name in ("intel", "freiburg-101"):
         truth = folder / f"{name}.truth.csv"
         start, x, y, heading = np.loadtxt(truth, delimiter=",", skiprows=1, max_rows=1)

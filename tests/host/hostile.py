@@ -100,7 +100,7 @@ CONTENTS = {
 }
 
 
-def _socket(path: Path) -> None:
+def make_socket(path: Path) -> None:
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
 
@@ -113,7 +113,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
     "nothing": lambda path: None,
     "folder": Path.mkdir,
     "silent pipe": os.mkfifo,
-    "socket": _socket,
+    "socket": make_socket,
     "endless device": _to("/dev/zero"),
     "no terminal": _to("/dev/tty"),
     "link to nothing": _to("/nowhere/at/all"),

@@ -200,7 +200,7 @@ MORE: dict[str, dict[str, Producer]] = {
         "… line …: … needs …; complete or delete the row": events("0,odometry,1,,\n"),
         "… line …: … is not a number; correct or delete the row": events("0,odometry,fast,0,\n"),
         "… line …: the clock jumps back from … to … s; split the log at this line": events(TWICE),
-        "standard input line …: the clock jumps back from … to … s; start the stream anew": raises(
+        "standard input line …: the clock jumps back from … to … s; restart the stream": raises(
             lambda: list(Stream("ekf", LocalizationOptions(), BEACONS, print).rows([EVENTS, *TWICE.splitlines(True)]))
         ),
         "… is not a CSV file: …; give a log with the header …": events("0,odometry," + "9" * 200_000),
@@ -303,7 +303,13 @@ MORE: dict[str, dict[str, Producer]] = {
         ),
     },
     "Calibration": {
-        "there is no rest of a second or more in …: record the sensor lying still": imu(3.0, calibrate_imu),
+        "there is no rest of a second or more in …: record the sensor lying still": imu(0.0, calibrate_imu, 1.0),
+        "…: the sensor is never at rest; where it is stillest, the accelerometer varies by … m/s² and the gyro by … rad/s (1σ): lay it down, away from running motors": imu(
+            3.0, calibrate_imu
+        ),
+        "…: the longest rest lasts … s, too short: leave the sensor on each side for 3 s": imu(0.0, calibrate_imu, 1.8),
+        "…: the sensor is saturated at each rest; record with a larger range": "test_calibration_link.py::test_saturated_rests_are_left_out",
+        "the gyro reads … rad/s at rest, which no MPU-6050 does: does it turn steadily, or is the range set wrong?": "test_calibration_link.py::test_a_gyro_that_turns_at_rest_is_refused",
         "only … s show motion; swing the link for half a minute or more, in all directions": imu(
             0.0, lambda found: calibrate_joint(found, Rig())
         ),

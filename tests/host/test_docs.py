@@ -49,8 +49,8 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", pages_with_commands())
 def test_the_commands_of_a_page_run(name: str, tmp_path: Path) -> None:
-    """In one folder, in the order of the page. A simulated link stands in for the board on the port."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "LINKPOSE_PORT": "sim://link?seed=1"}
+    """In one folder, in the order of the page. A simulated link, ten times as fast, stands in for the board."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "LINKPOSE_PORT": "sim://link?seed=1&speed=10"}
     for command in commands(DOCS / name):
         if command in HARDWARE:
             assert (ROOT / HARDWARE[command]).is_file()
@@ -70,7 +70,7 @@ def test_the_commands_of_a_page_run(name: str, tmp_path: Path) -> None:
 def test_the_steps_to_other_programs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Commands and Python of the page, in its order; in one process, which imports the libraries once."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("LINKPOSE_PORT", "sim://link?seed=1")
+    monkeypatch.setenv("LINKPOSE_PORT", "sim://link?seed=1&speed=10")
     text = (DOCS / PROGRAMS).read_text(encoding="utf-8")
     steps = re.findall(r"^( *)```(console|python)\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)
     assert {language for _, language, _ in steps} == {"console", "python"}

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from linkpose.cli.cures import cure
 from linkpose.cli.evaluate import command
-from linkpose.errors import TooFewRows
+from linkpose.errors import LinkposeError, TooFewRows
 from linkpose.evaluation.scores import evaluate
 from linkpose.evaluation.statistics import Statistics
 from linkpose.recording.table import Table
@@ -204,3 +204,60 @@ def test_the_command_prints_figures_verdicts_and_rows(tmp_path):
     row = json.loads(CliRunner().invoke(command, [*files, "--json"]).stdout)
     assert {"height_rmse_cm", "height_nees", "height_within_2sigma", "time_offset_s"} <= set(row)
     assert CliRunner().invoke(command, [*files, "--from", "9", "--to", "3"]).exit_code == 2
+
+
+SWAY = 0.3 * np.sin(2 * T) + 0.1 * np.sin(0.7 * T)
+SCALED = {
+    "millimetres": ("height_m", lambda v: 1000 * v, "height_m moves like the estimate of joint in", "times 1000"),
+    "twice": ("height_m", lambda v: 2 * v, "height_m moves like", "times 2:"),
+    "radians": ("roll_deg", np.radians, "roll_deg moves like", "times 0.01745"),
+    "reversed": ("roll_deg", np.negative, "roll_deg moves like", "times -1"),
+    "centimetres, about another axis": ("x_m", lambda v: 100 * v, "x_m moves like", "times 100"),
+    "constant": ("height_m", lambda v: 0 * v + 1, "height_m is the same wherever", "check the column"),
+}
+
+
+@pytest.mark.parametrize("name", SCALED)
+def test_a_column_in_another_unit_is_named(name):
+    column, change, *words = SCALED[name]
+    yaw = np.radians(40)  # the reference counts the yaw from elsewhere
+    motion = {"height_m": SWAY, "roll_deg": 20 * SWAY, "pitch_deg": 3 * np.cos(T), "yaw_deg": 5 * np.sin(T)}
+    paths = {"x_m": SWAY, "y_m": 0.2 * np.cos(3 * T)}
+    turned = {
+        "x_m": np.cos(yaw) * paths["x_m"] - np.sin(yaw) * paths["y_m"],
+        "y_m": np.sin(yaw) * paths["x_m"] + np.cos(yaw) * paths["y_m"],
+    }
+    ours = table(**{f"joint_{key}": value + 1e-3 * NOISE for key, value in {**motion, **paths}.items()})
+    theirs = {**motion, **turned}
+    assert evaluate(ours, table("truth", **theirs)).remarks == []
+    columns = ("x_m", "y_m") if column == "x_m" else (column,)
+    theirs |= {key: change(theirs[key]) for key in columns}
+    found = " ".join(evaluate(ours, table("truth", **theirs)).remarks)
+    assert all(word in found for word in words), found
+
+
+def test_a_negative_sigma_is_refused():
+    estimate = table(joint_height_m=SWAY, joint_height_std_m=np.where(T[5] == T, -0.1, 0.1))
+    with pytest.raises(LinkposeError, match="joint_height_std_m is negative, which no standard deviation is"):
+        evaluate(estimate, table("truth", height_m=SWAY))
+
+
+DRIVE = {"vx_m_s": 0.3 + 0.2 * np.sin(T), "wz_rad_s": np.cos(0.8 * T), "heading_rad": np.sin(0.8 * T) / 0.8 + 2 * T}
+
+
+@pytest.mark.parametrize("seconds", [1, 2])
+def test_odometry_and_a_truth_with_other_times_are_named(seconds):
+    """The truth states twice the time."""
+    ours = table(**{f"mice_{name}": value + 1e-3 * NOISE for name, value in DRIVE.items()})
+    theirs = Table(Path("truth.csv"), "truth", {"time_s": seconds * T, **DRIVE}, {}, None, 2)
+    found = evaluate(ours, theirs).remarks
+    assert any("hardly any motion in common" in remark for remark in found) == (seconds == 2)
+    assert seconds == 2 or not found
+
+
+def test_a_heading_in_degrees_is_named():
+    """Headings that turn round and round."""
+    ours = table(mice_heading_rad=np.angle(np.exp(1j * DRIVE["heading_rad"])))
+    theirs = table("truth", heading_rad=np.radians(DRIVE["heading_rad"]))
+    (remark,) = evaluate(ours, theirs).remarks
+    assert "heading_rad moves like the estimate of mice" in remark and "times 0.01745" in remark

@@ -15,7 +15,8 @@ from pty_board import PtyBoard
 
 from linkpose.recording.reader import load_recording
 from linkpose.recording.table import read_table
-from linkpose.sensors.health import Cause, Change, HealthMonitor
+from linkpose.sensors.checks import Cause
+from linkpose.sensors.health import Change, HealthMonitor
 from linkpose.sensors.measurements import Measurements
 from linkpose.wire.frames import StreamDecoder, encode
 from linkpose.wire.messages import Message, Sample, SampleFlags

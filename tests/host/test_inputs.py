@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hostile import make_socket
 
 from linkpose import inputs
 from linkpose.convert import convert
@@ -40,16 +40,11 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-def _socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(path))
-
-
 NASTY: dict[str, tuple[Callable[[Path], object], str]] = {
     "silent pipe": (os.mkfifo, "it is a pipe, and no program writes into it"),
     "endless device": (lambda path: path.symlink_to("/dev/zero"), "it is a device, not a file"),
     "folder": (Path.mkdir, "Is a directory"),
-    "socket": (_socket, "No such device or address"),
+    "socket": (make_socket, "No such device or address"),
     "loop of links": (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
     "nothing": (lambda path: None, "No such file or directory"),
 }

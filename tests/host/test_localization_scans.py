@@ -154,7 +154,7 @@ def test_a_robot_that_was_carried_is_found_again(drive):
     assert track.known[-1] and abs(track.state[-1, 0] - true) < 0.2
 
 
-def test_monte_carlo_localisation_is_seeded(drive):
+def test_monte_carlo_localization_is_seeded(drive):
     run, grid = drive
     log = as_log(run.readings)
     settings = Settings(start=tuple(run.pose[0]), start_std=(0.2, 0.05), particles=300, seed=2)

@@ -111,6 +111,13 @@ FAST = [
     (scale(0.5, "accel_y"), "accel_y is 0.5 times what the motion in the other columns shows"),
     (scale(2.0, "gyro_x"), "gyro_x is 2 times what the motion in the other columns shows"),
     (scale(0.5, "gyro_y"), "multiply it by 2"),
+    (scale(0.001, "accel_y"), "accel_y is 0.001 times what the motion in the other columns shows"),
+    (scale(0.001, "gyro_z"), "gyro_z is 0.001 times what the motion in the other columns shows"),
+    (scale(180 / np.pi, "accel_y"), "more than the sensor reads: check the unit of each axis"),
+    (
+        lambda table: table.update({f"accel_{a}_m_s2": 0 * table["time_s"] + 3 for a in "xyz"}),
+        "is the same in all rows while",
+    ),
 ]
 
 
@@ -121,6 +128,7 @@ FAST = [
         "right", "°/s", "°/s slowly", "rad/s twice", "twice", "half", "backwards", "one axis", "time x 10",
         "milliseconds", "accel exchanged", "gyro exchanged", "one axis of the gyro", "one axis backwards",
         "one axis twice", "one axis half", "one axis of the gyro twice", "one axis of the gyro half",
+        "one axis in km/s²", "one axis of the gyro in krad/s", "one axis in degrees", "no accel",
     ],
 )  # fmt: skip
 def test_a_fast_swing_shows_whether_gyro_and_accelerometer_agree(change, sentence: str | None) -> None:
@@ -151,6 +159,7 @@ WRONG = [
     (scale(10.0, "time"), "multiply time_s by 0.1"),
     (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
     (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
+    (scale(0.5, "pressure"), "pressure_Pa is 50650 (median), as above 5100 m of altitude"),
     (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
 ]
 
@@ -172,6 +181,7 @@ WRONG = [
         "time",
         "mmHg",
         "hPa",
+        "half the pressure",
         "thousands",
     ],
 )
@@ -186,8 +196,9 @@ def test_a_wrong_unit_is_named(tmp_path: Path, change: Callable[[dict[str, np.nd
         (put("time_s", N - 1, np.inf), f"line {N + 3}: time_s is inf; it must be a number of seconds"),
         (put("time_s", N - 1, 1e300), f"line {N + 3}: time_s is 1e"),
         (put("baro_fresh", 10, 2.0), "line 14: baro_fresh is 2; it must be 0 or 1"),
+        (lambda table: table.update(flags=np.full(N, 0.5)), "line 4: flags must be a whole number"),
     ],
-    ids=["one stamp", "inf", "huge", "fresh"],
+    ids=["one stamp", "inf", "huge", "fresh", "flags"],
 )
 def test_an_impossible_value_is_refused_with_its_line(
     tmp_path: Path, change: Callable[[dict[str, np.ndarray]], None], sentence: str
@@ -195,6 +206,32 @@ def test_an_impossible_value_is_refused_with_its_line(
     with pytest.raises(FileFormatError) as caught:
         remarks(tmp_path, change)
     assert sentence in str(caught.value)
+
+
+IMU2 = {f"imu2_{name}": name for name in NAMES[1:7]}
+BOTH_VALID = 65_537.0
+
+
+def with_second_sensor(table: dict[str, np.ndarray], flags: np.ndarray | None = None) -> None:
+    table.update({second: table[first] for second, first in IMU2.items()})
+    if flags is not None:
+        table["flags"] = flags
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_flags_that_contradict_the_readings_are_named(tmp_path: Path, factor: float) -> None:
+    """A wrong factor in `flags` made the filters leave out all readings without a word."""
+    found = remarks(tmp_path, lambda table: with_second_sensor(table, np.full(N, factor * BOTH_VALID)))
+    for sensor in ("the IMU", "the second IMU"):
+        named = f"flags marks {sensor} as invalid in 600 rows with a reading" in found
+        assert named == (factor != 1)
+    assert found.count("If the column was changed, delete it") == (0 if factor == 1 else 2)
+
+
+def test_without_flags_every_reading_is_valid(tmp_path: Path) -> None:
+    """Those of the second sensor, too: chains were blank without the column."""
+    assert remarks(tmp_path, with_second_sensor) == ""
+    assert (load_recording(tmp_path / "r.csv").measurements.flags == BOTH_VALID).all()
 
 
 @pytest.mark.parametrize("pressure", [500.0, 200_000.0])
@@ -218,6 +255,7 @@ def test_each_remark_of_the_documentation_is_produced(tmp_path: Path) -> None:
     shown = re.findall(r"^\| `([^`]+)` \|", page.split("\n## Remarks on recordings")[1].split("\n## ")[0], re.MULTILINE)
     found = "\n".join(remarks(tmp_path, change) for change, _ in [*WRONG, (scale(1000.0, "time"), "")])
     found += "\n".join(fast_remarks(change) for change, _ in FAST)
+    found += "\n" + remarks(tmp_path, lambda table: with_second_sensor(table, np.full(N, 2 * BOTH_VALID)))
     assert len(shown) > 10
     for remark in shown:
         assert re.search(".*".join(map(re.escape, remark.split("…"))), found), remark

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,8 @@ import numpy as np
 import pytest
 
 from linkpose import outputs
-from linkpose.errors import CannotWrite, FileExists
+from linkpose.cli import options
+from linkpose.errors import CannotWrite, FileChanged, FileError, FileExists
 from linkpose.outputs import create, new_file, replace_file
 from linkpose.recording.csvfile import CsvFile
 from linkpose.sensors.rig import Rig
@@ -137,6 +139,47 @@ def test_what_a_network_file_system_reports_at_the_end_is_reported(
     with monkeypatch.context() as patch, pytest.raises(CannotWrite, match=os.strerror(code)):
         patch.setattr(os, call, fail)
         file.close({})
+
+
+def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path: Path) -> None:
+    """The file has no folder to go on in. The closing line failed with "Bad file descriptor" before."""
+    (folder := tmp_path / "run").mkdir()
+    file = CsvFile(folder / "a.csv", "recording", {}, ["time_s"], force=False)
+    shutil.rmtree(folder)
+    with pytest.raises(FileChanged, match="it was removed"):
+        file.write("1\n")
+    with pytest.raises(CannotWrite, match=r"a-2\.csv: No such file"):
+        file.continue_elsewhere()
+    with pytest.raises(FileChanged, match="it was removed"):
+        file.close({})
+
+
+def test_a_check_that_fails_does_not_end_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network folder for a moment: what the operating system cannot tell about a file is no reason to stop."""
+
+    def fail(*_: object) -> None:
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+    file = CsvFile(tmp_path / "a.csv", "recording", {}, ["time_s"], force=False)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fstat", fail)
+        file.write("1\n")
+        patch.setattr(os, "write", fail)
+        with pytest.raises(FileError, match=r"cannot write to .*a\.csv any more: Stale file handle"):
+            file.write("2\n")
+    file.close({})
+    assert (tmp_path / "a.csv").read_text().splitlines()[2:] == ["time_s", "1", "# {}"]
+
+
+@pytest.mark.parametrize("error", [errno.EACCES, errno.ESTALE])
+def test_a_name_that_cannot_be_looked_up_is_proposed(monkeypatch: pytest.MonkeyPatch, error: int) -> None:
+    """The proposal of the next command ended a good recording with an error."""
+
+    def fail(*_args: object, **_options: object) -> None:
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(os, "stat", fail)
+    assert options.new_file("estimate.csv") == Path("estimate.csv")
 
 
 def test_what_cannot_be_synchronised_ends_well(tmp_path: Path) -> None:

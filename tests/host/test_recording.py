@@ -222,7 +222,7 @@ BAD_FILES = {
     ),
     "flags out of range": (
         lambda lines: [*lines[:5], lines[5].rpartition(",")[0] + ",-1\n", *lines[6:]],
-        "line 6: flags must be a number from 0 to 4294967295",
+        "line 6: flags must be a whole number from 0 to 4294967295",
     ),
     "an unknown rig key": (
         lambda lines: swap(lines, 1, '"j2s_m"', '"j2s_mm"'),

@@ -17,13 +17,13 @@ LEVELS = [
     {"lean_compiler", "rotations"},
     {"errors", "compiling", "quantities"},
     {"inputs", "outputs"},
-    {"wire", "presentation", "extremes", "exclusions"},
+    {"wire", "presentation", "extremes"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},
-    {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert"},
+    {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert", "exclusions"},
     {"board"},
     {"estimation"},
-    {"experiments", "plotting", "streams"},
+    {"live_estimation", "experiments", "plotting", "streams"},
     {"page"},
     {"cli"},
 ]
@@ -107,10 +107,20 @@ def test_imports_point_downwards() -> None:
     assert not upward
 
 
+def parts() -> set[str]:
+    found = {path.name.removesuffix(".py") for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    return found - {"__init__", "__main__", "__pycache__", "_firmware", "_docs"}
+
+
 def test_every_part_has_its_level() -> None:
-    parts = {path.name.removesuffix(".py") for path in PACKAGE.iterdir() if path.suffix == ".py" or path.is_dir()}
-    parts -= {"__init__", "__main__", "__pycache__", "_firmware", "_docs", "py.typed"}
-    assert parts <= set().union(*LEVELS)
+    assert parts() == set().union(*LEVELS)
+
+
+def test_the_architecture_page_describes_every_part() -> None:
+    page = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = page.split("## Packages")[1].split("## ")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert {name for row in rows for name in re.findall(r"`(\w+)`", row)} == parts()
 
 
 def test_gravity_and_the_number_of_mouse_ports_stand_in_one_place() -> None:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from linkpose.cli import group
 from linkpose.device.clock import DeviceClock
 from linkpose.recording.reader import load_recording
 from linkpose.sensors.conversion import GAP_BEFORE
@@ -181,3 +186,21 @@ def test_live_and_replay_place_samples_alike_where_the_board_clock_jumps(tmp_pat
     live = [timeline.place(each, clock, 0.0).time_s for each in samples]
     assert replayed.measurements.time_s == pytest.approx(live, abs=1e-6)
     assert any("clock jumped 2 times" in remark for remark in replayed.remarks)
+
+
+@pytest.mark.parametrize("words", ["record", "estimate --live --filter tilt"])
+def test_the_date_that_is_set_meanwhile_changes_no_time(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The host's clock goes to and fro by a day at each look at it."""
+    days = itertools.cycle((0, 86_400, -86_400))
+    now = time.time
+    monkeypatch.setattr(time, "time", lambda: now() + next(days))
+    out = tmp_path / "out.csv"
+    typed = [*words.split(), "--port", "sim://link?speed=20", "--duration", "3", "-o", str(out)]
+    if words == "record":
+        typed[-2:] = [str(out)]
+    done = CliRunner().invoke(group, typed, catch_exceptions=False)
+    assert done.exit_code == 0 and "300 samples" in done.stderr and "0 lost" in done.stderr
+    rows = np.genfromtxt(out, delimiter=",", comments="#", skip_header=3)
+    assert np.abs(np.diff(rows[:, 0]) - 0.01).max() < 1e-3

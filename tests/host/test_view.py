@@ -21,8 +21,9 @@ from linkpose.cli.curve import Canvas, curve, path_map, time_axis
 from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen, final_table
-from linkpose.estimation import Estimator, LiveEstimator
+from linkpose.estimation import Estimator
 from linkpose.extremes import Extremes
+from linkpose.live_estimation import LiveEstimator
 from linkpose.presentation import Row, aligned_length, angle_with_std, length_with_std, same_digits
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Floats

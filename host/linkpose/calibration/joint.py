@@ -78,11 +78,12 @@ _GROUPS = (
     (np.concatenate([ACCEL_MATRIX + _OFF_DIAGONAL, GYRO_MATRIX + _OFF_DIAGONAL]), 0.02),
 )
 _ACCEL_SCALES = _GROUPS[0][0]
+_FEWEST_BLOCKS = 4  # into which the recording is cut to measure how far residuals are correlated
 _FREE_PASSES = 2  # before the residuals are small enough to measure their correlation
 # Largest changes of a calibrated sensor's gyro bias (rad/s), accelerometer offset (m/s²) and scale.
 _AS_CALIBRATED = (0.01, 0.15, 0.01)
 _FIRST_STD = 0.01
-_USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, worth so many members
+_USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, weighted as this many members
 
 
 SENSOR_ERRORS = (
@@ -254,7 +255,8 @@ def _refuse_impossible(found: JointCalibration) -> None:
     if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
         raise LinkposeError(
             f"the fit needs an accelerometer with an offset of {np.round(offset, 2)} m/s² and a scale of "
-            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, and the range set right?"
+            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, the sensor firmly on the link, and the "
+            "range right?"
         )
 
 
@@ -272,7 +274,7 @@ def _fit(parts: Sequence[Stretch]) -> tuple[Floats, Floats, float]:
         sums = _normal_equations([equations(p, unknowns) for part in parts for p in pieces(part, longest_s)], scale)
         normal, prior = sums.normals.sum(axis=0), _prior(spread)
         first = number < _FREE_PASSES
-        worth = 1.0 if first else correlation(sums, normal + worth * np.diag(prior))
+        worth = 1.0 if first else correlation(sums, normal + worth * np.diag(prior), _FEWEST_BLOCKS)
         # The readings' density: without it, a fit could reduce its residuals by shrinking the readings.
         volume = np.zeros(UNKNOWNS)
         volume[_ACCEL_SCALES] = sums.equations / (1 - unknowns[_ACCEL_SCALES])

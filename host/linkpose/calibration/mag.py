@@ -44,9 +44,9 @@ _LARGEST_STD_UT = 2.0  # of the hard iron
 # directions in one plane makes it 10 and more. Doubled, two planes a few degrees apart pass.
 _MOST_STRETCH = 3.0
 _FEWEST = 100  # readings
-# A reading is left out if its magnitude differs from the median by more than so many median absolute deviations and by
-# more than twice the strongest field of the earth, by which hard iron alone can change it. Doubled, spikes of a field
-# of 300 µT stay, and the algebraic fit fails.
+# A reading is left out if its magnitude differs from the median by more than this many median absolute deviations
+# and by more than twice the strongest field of the earth, by which hard iron alone can change it. Doubled, spikes of a
+# field of 300 µT stay, and the algebraic fit fails.
 _OUTLIER_DEVIATIONS = 10.0
 _OUTLIER_UT = 2 * MOST_FIELD_UT
 # Median distance of the readings from their middle. A third of all attitudes makes it 15 µT at 25 µT, noise at rest

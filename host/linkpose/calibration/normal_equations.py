@@ -34,13 +34,24 @@ def in_blocks(jacobian: Floats, weight: Floats, residual: Floats, duration_s: fl
         yield np.einsum("n,nip,niq->pq", w, j, j), -np.einsum("n,nip,ni->p", w, j, residual[rows])
 
 
-def correlation(sums: Sums, information: Floats) -> float:
+def correlation(sums: Sums, information: Floats, fewest: int | None = None) -> float:
     """Variance of the blocks' gradients over the variance with independent residuals; 1 or more.
 
     Σ sᵀ N⁻¹ s over the blocks' gradients s, over its expectation: a block's normal matrix less its share in the fit.
+    Residuals may be correlated for longer than a block, as after a step of a bias. The largest ratio counts, with
+    neighbours merged in pairs until `fewest` blocks or less remain; None: with the blocks as they are.
     """
-    inverse = np.linalg.inv(information)
-    measured = np.einsum("bp,pq,bq->", sums.gradients, inverse, sums.gradients)
-    shares = inverse @ sums.normals
-    expected = np.einsum("bpp->", shares) - np.einsum("bpq,bqp->", shares, shares)
-    return max(1.0, float(measured / expected))
+    inverse, normals, gradients, largest = np.linalg.inv(information), sums.normals, sums.gradients, 1.0
+    while True:
+        measured = np.einsum("bp,pq,bq->", gradients, inverse, gradients)
+        shares = inverse @ normals
+        expected = np.einsum("bpp->", shares) - np.einsum("bpq,bqp->", shares, shares)
+        largest = max(largest, float(measured / expected))
+        if fewest is None or len(normals) <= fewest:
+            return largest
+        normals, gradients = _merged(normals), _merged(gradients)
+
+
+def _merged(values: Floats) -> Floats:
+    """Sums of neighbours; the last of an odd number stays alone."""
+    return np.add.reduceat(values, np.arange(0, len(values), 2), axis=0)

@@ -116,7 +116,7 @@ def _run() -> int:
 
 
 def _of_the_system(error: Exception) -> str:
-    """What the operating system lacks, for errors of which no part of the program knows more; empty for others."""
+    """What the operating system lacks, for errors that no part of the program explains; empty for others."""
     if isinstance(error, MemoryError):
         return "the memory does not suffice; close other programs, or take a shorter file"
     if not isinstance(error, OSError) or error.strerror is None:

@@ -27,7 +27,7 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
     Lay the sensor on each of its six sides in turn, for some seconds each, in one recording or several. Fewer attitudes
     are enough for the gyro's bias and the noise. `linkpose simulate link --rests` simulates such a recording.
     """
-    from linkpose.calibration.imu import FEWEST_ATTITUDES, calibrate_imu, with_calibration
+    from linkpose.calibration.imu import calibrate_imu, with_calibration
 
     console = Console(quiet, verbose=False)
     loaded, rig = options.recordings_and_rig(recordings, rig_file, console.report)
@@ -37,12 +37,24 @@ def command(recordings: tuple[Path, ...], rig_file: Path, json_lines: bool, quie
         click.echo(json.dumps(found.as_dict()))
     else:
         _show(found)
-    if found.accel_scale is None:
+    if found.saturated:
         console.report(
-            f"Offset and scale of the accelerometer are unchanged: {counted(found.attitudes, 'attitude')} recorded, "
-            f"{FEWEST_ATTITUDES} needed."
+            f"{counted(found.saturated, 'rest')} with saturated readings left out; record them with a larger range."
         )
+    if found.accel_scale is None:
+        console.report(_unchanged(found))
     options.show_next_recording(rig_file, quiet, loaded[0], "joint")
+
+
+def _unchanged(found: FoundImuErrors) -> str:
+    from linkpose.calibration.imu import FEWEST_ATTITUDES
+
+    sides = ", ".join(found.missing_sides)
+    lacking = f" Add a rest with {sides} upwards." if sides else " Add rests in further attitudes."
+    return (
+        f"Offset and scale of the accelerometer are unchanged: {counted(found.attitudes, 'attitude')} recorded, "
+        f"{FEWEST_ATTITUDES} that determine all axes needed.{lacking}"
+    )
 
 
 def _show(found: FoundImuErrors) -> None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the user asked for, live or not."""
+    """The options of the command, live or not."""
 
     output: Path | None
     filter_names: tuple[str, ...]

@@ -90,8 +90,8 @@ class _LiveRun:
     ) -> None:
         from linkpose.cli.keys import Marker
         from linkpose.cli.view import View
-        from linkpose.estimation import LiveEstimator
         from linkpose.extremes import Extremes
+        from linkpose.live_estimation import LiveEstimator
 
         self._board, self._estimator, self._compiling, self._sink = board, estimator, compiling, sink
         self._console, self._keys = console, keys
@@ -128,7 +128,7 @@ class _LiveRun:
         show_newest(self._page, rows, lambda: self.health, self._estimator, self._compiling)
 
     def follow_keys(self) -> None:
-        """Does what the keys pressed since the last call ask for. Raises KeyboardInterrupt to end the run."""
+        """Carries out the keys pressed since the last call. Raises KeyboardInterrupt to end the run."""
         self._keys.follow({"m": self._marker, "f": self._view.next_filter})
 
     def finish(self, ended: str) -> None:

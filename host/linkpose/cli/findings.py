@@ -17,7 +17,7 @@ WORST_STD_M = 0.03  # (m, 1σ in the worst direction) from which on the heights 
 
 
 def report_running(estimator: Estimator, joint: Joint | None, console: Console) -> None:
-    """Reports which filters run; `joint` is what --j2s asks for.
+    """Reports which filters run; `joint` is the joint that --j2s states.
 
     Raises LinkposeError if J2S is to be estimated and no filter that runs does it.
     """

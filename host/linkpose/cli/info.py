@@ -87,7 +87,7 @@ def _observe(session: Session, console: Console) -> dict[str, Any]:
 
 
 def _report(session: Session, health: Health) -> dict[str, Any]:
-    from linkpose.device.session import firmware_version, reset_causes
+    from linkpose.device.answers import firmware_version, reset_causes
     from linkpose.sensors import devices
 
     hello, status = session.hello, health.status

@@ -47,7 +47,7 @@ def _number(
 
 
 class Numbers(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
-    """So many finite numbers, separated by commas."""
+    """Finite numbers separated by commas, one for each name."""
 
     def __init__(self, names: str) -> None:
         self.name = names
@@ -298,7 +298,7 @@ def command(
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     if map_path is None and beacons_path is None:
-        raise click.UsageError("nothing to localise against; add --map MAP.yaml or --beacons BEACONS.csv")
+        raise click.UsageError("nothing to localize against; add --map MAP.yaml or --beacons BEACONS.csv")
     console = Console(quiet, verbose=False)
     methods = cast("tuple[Method, ...]", filters)
     chosen = LocalizationOptions(**settings)
@@ -421,7 +421,7 @@ def _sentence(name: str, track: Track, result: PathScore | None) -> str:
         often = counted(track.widened, "time")
         text += f"\n  {often} most measurements were rejected, so the pose was made uncertain again"
     if track.relocated:
-        text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found anew"
+        text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found again"
     for verdict in track.consistency.verdicts():
         text += f"\n  {verdict.sentence()}" + (f" ({figures})" if (figures := verdict.figures()) else "")
     if result is not None:

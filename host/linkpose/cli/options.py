@@ -290,7 +290,7 @@ def estimate_command(recording: Path, *flags: object) -> tuple[object, ...]:
 def plot_command(estimates: Path) -> tuple[object, ...]:
     """The command that draws estimates, to propose as the next one; it replaces no picture."""
     picture = estimates.with_suffix(".png")
-    return "plot", estimates, *(("-o", new_file(str(picture))) if picture.exists() else ())
+    return "plot", estimates, *(("-o", new_file(str(picture))) if _exists(picture) else ())
 
 
 def new_file(name: str) -> Path:
@@ -298,7 +298,15 @@ def new_file(name: str) -> Path:
     from linkpose.outputs import numbered
 
     path = Path(name)
-    return next(free for free in itertools.chain([path], numbered(path)) if not free.exists())
+    return next(free for free in itertools.chain([path], numbered(path)) if not _exists(free))
+
+
+def _exists(path: Path) -> bool:
+    """Whether the file exists; False where the folder cannot be looked at, which is no reason to fail."""
+    try:
+        return path.exists()
+    except OSError:
+        return False
 
 
 def typed(words: Iterable[object]) -> str:

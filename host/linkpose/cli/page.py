@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from linkpose.board import Board
     from linkpose.cli.live import Console
     from linkpose.device.session import Health
-    from linkpose.estimation import Estimator, LiveRows
+    from linkpose.estimation import Estimator
+    from linkpose.live_estimation import LiveRows
     from linkpose.localization.surroundings import Surroundings
     from linkpose.page import Page
     from linkpose.page.history import Replay
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PageOptions:
-    """What --view, --view-host and --view-port ask for."""
+    """The values of --view, --view-host and --view-port."""
 
     is_wanted: bool
     host: str
@@ -103,7 +104,8 @@ class PageOptions:
         if not self.is_wanted:
             yield lambda _: None
             return
-        from linkpose.estimation import Estimator, LiveEstimator
+        from linkpose.estimation import Estimator
+        from linkpose.live_estimation import LiveEstimator
         from linkpose.precompile import Precompilation
 
         estimator = Estimator.for_board((), board)
@@ -126,13 +128,13 @@ def show_newest(
     estimator: Estimator,
     compiling: Precompilation,
 ) -> None:
-    """Shows the newest row of a live run, or all rows anew. Raises KeyboardInterrupt once "stop" was pressed."""
+    """Shows the newest row of a live run, or all rows again. Raises KeyboardInterrupt once "stop" was pressed."""
     if page is None:
         return
     from linkpose.page.status import PageStatus  # 0.06 s, by which the first sample without a page would be late
 
     if len(rows.caught_up):
-        page.begin_anew(rows.caught_up)
+        page.restart(rows.caught_up)
     page.show(rows.newest, lambda: PageStatus(health(), estimator.found_j2s, compiling.progress))
     page.raise_if_stopped()
 

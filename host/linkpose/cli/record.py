@@ -97,7 +97,7 @@ class _Run:
         self._marker = Marker(self.mark)
 
     def follow(self, keys: Keys, block: Measurements) -> None:
-        """Shows the progress and does what the keys ask for. Raises KeyboardInterrupt to end the recording."""
+        """Shows the progress and carries out the keys. Raises KeyboardInterrupt to end the recording."""
         from linkpose.cli.live import health_line
 
         self._marker.advance(block)

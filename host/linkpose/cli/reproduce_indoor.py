@@ -36,5 +36,5 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, q
     if files:
         labels = [indoor.label(variant) for variant in variants]
         figures = plotting.indoor_figures(indoor.drive(0))
-        figures[VARIANTS] = plotting.variants("Indoor localisation", variants, labels)
+        figures[VARIANTS] = plotting.variants("Indoor localization", variants, labels)
         rendering.save_figures(figures, files, force, quiet)

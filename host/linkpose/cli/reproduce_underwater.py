@@ -21,7 +21,7 @@ VARIANTS = "variants-underwater"  # the picture with the errors of all variants
 def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, quiet: bool) -> None:
     """Check the simulator of Tables 2.2 to 2.9, and compare the EKF with the UKF on its measurements.
 
-    Prints the noises of Tables 3.5 and 3.6, asked for and computed back from the dives, the sets of measurements (Table
+    Prints the noises of Tables 3.5 and 3.6, as set and as computed from the dives, the sets of measurements (Table
     3.10), and the errors of each filter on each set. Each claim is judged by a two-sided sign test over the dives (p <
     0.05). With --plot, Figures 3.7 to 3.10 show the dive of seed 0.
     """
@@ -41,5 +41,5 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, q
         variants = [variant for case in cases for variant in case.variants]
         labels = [underwater.label(variant) for variant in variants]
         figures = plotting.underwater_figures(underwater.dive(0), BEACONS)
-        figures[VARIANTS] = plotting.variants("Underwater localisation", variants, labels)
+        figures[VARIANTS] = plotting.variants("Underwater localization", variants, labels)
         rendering.save_figures(figures, files, force, quiet)

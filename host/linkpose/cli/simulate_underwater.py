@@ -62,7 +62,7 @@ def command(
 ) -> None:
     """Simulate an underwater vehicle's sensors after the thesis's Tables 2.2 to 2.9: its log, beacons and truth.
 
-    Prints the noise's statistics, computed from the log, beside those asked for.
+    Prints the statistics of the noise as set and as computed from the log.
     """
     from linkpose.simulation.export import check_outputs, write_underwater
     from linkpose.simulation.underwater import UnderwaterErrors, self_check, simulate_underwater

@@ -49,7 +49,7 @@ class _Results(_Stream):
     """Raises LinkposeError for what cannot be written."""
 
     def write(self, text: str) -> int:
-        if text == "":  # click writes nothing to find out what the stream takes; a full disk refuses even that
+        if text == "":  # click writes an empty text to test the stream, which fails on a full disk
             return 0
         with self._failing_well():
             return self._stream.write(text)

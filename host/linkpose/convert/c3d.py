@@ -15,7 +15,7 @@ from linkpose.convert.motion import Motion
 def write(output: BinaryIO, path: Path, motion: Motion) -> None:
     """Three markers in mm at equal intervals; the world has Z up. A missing marker has the residual −1.
 
-    ezc3d writes to a name only: to one in a folder of its own, which nobody else can write.
+    ezc3d writes to a file name only; the file is created in a private folder, which no other user can write.
     """
     ezc3d = libraries.load("ezc3d", path)
     markers = np.concatenate(list(motion.markers()))

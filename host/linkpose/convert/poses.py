@@ -59,7 +59,7 @@ def has_orientation(names: Collection[str], prefix: str) -> bool:
 
 
 def poses_of(block: Block, prefix: str) -> Poses:
-    """The poses of the filter with this prefix. What it does not estimate is 0; see `not_estimated`."""
+    """The poses of the filter with this prefix. A coordinate that it does not estimate is 0; see `not_estimated`."""
     zero = np.zeros(len(block["time_s"]))
 
     def column(*names: str) -> Floats:

@@ -121,7 +121,7 @@ def choose_port(simulated_will_do: bool = True) -> str:
 
 
 def register_scheme(package: str) -> None:
-    """Lets `open_port` open URLs of another scheme: `package` holds a module protocol_SCHEME, as pyserial asks."""
+    """Lets `open_port` open URLs of another scheme: `package` holds a module protocol_SCHEME, as pyserial requires."""
     if package not in serial.protocol_handler_packages:
         serial.protocol_handler_packages.append(package)
 

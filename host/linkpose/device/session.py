@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
+from linkpose.device.answers import other_protocol, other_schema, refusal_reason, reset_causes, why_no_hello
 from linkpose.device.clock import WRAP_US, DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
 from linkpose.device.ports import find_again, usb_identity
@@ -19,12 +20,11 @@ from linkpose.sensors.conversion import BoardSettings, Placed
 from linkpose.sensors.devices import Sensors, check_hello, found, mouse_remarks
 from linkpose.sensors.rig import Rig
 from linkpose.sensors.timeline import Gap, Timeline
-from linkpose.wire.frames import Corrupt, OtherProtocol, StreamDecoder
+from linkpose.wire.frames import Corrupt, OtherProtocol
 from linkpose.wire.messages import (
     PROTOCOL_MAJOR,
     PROTOCOL_MINOR,
     SCHEMA_CRC,
-    VERSION,
     Ack,
     Command,
     Configure,
@@ -33,7 +33,6 @@ from linkpose.wire.messages import (
     Hello,
     Message,
     Nak,
-    NakReason,
     Ping,
     Pong,
     Sample,
@@ -52,7 +51,7 @@ SELF_TEST_TIMEOUT_S = 3.0
 MICE_TIMEOUT_S = 3.0  # self-test up to 1.5 s, set-up of a slow mouse 0.6 s
 LOW_SUPPLY_MV = 4500  # below it an ATmega328P at 16 MHz is out of its specification, and 5 V mice are too
 SENSORS_TIMEOUT_S = 1.0  # the slowest sensor is set up 0.3 s after the firmware starts
-SETTLE_S = 0.15  # in which the sensors are set up anew and their filters fill
+SETTLE_S = 0.15  # for the sensors to be set up again and their filters to settle
 FIRST_PINGS = 5
 PING_INTERVAL_S = 1.0
 SILENCE_S = 1.5  # of a board that should be streaming
@@ -61,14 +60,14 @@ RECEIVE_TIMEOUT_S = 0.1
 MOST_UNREAD_BYTES = 100  # a silent line may give a few when the board is reset
 RETRY_INTERVAL_S = 0.25
 WAIT_STEP_S = 0.05
-OWN_TOKENS = 1000  # PONGs of so many of the latest PINGs are late answers to this program
+OWN_TOKENS = 1000  # a PONG to one of this many latest PINGs is a late answer to this program
 
 Answer = TypeVar("Answer", bound="Message")
 Notify = Callable[[str], None]
 
 
 class _TimeLimit:
-    """A time to wait, of which a suspended program uses up no more than one step."""
+    """A time to wait. The time for which the program is suspended counts as one step at most."""
 
     def __init__(self, seconds: float) -> None:
         self._left_s = seconds
@@ -129,7 +128,7 @@ class Session:
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = random.getrandbits(32)  # another program's differ
-        self._intruder_reported = False
+        self._other_program_reported = False
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
@@ -138,9 +137,8 @@ class Session:
         self._arrived_s = 0.0  # s, the connection's clock: of the last sample
         self._repeats = 0  # samples since the last one with a new number
         self._clock_faults: set[str] = set()  # reported
-        self._silent_s = self._asked_s = (
-            0.0  # waited for a sample: since the last one; of that, up to the last GET_INFO
-        )
+        self._silent_s = 0.0  # waited for a sample since the last one
+        self._asked_s = 0.0  # of that, up to the last GET_INFO
         self._corrupt_before = Corrupt()
         try:
             self.hello = self._first_hello = self._handshake()
@@ -170,7 +168,7 @@ class Session:
     # ---- handshake ----
 
     def _handshake(self) -> Hello:
-        """Asks until HELLO comes; a board that streams already (its last host was killed) is stopped first."""
+        """Sends GET_INFO until HELLO arrives; a board that is still streaming for a killed host is stopped first."""
         connection = self._connection
         received, refused = bytearray(), 0
         limit, ask_at = _TimeLimit(HANDSHAKE_TIMEOUT_S), 0.0
@@ -185,14 +183,14 @@ class Session:
             received += arrival.data[: 512 - len(received)]
             for message in arrival.messages:
                 if isinstance(message, OtherProtocol):
-                    raise _other_protocol(message)
+                    raise other_protocol(message)
                 refused += isinstance(message, Nak)
                 if isinstance(message, Hello) and message.streaming != 1:
                     self._check_versions(message)
                     message = self._wait_for_sensors(message)
                     connection.decoder.corrupt = Corrupt()  # earlier bytes are not part of the session
                     return message
-        reason = _why_no_hello(bytes(received), connection.decoder)
+        reason = why_no_hello(bytes(received), connection.decoder)
         if refused:
             reason = "the board refuses every command, also the request for its version; its firmware is damaged"
         raise NoFirmware(self.port, bytes(received), reason)
@@ -210,7 +208,7 @@ class Session:
     def _check_versions(self, hello: Hello) -> None:
         """Raises WrongFirmware when the two sides are incompatible, and notifies of a harmless difference."""
         if hello.schema_crc != SCHEMA_CRC and hello.protocol_minor == PROTOCOL_MINOR:
-            raise _other_schema(hello)
+            raise other_schema(hello)
         if hello.protocol_minor != PROTOCOL_MINOR:
             older = "firmware" if hello.protocol_minor < PROTOCOL_MINOR else "linkpose"
             self.notify(
@@ -264,16 +262,16 @@ class Session:
         return result
 
     def _command(self, message: Message, command: Command) -> Arrival:
-        """Sends a command, again where its answer is lost; the arrival that holds the ACK, from behind the ACK on.
+        """Sends a command, and repeats it if the answer is lost. Returns what arrived after the ACK.
 
-        A SAMPLE is as good an answer to START. Raises LinkposeError on a NAK, and when no answer comes.
+        A SAMPLE also confirms START. Raises LinkposeError on a NAK, and if no answer arrives.
         """
         for _ in range(ATTEMPTS):
             self._connection.send(message)
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for at, answer in enumerate(arrival.messages):
                     if isinstance(answer, Nak) and answer.command == command:
-                        raise LinkposeError(f"the board refused {command.name}: {_reason(answer.reason)}")
+                        raise LinkposeError(f"the board refused {command.name}: {refusal_reason(answer.reason)}")
                     if isinstance(answer, Ack) and answer.command == command:
                         return Arrival(arrival.time_s, arrival.messages[at + 1 :], b"")
                     if isinstance(answer, Sample) and command == Command.START:
@@ -307,31 +305,31 @@ class Session:
         self._token = (self._token + 1) % (1 << 32)
         self._pings = {self._token: self._connection.send(Ping(self._token))}
 
-    def _hear_pong(self, pong: Pong, time_s: float) -> None:
+    def _handle_pong(self, pong: Pong, time_s: float) -> None:
         sent = self._pings.pop(pong.token, None)
         if sent is not None:
             t_us = (pong.t_us + self.timeline.stamps.shift_us) % WRAP_US
             if self.timeline.stamps.is_trusted:
                 self._clock.pong(t_us, sent, time_s)
         elif (self._token - pong.token) % (1 << 32) >= OWN_TOKENS:
-            self._report_intruder()
+            self._report_other_program()
 
-    def _report_intruder(self) -> None:
-        """An answer came that this program has not asked for: a port such as socket:// serves several programs."""
-        if not self._intruder_reported:
-            self._intruder_reported = True
+    def _report_other_program(self) -> None:
+        """Reports an answer to another program's command: a port such as socket:// serves several programs."""
+        if not self._other_program_reported:
+            self._other_program_reported = True
             self.notify(
                 f"another program also sends commands to the board at {self.port}; close it, or the data will have gaps"
             )
 
-    def _tie_clocks(self) -> None:
+    def _synchronise_clocks(self) -> None:
         """A few round trips before the first sample."""
         for _ in range(FIRST_PINGS):
             self._ping()
             for arrival in self._arrivals(ANSWER_TIMEOUT_S):
                 for message in arrival.messages:
                     if isinstance(message, Pong):
-                        self._hear_pong(message, arrival.time_s)
+                        self._handle_pong(message, arrival.time_s)
                 if not self._pings:
                     break
         if not self._clock.ready:
@@ -379,11 +377,11 @@ class Session:
         timeline.end_if_past(timeline.duration_s + self._connection.now() - self._arrived_s - LATE_S)
 
     def _begin(self) -> None:
-        """Ties the clocks anew and starts the stream."""
+        """Synchronises the clocks again and starts the stream."""
         wanted = self._wanted
         for _ in range(ATTEMPTS):
             self._clock = DeviceClock()
-            self._tie_clocks()
+            self._synchronise_clocks()
             self._unhandled = self._start(wanted)
             if self._unhandled is not None:
                 break
@@ -444,7 +442,7 @@ class Session:
                 # It may end the connection, and the samples before it must not be lost then.
                 self._unhandled = Arrival(arrival.time_s, arrival.messages[at:], b"")
                 break
-            elif self._hear(message, arrival, timeline):
+            elif self._handle(message, arrival, timeline):
                 break
         return placements
 
@@ -484,18 +482,18 @@ class Session:
             self._asked_s = self._silent_s
             self._connection.send(GetInfo())
 
-    def _hear(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> bool:
+    def _handle(self, message: Message | OtherProtocol, arrival: Arrival, timeline: Timeline) -> bool:
         """Act on a message other than a sample. True if the board was reset and has been started again: what arrived
         together with its HELLO is older than that."""
         if isinstance(message, Pong):
-            self._hear_pong(message, arrival.time_s)
+            self._handle_pong(message, arrival.time_s)
         elif isinstance(message, Ack | Nak) and message.command in (Command.STOP, Command.CONFIGURE):
-            self._report_intruder()  # the board answers in order: START was the last command of this program
+            self._report_other_program()  # the board answers in order: START was the last command of this program
         elif isinstance(message, Status):
             self.status = message
             self._check_supply(message)
         elif isinstance(message, OtherProtocol):
-            raise _other_protocol(message)
+            raise other_protocol(message)
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
             self.notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
@@ -510,7 +508,7 @@ class Session:
         return False
 
     def _resume(self, hello: Hello) -> None:
-        """Puts the settings of before in force again and goes on streaming."""
+        """Restores the settings and continues streaming."""
         self.hello, before = hello, self._first_hello
         if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
@@ -609,20 +607,6 @@ def summary(health: Health) -> dict[str, Any]:
     }
 
 
-def firmware_version(hello: Hello) -> str:
-    return f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}"
-
-
-def reset_causes(hello: Hello) -> str:
-    """Names of the reset flags that are set, such as "watchdog", or where the firmware hung."""
-    from linkpose.wire.messages import ResetCause
-
-    if hello.reset_cause & ResetCause.HUNG:
-        return f"the firmware hung at program counter {hello.hung_at:#06x}"
-    names = [cause.name.lower().replace("_", " ") for cause in ResetCause if hello.reset_cause & cause and cause.name]
-    return ", ".join(names) or "cause unknown"
-
-
 def _configured(hello: Hello) -> Configure:
     """The CONFIGURE that puts the settings of a HELLO in force."""
     return Configure(*(getattr(hello, name) for name in Configure._fields))
@@ -635,51 +619,3 @@ def _first(kind: type[Answer], messages: Iterable[Message | OtherProtocol]) -> A
 
 def _no_answer(command: str) -> LinkposeError:
     return LinkposeError(f"the board did not answer {command}; unplug it, plug it in and try again")
-
-
-def _reason(code: int) -> str:
-    try:
-        return NakReason(code).name.lower().replace("_", " ")
-    except ValueError:
-        return f"reason {code}"
-
-
-def _other_protocol(other: OtherProtocol) -> WrongFirmware:
-    theirs = f"{other.protocol_major}.{other.protocol_minor}"
-    ours = f"{PROTOCOL_MAJOR}.{PROTOCOL_MINOR}"
-    if other.protocol_major < PROTOCOL_MAJOR:
-        return WrongFirmware(f"the board's firmware is old: it uses protocol {theirs}, this linkpose {ours}", True)
-    return WrongFirmware(f"this linkpose is old: it uses protocol {ours}, the board's firmware {theirs}", False)
-
-
-def _other_schema(hello: Hello) -> WrongFirmware:
-    theirs = firmware_version(hello)
-    release = (hello.firmware_major, hello.firmware_minor, hello.firmware_patch)
-    if release > tuple(map(int, VERSION.split("."))):
-        text = f"this linkpose {VERSION} is older than the board's firmware {theirs}, and their schemas differ"
-        return WrongFirmware(text, False)
-    text = f"the board's firmware {theirs} and this linkpose {VERSION} have different wire schemas"
-    return WrongFirmware(text, True)
-
-
-def _why_no_hello(received: bytes, decoder: StreamDecoder) -> str:
-    """What came instead of a HELLO, and what to do about it."""
-    corrupt = decoder.corrupt
-    if decoder.misfit is not None:
-        kind, length = decoder.misfit
-        return (
-            f"a frame of type {kind:#04x} with {length} bytes arrived intact, which protocol {PROTOCOL_MAJOR} does not "
-            "have; the firmware is damaged or not linkpose's"
-        )
-    if not received:
-        return "the board is silent; it may never have had this firmware, or another port is the board's"
-    printable = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in received)
-    if printable > 0.8 * len(received):
-        text = received[:60].decode("ascii", "replace").strip().replace("\r", "").replace("\n", " / ")
-        return f"another firmware answers: {text!r}"
-    if 0 in received and corrupt.crc + corrupt.cobs + corrupt.length < 3 and len(received) < 64:
-        return "the board answers only in part; check the cable and try again"
-    return (
-        "only noise was received, and no frame; the device uses another baud rate or is not a linkpose board: check "
-        "the port"
-    )

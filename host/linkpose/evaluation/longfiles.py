@@ -16,6 +16,7 @@ import numpy as np
 
 from linkpose.errors import FileFormatError
 from linkpose.evaluation.errors import CommonStart, errors_of
+from linkpose.evaluation.mismatches import mismatches
 from linkpose.evaluation.references import read_take
 from linkpose.evaluation.scores import (
     SCORED,
@@ -23,7 +24,6 @@ from linkpose.evaluation.scores import (
     common_offset,
     comparable,
     evaluate,
-    mismatches,
     pairs_of,
     window_of,
 )
@@ -37,18 +37,18 @@ from linkpose.recording.textfile import Part
 from linkpose.recording.thinned import Thinner
 from linkpose.sensors.measurements import Floats
 
-# Rows by which the offset is searched, at equal distances. Twice of it doubles the memory, and the precision of the lag
+# Rows by which the offset is searched, at equal distances. Doubling it doubles the memory, and the precision of the lag
 # from which the second pass starts.
 _COARSE_ROWS = 1_000_000
 # Stretches of this many rows show the offset exactly: 100 of 10 s at 100 Hz. Twice of either doubles the memory.
 _STRETCHES, _STRETCH_ROWS = 100, 1000
 _FAR_S = 1e300  # stamps beyond are infinite
-# Rows that are scored at once, and rows of the other file that may belong to them. Twice of it doubles the memory.
+# Rows scored in one piece, and the most rows of the other file in the same interval. Doubling it doubles the memory.
 _PIECE_ROWS, _MOST_OTHER_ROWS = 50_000, 200_000
-# Rows of one file at once; ten times as many as the usual step gives. Twice of it doubles the memory of a file whose
+# Rows of one file at once; ten times as many as the usual step gives. Doubling it doubles the memory of a file whose
 # stamps do not increase.
 _MOST_HELD_ROWS = 10 * _MOST_OTHER_ROWS
-_KEPT_FOR_PICTURES = 0.4  # of the rows that the picture of a table has. Twice of it doubles their memory
+_KEPT_FOR_PICTURES = 0.4  # of the rows that the picture of a table has. Doubling it doubles their memory
 
 
 def evaluate_files(
@@ -272,7 +272,7 @@ class _Comparison:
         tables = self._stretches(stamps[np.isfinite(stamps)], near)
         compared = pairs_of(*tables)
         offset_s, residual = common_offset(compared.values(), near)
-        remarks = mismatches(*tables, compared.values(), offset_s, residual)
+        remarks = mismatches(*tables, compared, offset_s, residual)
         return {name: list(both.pairs) for name, both in compared.items()}, offset_s, remarks
 
     def _most_telling(self) -> tuple[list[str], list[str]]:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from linkpose.errors import LinkposeError, listed
+from linkpose.evaluation.mismatches import mismatches
 from linkpose.evaluation.scoring import CHAIN, LINK, Compared, Score, Scorer, Window, scores_of
-from linkpose.evaluation.series import Lag, Pair, Series, find_offset, paired
-from linkpose.evaluation.takes import MOTION_CAPTURE
+from linkpose.evaluation.series import Lag, Pair, Series, find_offset
 from linkpose.quantities import (
-    ANGLE,
     CHAIN_ROTATION,
     HEADING,
     HEIGHT,
-    PITCH,
-    ROLL,
     ROTATION,
     VX,
     VY,
@@ -34,9 +31,6 @@ from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
 SCORED = (*LINK, VX, VY, WZ, X, Y, HEADING, Z)
-_UNRELATED = 0.9  # share of the reference's motion that remains when even the best filter's is subtracted
-_SAME_TILT_DEG = 30.0
-_MIRRORED = 0.8  # correlation, negated
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +59,7 @@ def evaluate(estimate: Table, reference: Table, from_s: float | None = None, to_
         scorers.append(Scorer(name, paths, offset_s, window_of(from_s, to_s), most, both.empty))
         scorers[-1].add(both)
     scores, without = scores_of(scorers)
-    return Evaluation(scores, mismatches(estimate, reference, compared.values(), offset_s, residual) + without)
+    return Evaluation(scores, mismatches(estimate, reference, compared, offset_s, residual) + without)
 
 
 def window_of(from_s: float | None, to_s: float | None) -> Window:
@@ -107,6 +101,10 @@ def _std(estimate: Table, columns: Mapping[Quantity, str]) -> dict[Quantity, Ser
     for quantity, column in columns.items():
         sigma = std_column(column) or ""
         if sigma in estimate.columns:
+            if (estimate.columns[sigma] < 0).any():
+                raise LinkposeError(
+                    f"{estimate.path}: {sigma} is negative, which no standard deviation is: remove the column"
+                )
             of = ROTATION if quantity in CHAIN_ROTATION else quantity
             found[of] = _signal(estimate, estimate.columns[sigma] * of.radians)
     return found
@@ -179,49 +177,3 @@ def comparable(both: Compared) -> list[Pair]:
     """The pairs that move alike. A link's x and y do not where the two count yaw from different directions."""
     unaligned = (YAW, *CHAIN_ROTATION, *((X, Y) if YAW in both.pairs else ()))
     return [pair for q, pair in both.pairs.items() if q not in unaligned]
-
-
-# ---- signs of a mismatch ----
-
-
-def mismatches(
-    estimate: Table, reference: Table, compared: Collection[Compared], offset_s: float, residual: float
-) -> list[str]:
-    """Evidence that the files are of different runs or frames."""
-    both_files = f"{estimate.path} and {reference.path}"
-    tilts = [both.pairs for both in compared if ROLL in both.pairs and PITCH in both.pairs]
-    apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
-    if apart > _SAME_TILT_DEG:
-        cure = (
-            "try the other axis with --up y or z, and check the order of the markers"
-            if reference.kind == MOTION_CAPTURE
-            else "are they of the same run, and of the same axes?"
-        )
-        return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]
-    if any(_is_mirrored(both.pairs[ANGLE]) for both in compared if ANGLE in both.pairs):
-        return [
-            f"{both_files} count the joint angle in opposite senses: the sense of an axis that a filter finds is "
-            "arbitrary; negate axis1 and axis2 in the rig file and estimate again"
-        ]
-    is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
-    if is_link and _UNRELATED < residual < np.inf:
-        return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
-    return []
-
-
-def _is_mirrored(pair: Pair) -> bool:
-    """Whether an angle and its reference turn in opposite senses, on the clocks as they are."""
-    ours, theirs = np.array(paired(*pair, 0.0))
-    known = np.isfinite(ours) & np.isfinite(theirs)
-    if known.sum() < 3:
-        return False
-    turned = [angle[known] - np.median(angle[known]) for angle in (ours, theirs)]
-    return bool(turned[0] @ turned[1] < -_MIRRORED * np.linalg.norm(turned[0]) * np.linalg.norm(turned[1]))
-
-
-def _tilt_apart_deg(both: Mapping[Quantity, Pair], offset_s: float) -> float:
-    """Median angle between the two verticals, in the sensor's axes; 0 without an instant in common."""
-    roll, pitch = (np.array(paired(*both[quantity], offset_s)) for quantity in (ROLL, PITCH))
-    z = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])  # (3, 2, N)
-    angle = np.arccos(np.clip((z[:, 0] * z[:, 1]).sum(axis=0), -1.0, 1.0))
-    return float(np.degrees(np.median(angle[np.isfinite(angle)]))) if np.isfinite(angle).any() else 0.0

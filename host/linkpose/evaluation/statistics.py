@@ -9,8 +9,8 @@ import numpy as np
 from linkpose.sensors.measurements import Floats
 
 _HIGH = 0.95  # the quantile of the magnitudes
-# The largest magnitudes are sorted out when there are so many times as many as needed. Twice of it doubles that memory,
-# and halves the number of times.
+# The largest magnitudes are selected when their number exceeds the needed one by this factor. Doubling it doubles that
+# memory, and halves the number of selections.
 _SURPLUS = 1.25
 # A verdict on σ: shares of errors within 2σ between which σ is right. A normal error has 95.4 %.
 HONEST_SHARE = (0.90, 0.99)
@@ -18,7 +18,7 @@ HONEST_SHARE = (0.90, 0.99)
 # too small, has 1.5 with normal errors. Doubled, an error of 20σ in 100 is still named.
 _FAR_NEES = 2.0
 _ROUNDING = 1.001  # that two rounded files differ by, in units of the last digit, with some for binary fractions
-_NORMAL_95 = 1.96  # 95 % of normal errors are within so many σ
+_NORMAL_95 = 1.96  # 95 % of normal errors are within this many σ
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from linkpose.simulation.gyro_noise import rate_noise
 from linkpose.simulation.mice import Fault, MiceRun, MouseErrors, ring
 
 RATE_HZ = 100.0
-STILL_S = 1.0  # the baseline takes the gyro's bias from so long a rest
+STILL_S = 1.0  # duration of the rest from which the baseline takes the gyro's bias
 FAULT_FROM_S = 20.0
 FLOOR_SCALE = 1.05  # the mice of the case "floor" count 5 % more than their calibration states
 RESTS = 0.2  # share of the manoeuvres: a robot that works stops now and then

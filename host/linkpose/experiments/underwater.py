@@ -155,7 +155,7 @@ def _settings(errors: UnderwaterErrors, variant: Variant) -> Settings:
 
 
 def check_simulator(seeds: int) -> list[dict[str, object]]:
-    """The simulator's own statistics beside the figures asked for, mean over the seeds, in the order of the tables."""
+    """The simulator's statistics beside the values set, mean over the seeds, in the order of the tables."""
     runs = [
         self_check(simulate_underwater(seed, UnderwaterErrors(outliers=OUTLIERS), DURATION_S)) for seed in range(seeds)
     ]

@@ -1,4 +1,4 @@
-"""Variants of a localisation filter, compared on the same simulated runs."""
+"""Variants of a localization filter, compared on the same simulated runs."""
 
 from __future__ import annotations
 

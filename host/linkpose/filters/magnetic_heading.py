@@ -63,7 +63,7 @@ _LEAST_LEVEL_UT = 5.0  # horizontal field below which there is no heading
 _NEIGHBOURS = 2
 _RENEW_S = 20  # windows of a steady but different field before it becomes the reference
 _STRENGTH_S = 60.0  # over which the strength's variation with attitude is measured
-_UNKNOWN_RAD2 = 100.0  # variance of a direction of which nothing is known
+_UNKNOWN_RAD2 = 100.0  # variance of an unknown direction
 _DRIFT, _RATE, _NORTH, _ERROR = range(4)
 # Variance of the disturbance within the gates. Windows closer than this are not independent (s); memory (s).
 _INDEPENDENT_S, _VARIATION_S = 30.0, 300.0
@@ -367,7 +367,7 @@ class MagneticHeading:
         self._predict(window)
         self._unlike = [*self._unlike, window.field_uT] if is_usable else []
         if self._is_steady():
-            self._accept_anew(window, is_same)
+            self._accept_again(window, is_same)
         return False
 
     def _apply(self, window: _Window) -> None:
@@ -380,7 +380,7 @@ class MagneticHeading:
         if self._foreign_uT == 0.0:
             self.found.north_deg = math.degrees(wrapped(float(self._mean[_NORTH])))
 
-    def _accept_anew(self, window: _Window, is_same: bool) -> None:
+    def _accept_again(self, window: _Window, is_same: bool) -> None:
         """Take a field that was rejected but is steady: the old one but for a small angle, or a new reference."""
         if not is_same:
             self._variation.renew(self._change(window))

@@ -20,7 +20,7 @@ RESET_PULSE_S = (
 START_UP_S = 0.1  # the fuses hold the processor for 65 ms after a reset
 # Optiboot blinks for 0.4 s before it reads, and gives up 1 s after that. Its UART holds two bytes meanwhile, so that
 # GET_SYNC is sent once for each reset: of a second one it would receive a part and start the firmware. Half of this
-# value makes the UNO's own Optiboot unreachable; twice of it doubles the time until a silent board is reported.
+# value makes the UNO's own Optiboot unreachable; doubling it doubles the time until a silent board is reported.
 SYNC_TIMEOUT_S = 0.8
 ANSWER_TIMEOUT_S = 2.0  # a page takes 30 ms; the rest is for a computer that is busy
 

@@ -1,4 +1,4 @@
-"""What a localisation log holds: one event a measurement, read from CSV (`time_s,kind,a,b,c`)."""
+"""What a localization log holds: one event a measurement, read from CSV (`time_s,kind,a,b,c`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Monte-Carlo localisation, the peer that the Kalman filters are compared with: `--filter mcl`.
+"""Monte-Carlo localization, the peer that the Kalman filters are compared with: `--filter mcl`.
 
 Models as published: `sample_motion_model_odometry` and `likelihood_field_range_finder_model` of Thrun, Burgard and Fox,
 Probabilistic Robotics, MIT Press 2005, Tables 5.6 and 6.3 (`likelihood_field_prob` in ROS's AMCL), low-variance

@@ -35,8 +35,8 @@ FIRST_PORT = 8080
 # halves the cost, and a sample takes up to 0.12 s more to the screen.
 UPDATE_INTERVAL_S = 0.12
 CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
-STATUS_INTERVAL = 25  # blocks between two looks at the health, which counts over all sensors
-J2S_GOAL_M = 0.03  # 1σ in the worst direction from which on the guide asks for no other motion
+STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
+J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
 _PORTS_TRIED = 100
 
@@ -104,7 +104,7 @@ class Page:
         self._blocks += 1
         self._is_changed = True
 
-    def begin_anew(self, estimates: Floats) -> None:
+    def restart(self, estimates: Floats) -> None:
         """Takes estimates (N, columns) in place of all before: a filter has caught up with the samples so far."""
         self._queue.append((estimates, True))
 
@@ -205,9 +205,9 @@ class Page:
         blocks = [self._queue.popleft() for _ in range(len(self._queue))]
         if not blocks or not isinstance(self._history, History):
             return
-        last_anew = max((at for at, (_, is_anew) in enumerate(blocks) if is_anew), default=None)
-        if last_anew is not None:
-            del blocks[:last_anew]
+        last_restart = max((at for at, (_, is_restart) in enumerate(blocks) if is_restart), default=None)
+        if last_restart is not None:
+            del blocks[:last_restart]
             self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
         rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
         self._history.add(rows)
@@ -307,7 +307,7 @@ def serve(host: str, port: int, is_named: bool) -> viser.ViserServer:
     import viser
 
     class Server(viser.ViserServer):
-        """A server that opens no tunnel to the network, whatever a browser asks for."""
+        """A server that never opens a tunnel to the network, even if a browser requests one."""
 
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None

@@ -98,7 +98,7 @@ class Panel:
         )
 
     def draw_charts(self, window: Floats, name: str) -> None:
-        """Draws the rows (N, columns) of the last seconds as the filter `name` sees them."""
+        """Draws the rows (N, columns) of the last seconds as the filter `name` estimates them."""
         rows = with_gap_rows(window)
         columns = self._of_filter.get(name, {})
         if name != self._charted:

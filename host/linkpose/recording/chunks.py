@@ -11,7 +11,7 @@ from typing import BinaryIO, NamedTuple
 from linkpose.errors import FileFormatError
 from linkpose.recording.delimited import codec_of
 
-# Twice of it doubles the memory of a run (about ten times as much) and saves no time.
+# Doubling it doubles the memory of a run (about ten times as much) and saves no time.
 CHUNK_BYTES = 8_000_000
 
 # How files of other formats begin.

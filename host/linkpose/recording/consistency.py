@@ -31,13 +31,14 @@ _TIE = 1.05  # explanations as good as the best
 _DEGREES = 180 / np.pi
 _FACTORS = (1 / _DEGREES, 0.5, 2.0, 0.1, 10.0, 0.25, 4.0, 0.01, 100.0, 0.001, 1000.0, _DEGREES, -1.0)
 _AXES = "xyz"
-# Scales of one axis: another range in one column. In right data of public recordings, the best of them left 0.91 and
-# more of what is left without it. A tenth would leave out an axis, which fits a motion without a joint too well.
+# Scales of one axis: another range or unit in one column. In right data of public recordings, the best of 0.5 and 2
+# left 0.91 and more of what is left without it, and none of the others was reported. A tenth would leave out an axis,
+# which fits a motion without a joint too well; a column that is too large exceeds the range of the sensor instead.
 _SCALES = {
     f"{sensor}_{_AXES[axis]} times {factor:g}": np.where(np.arange(3) == axis, factor, 1.0)
     for sensor in ("accel", "gyro")
     for axis in range(3)
-    for factor in (0.5, 2.0)
+    for factor in (0.5, 2.0, _DEGREES, 1000.0)
 }
 
 

@@ -75,13 +75,13 @@ class CsvFile:
         changed its content. Raises CannotWrite and FileError.
         """
         has_all_rows = not is_changed(self._fd)
-        with os.fdopen(self._fd, "rb") as old:
-            self._fd = -1
-            for path in numbered(self._asked):
-                self.path = path
-                with contextlib.suppress(FileExists):
-                    self._open(force=False)
-                    break
+        before = self._fd  # stays in use where no new file can be created
+        for path in numbered(self._asked):
+            self.path = path
+            with contextlib.suppress(FileExists):
+                self._open(force=False)
+                break
+        with os.fdopen(before, "rb") as old:
             if has_all_rows:
                 old.seek(0)
                 while part := old.read(_COPIED_BYTES):

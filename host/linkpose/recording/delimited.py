@@ -32,7 +32,8 @@ _DATE = re.compile(
     r"|[^\W\d_]{3,9}\.?[- ]\d{2,4}"  # May-26
     r"|\d+:\d\d(:\d\d([.,]\d+)?)?"  # 00:00:01,5
 )
-# A piece of JSON after a comma begins so only where LibreOffice has taken the quotes of a text for those of a cell.
+# A piece of JSON after a comma begins like this only if LibreOffice has removed the quotes of a text as quotes of the
+# cell.
 _WITHOUT_QUOTES = re.compile(r"(?!(true|false|null)\b)[^\W\d_]", re.IGNORECASE)
 _INDEX_NAME = re.compile(r"Unnamed: \d+(_level_\d+)?")  # what pandas names a header cell that is empty
 _LONGEST_EXCERPT = 60

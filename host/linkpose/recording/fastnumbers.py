@@ -17,7 +17,7 @@ _NEWLINE, _RETURN, _COMMA, _MINUS, _POINT, _ZERO = 10, 13, 44, 45, 46, 48
 
 @compiled
 def _parse(data: NDArray[np.uint8], powers: Floats, out: Floats) -> bool:
-    """Fills `out` (columns, rows); False unless `data` has so many rows of so many numbers of at most 15 digits."""
+    """Fills `out` (columns, rows); False unless `data` has this shape, and numbers of at most 15 digits."""
     columns, rows = out.shape
     size = len(data)
     at = 0

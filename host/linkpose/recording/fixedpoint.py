@@ -13,7 +13,7 @@ _COMMA, _NEWLINE, _MINUS, _POINT, _ZERO = 44, 10, 45, 46, 48
 _MOST_DIGITS = 19
 _POWERS: NDArray[np.float64] = np.array([10.0**power for power in range(_MOST_DIGITS)])
 _TENS: NDArray[np.uint64] = np.array([10**power for power in range(_MOST_DIGITS)], np.uint64)
-# Rows at once: their text stays in the processor's cache. Twice of it changes nothing that can be measured.
+# Rows at once: their text stays in the processor's cache. Doubling it changes nothing that can be measured.
 _ROWS = 4096
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from linkpose.sensors.measurements import Floats
 
 # Text of this length is parsed by compiled code: below it, numpy takes less time than loading numba (about 0.5 s).
-# Twice of it adds 0.5 s to files of that size.
+# Doubling it adds 0.5 s to files of that size.
 _LONG = 6_000_000
 
 

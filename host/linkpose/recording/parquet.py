@@ -13,7 +13,7 @@ from linkpose.recording.textfile import Part, metadata_of
 
 PARQUET_KEY = b"linkpose"  # of the metadata in a file's schema
 _MAGIC = b"PAR1"
-_ROWS = 65_536  # in memory at once; twice of it doubles the memory of a run
+_ROWS = 65_536  # in memory at once; doubling it doubles the memory of a run
 _INDEX = "__index_level_"  # pandas' row names
 
 

@@ -14,7 +14,7 @@ from linkpose.sensors.measurements import Floats, Measurements
 MOST_GAPS = 20  # listed; all are counted
 _GAP_PERIODS = 1.5  # a longer step has lost a sample; jitter of the clock fit is below 0.1 periods
 # A window of 1 s is at rest where its readings deviate less than this: about ten times the MPU-6050's noise (data
-# sheet: 0.05 °/s rms; 400 µg/√Hz, at 94 Hz of bandwidth 0.005 g). Twice of it accepts slow motion as rest.
+# sheet: 0.05 °/s rms; 400 µg/√Hz, at 94 Hz of bandwidth 0.005 g). Doubling it accepts slow motion as rest.
 _WINDOW_S = 1.0
 _REST_GYRO_RAD_S = 0.01
 _REST_ACCEL_M_S2 = 0.5

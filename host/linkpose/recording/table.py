@@ -21,7 +21,7 @@ from linkpose.recording.parquet import ParquetTable, is_parquet
 from linkpose.recording.textfile import Part, TextTable, metadata_of
 from linkpose.sensors.measurements import Floats
 
-# A step of more than so many usual ones is a gap; a reference is interpolated over no longer hole.
+# A step longer than this many usual steps is a gap; a reference is not interpolated over it.
 LONGEST_HOLE = 3.5
 
 

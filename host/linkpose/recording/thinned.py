@@ -14,9 +14,9 @@ from linkpose.recording.table import LONGEST_HOLE, Progress, Table, TableFile, W
 from linkpose.recording.textfile import Part
 from linkpose.sensors.measurements import Floats
 
-MOST_ROWS = 500_000  # of a table that is kept whole: 83 min at 100 Hz. Twice of it doubles the memory of a plot
+MOST_ROWS = 500_000  # of a table that is kept whole: 83 min at 100 Hz. Doubling it doubles the memory of a plot
 # Rows at equal distances. They are at least four times as many as the extremes, so that the usual step between two kept
-# rows is the distance. Twice of it doubles the memory of a plot, and a picture has a few thousand columns of pixels.
+# rows is the distance. Doubling it doubles the memory of a plot, and a picture has a few thousand columns of pixels.
 _REGULAR_ROWS = 240_000
 _EXTREME_ROWS = 60_000
 
@@ -54,7 +54,7 @@ class Thinner:
     """Selects rows of consecutive parts: some at equal distances, and those with the extremes of each column."""
 
     def __init__(self, total: float, columns: int, share: float = 1.0) -> None:
-        """Of about `total` rows of so many columns; `share` of the usual number of rows is kept."""
+        """For about `total` rows of `columns` columns; `share` of the usual number of rows is kept."""
         self._distance = max(1, math.ceil(total / (share * _REGULAR_ROWS)))
         windows = max(1, int(share * _EXTREME_ROWS) // (2 * columns))
         self._window = max(2, math.ceil(total / windows))

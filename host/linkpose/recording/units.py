@@ -29,8 +29,12 @@ _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
 _MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
 _PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
+_THIN_AIR_PA = 54_000.0  # at 5100 m, where the highest town is
 _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
+_STRONGEST_M_S2 = 160.0  # the MPU-6050 reads up to 16 g, 156.9 m/s²
+_SPIKES = 0.001  # share of readings beyond these that are no wrong unit
+_TILTS_RAD_S = 0.1  # rms rate about horizontal axes at which gravity turns through the accelerometer's axes
 _LONGEST_STEP_S = 0.5
 
 
@@ -43,9 +47,10 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
     unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     time = _time(_median(np.diff(measurements.time_s)), rate_hz)
+    force = unit or _force(measurements)
     found = [
-        unit or _gravity(measurements, force_m_s2),
-        _rate(measurements.gyro_rad_s) or ("" if time else contradiction(measurements)),
+        force or _gravity(measurements, force_m_s2),
+        _rate(measurements.gyro_rad_s) or ("" if time or force else contradiction(measurements)),
         time,
         _pressure(_median(measurements.pressure_Pa)),
         _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
@@ -73,6 +78,24 @@ def is_negated(measurements: Measurements, j2s_m: Sequence[float]) -> bool:
     if np.count_nonzero(known) < _FEWEST_BLOCKS or _rms(motion[known]) < _MOVES_M_S2:
         return False
     return _rms(reversed_[known]) < 0.5 * _rms(as_is[known])
+
+
+def _force(measurements: Measurements) -> str:
+    """A remark if the accelerometer reads more than its range, or the same in all rows while the sensor tilts."""
+    known = np.isfinite(measurements.accel_m_s2).all(axis=1) & np.isfinite(measurements.gyro_rad_s).all(axis=1)
+    accel, gyro = measurements.accel_m_s2[known], measurements.gyro_rad_s[known]
+    if not len(accel):
+        return ""
+    sizes = np.abs(accel)
+    if np.count_nonzero(sizes.max(axis=1) > _STRONGEST_M_S2) > _SPIKES * len(sizes):
+        return (
+            f"accel_* is up to {sizes.max():.0f} m/s², more than the sensor reads: check the unit of each axis, which "
+            "is m/s²"
+        )
+    force = np.linalg.norm(accel[0])
+    if force > 0 and not np.ptp(accel, axis=0).any() and _rms(np.cross(gyro, accel[0] / force)) > _TILTS_RAD_S:
+        return "accel_* is the same in all rows while the sensor tilts: the accelerometer gives no reading there"
+    return ""
 
 
 def _gravity(measurements: Measurements, force_m_s2: Floats) -> str:
@@ -122,6 +145,8 @@ def _pressure(median_pa: float) -> str:
             f"pressure_Pa is {median_pa:.4g} (median): is it in mmHg? multiply it by 133.322. If it is in hPa, at 2 to "
             "4 km of altitude, multiply it by 100"
         )
+    if 0.5 * _AIR_PA < median_pa < _THIN_AIR_PA:
+        return f"pressure_Pa is {median_pa:.0f} (median), as above 5100 m of altitude: check its unit and the sensor"
     return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS)
 
 
@@ -142,7 +167,7 @@ def _median(values: Floats) -> float:
 
 def _rate(gyro_rad_s: Floats) -> str:
     rates = np.abs(gyro_rad_s[np.isfinite(gyro_rad_s)])
-    if np.count_nonzero(rates > _FASTEST_RAD_S) <= 0.001 * len(rates):  # single spikes are not a wrong unit
+    if np.count_nonzero(rates > _FASTEST_RAD_S) <= _SPIKES * len(rates):
         return ""
     return (
         f"gyro_* is up to {rates.max():.0f} rad/s, more than the sensor reads: is it in °/s? "

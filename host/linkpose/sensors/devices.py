@@ -151,7 +151,7 @@ def mouse_remarks(hello: Hello) -> Iterator[str]:
 MOUSE_COUNTS = 255  # that a packet of a PS/2 mouse holds: 9 bits, two's complement
 USUAL_POLL_S = 0.0075  # a poll of usual mice with its margin: firmware/README.md, "Mice"
 # Above it a mouse's counts are no limit in practice: most office sensors lose the surface at 0.3 to 0.5 m/s, good ones
-# at 1 m/s. Twice of it warns of mice that are fast enough.
+# at 1 m/s. Doubling it warns of mice that are fast enough.
 ENOUGH_SPEED_M_S = 1.0
 
 

@@ -28,23 +28,37 @@ class Measurements:
     """N consecutive samples in the sensors' own axes, before the rig's calibration. A value that is missing is NaN.
 
     All arrays are C-contiguous. A block of one sample and a whole recording have the same form.
+
+    Attributes:
+        time_s: (N,) device clock fitted to the host's (s), 0 at the recording's start, increasing.
+        accel_m_s2: (N, 3) specific force, +9.81 along the upward axis at rest.
+        gyro_rad_s: (N, 3) angular rate.
+        imu_temp_degC: (N,) temperature of the inertial sensor.
+        pressure_Pa: (N,) the last compensated pressure, repeated until the next one.
+        baro_temp_degC: (N,) temperature of the barometer.
+        baro_fresh: (N,) True at the first sample that carries a new pressure.
+        mice_counts: (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where MICE_STALE is set.
+        flags: (N,) `linkpose.wire.messages.SampleFlags`.
+        accel2_m_s2, gyro2_rad_s: (N, 3) the second inertial sensor's, in its own axes; NaN without such a sensor.
+        imu2_temp_degC: (N,) temperature of the second inertial sensor.
+        mag_uT: (N, 3) field in the magnetometer's axes, repeated until the next reading; NaN without a magnetometer.
+        mag_fresh: (N,) True where a new field arrived.
     """
 
-    time_s: Floats  # (N,) device clock fitted to the host's, 0 at the recording's start, increasing
-    accel_m_s2: Floats  # (N, 3) specific force, +g along the upward axis at rest
-    gyro_rad_s: Floats  # (N, 3) angular rate
-    imu_temp_degC: Floats  # (N,)
-    pressure_Pa: Floats  # (N,) the last compensated pressure, repeated until the next
-    baro_temp_degC: Floats  # (N,)
-    baro_fresh: NDArray[np.bool_]  # (N,) True at the first sample that carries a new pressure
-    mice_counts: Floats  # (N, M, 2) counts dx, dy of each mouse since it was last read; 0 where MICE_STALE is set
-    flags: NDArray[np.uint32]  # (N,) wire.messages.SampleFlags
-    # A second inertial sensor and a magnetometer; NaN (and False) in all rows if there is none.
-    accel2_m_s2: Floats = None  # type: ignore[assignment]  # (N, 3) as the first sensor's, in the second sensor's axes
-    gyro2_rad_s: Floats = None  # type: ignore[assignment]  # (N, 3)
-    imu2_temp_degC: Floats = None  # type: ignore[assignment]  # (N,)
-    mag_uT: Floats = None  # type: ignore[assignment]  # (N, 3) field in the magnetometer's axes, repeated until the next reading
-    mag_fresh: NDArray[np.bool_] = None  # type: ignore[assignment]  # (N,) True where a new field arrived
+    time_s: Floats
+    accel_m_s2: Floats
+    gyro_rad_s: Floats
+    imu_temp_degC: Floats
+    pressure_Pa: Floats
+    baro_temp_degC: Floats
+    baro_fresh: NDArray[np.bool_]
+    mice_counts: Floats
+    flags: NDArray[np.uint32]
+    accel2_m_s2: Floats = None  # type: ignore[assignment]
+    gyro2_rad_s: Floats = None  # type: ignore[assignment]
+    imu2_temp_degC: Floats = None  # type: ignore[assignment]
+    mag_uT: Floats = None  # type: ignore[assignment]
+    mag_fresh: NDArray[np.bool_] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         """Absent sensors become rows of NaN, without memory of their own."""

@@ -12,7 +12,7 @@ from linkpose.wire.messages import Sample
 _SEQ_WRAP = 1 << 16
 _T_WRAP = 1 << 32
 # How far the board's clock may be off its own count of ticks, in ticks, over at most WINDOW_TICKS: 5 %. The timer that
-# counts the ticks also stamps the samples, so that they agree; twice of it notices a slow clock half as early.
+# counts the ticks also stamps the samples, so that they agree. Doubled, a slow clock is detected half as early.
 OFF_TICKS = 5
 WINDOW_TICKS = 100
 
@@ -25,7 +25,7 @@ class Clock(Protocol):
 
 
 class BoardClock:
-    """The board's own seconds, for samples whose arrival nobody stamped (a raw capture, a simulation)."""
+    """The board's own seconds, for samples without a time of arrival (a raw capture, a simulation)."""
 
     def __init__(self) -> None:
         self._last_us = 0
@@ -46,7 +46,7 @@ class Gap:
     after_s: float  # time of the last sample before it
     duration_s: float
     lost: int
-    cause: str  # "link": frames lost or dropped; "reset": the board started anew; "cable": the port was gone
+    cause: str  # "link": frames lost or dropped; "reset": the board restarted; "cable": the port was gone
 
     def as_dict(self) -> dict[str, float | int | str]:
         """For a recording's closing line."""
@@ -155,7 +155,7 @@ class Timeline:
             self.gaps.append(Gap(last_s, self._end_s - last_s, missing, self._cause))
 
     def interrupted(self, cause: str) -> None:
-        """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters start anew."""
+        """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters restart."""
         self._cause, self._restarted = cause, True
         self.stamps.restart()
 

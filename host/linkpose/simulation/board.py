@@ -79,7 +79,7 @@ class SimulatedBoard:
     """The firmware's behaviour at the wire. Times are microseconds of the board's own clock since power-on."""
 
     def __init__(self, make_run: Callable[[Configure], Run]) -> None:
-        """`make_run` gives the rig as sensors with these settings see it."""
+        """`make_run` returns the rig as sensors with these settings measure it."""
         self._make_run = make_run
         self._decoder = StreamDecoder(from_board=False)
         self._settings = DEFAULTS

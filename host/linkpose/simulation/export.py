@@ -82,7 +82,7 @@ def _truth_blocks(run: LinkRun) -> Iterator[Mapping[str, Floats]]:
 
 
 def write_mice(run: MiceRun, resolution: int, recording: Path, truth: Path, force: bool) -> None:
-    """The recording of a robot with mice of so many counts per mm, and its truth."""
+    """The recording of a robot whose mice have `resolution` counts per mm, and its truth."""
     check_outputs((recording, truth), force)
     name = f"sim://mice?seed={run.seed}&mice={len(run.mice)}&path={run.path}&errors={run.errors}"
     write_truth(truth, run.truth().columns(), {"device": name, "rig": run.rig.as_dict()}, force)

@@ -144,7 +144,7 @@ def white(seed: tuple[int, ...], first: int, count: int, width: int) -> Floats:
 
 @lru_cache(maxsize=8)
 def _white_block(seed: tuple[int, ...], block: int, width: int) -> Floats:
-    """Kept for a while, because a live board asks for one reading at a time."""
+    """Cached, because a live board reads one sample at a time."""
     return np.random.default_rng([*seed, block]).standard_normal((_BLOCK, width))
 
 

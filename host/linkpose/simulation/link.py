@@ -1,6 +1,6 @@
 """The rig of the first paper: a link on a ball joint, moved by hand, with a GY-87 on it. Tests 1 to 3.
 
-Truth is a function of time, so any instant may be asked for. What the sensors give is a function of the instant and of
+Truth is a function of time and defined at any instant. What the sensors give is a function of the instant and of
 the reading's number (its noise), so that a run is the same whether it is made whole, in blocks, or sample by sample.
 """
 

@@ -33,7 +33,7 @@ PAPER_SIDE_M = 0.3
 PAPER_TWIST = (0.01, 0.01, 0.0)  # m/s, m/s, rad/s
 PAPER_NOISE_M_S = 0.0025
 NOISE_S = 0.01  # for which a mouse's noise keeps its value
-_POLL_S = 0.0075  # that the firmware leaves the mice to answer, before it asks them again at a tick
+_POLL_S = 0.0075  # that the firmware allows the mice for an answer before it polls them again at a tick
 _TEMPERATURE_DEGC = 27.0
 _BLOCK = 1000  # samples, or draws of noise, made at once
 
@@ -41,7 +41,7 @@ _BLOCK = 1000  # samples, or draws of noise, made at once
 _DRIVE, _ERRORS, _PHASE, _SCATTER, _FLOOR, _IMU_NOISE, _MOUNTING = range(7)
 
 PATHS = ("drive", "paper", "line", "turn")
-SEEN = {"slip": 0.3, "lift": 0.0, "unplug": 0.0}  # kind of fault -> share of its way that the mouse sees
+SEEN = {"slip": 0.3, "lift": 0.0, "unplug": 0.0}  # kind of fault -> share of its way that the mouse counts
 
 
 @dataclass(frozen=True, slots=True)

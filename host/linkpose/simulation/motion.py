@@ -53,7 +53,7 @@ class Kinematics:
 class HandMotion:
     """Sums of tones in roll, pitch and yaw under an envelope that keeps the link still at the start and at the end.
 
-    All instants are functions of (seed, tempo, amplitude, duration): any time may be asked for, in any order.
+    All instants are functions of (seed, tempo, amplitude, duration): times may be evaluated in any order.
     """
 
     def __init__(self, rng: np.random.Generator, tempo: float, duration_s: float | None) -> None:

@@ -170,7 +170,7 @@ def read_capture(file: BinaryIO) -> Iterator[Capture]:
         data = rest + piece
         end = data.rfind(b"\0") + 1
         rest = data[end:]
-        if len(rest) > _PIECE_BYTES:  # no frame is so long: keep enough of it to see that
+        if len(rest) > _PIECE_BYTES:  # longer than any frame: keep enough of it to detect that
             rest = rest[: 2 * MAX_FRAME]
         if end:
             part = _decode_part(data[:end], before, decoder)

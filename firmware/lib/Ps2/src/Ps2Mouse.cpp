@@ -151,7 +151,7 @@ void Ps2Mouse::begin_reset() {
 uint8_t Ps2Mouse::set_up_byte() const {
   const Step step = step_at(step_);
   if (step.argument) return step.byte == kResolutionArgument ? resolution_code(wanted_resolution_) : kReportRateHz;
-  return step_ == kModeStep && stream_ ? kStreamMode : step.byte;
+  return step_ == kModeStep && stream_ ? uint8_t{kStreamMode} : step.byte;
 }
 
 Ps2Mouse::Presence Ps2Mouse::presence() const {

@@ -3,7 +3,8 @@
 The covariance changes some 25 times in a second. From one change to the next it is held: that of the attitude in n and
 that of J2S in the sensor's axes, which the rotation of the sensor does not change. σ of position and angles follow from
 it and the attitude at each sample. (A sensor one metre from the centre that turns by 40° meanwhile would otherwise have
-σ of another direction.)
+σ of another direction.) Since the change, the attitude has gained the noise of the rates and the rotation by an unknown
+gyro bias. After switch-on, 20 °/s turn it by 0.7° until the first propagation.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import LONGEST_HOLD_S, ImuCalibration
 from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.inertial.propagate import corrected
-from linkpose.filters.inertial.state import BA, HEIGHT, MG, PITCH, PSI, ROLL, YAW, D, Record, X, Y, Z
+from linkpose.filters.inertial.state import BA, BG, HEIGHT, MG, PITCH, PSI, ROLL, YAW, D, Record, X, Y, Z
 from linkpose.filters.inertial.update import sub_covariance
 
 _NO_SENSOR_S = 1.0  # without a usable sample for longer there is no estimate
@@ -32,8 +33,10 @@ def report(s: Record, time_s: float, imu: ImuCalibration, row: Record) -> None:
     _report_values(tilt, north, west, vec.load(s.j2s), row)
     if s.span == 0.0:  # the covariance belongs to this sample
         _follow_covariance(s)
-    _report_position_stds(s, tilt, north, west, row)
-    _report_angle_stds(s, tilt, north, west, row)
+    gained = s.rotation_variance + s.span * s.span * vec.trace(sub_covariance(s.covariance, BG)) / 3.0
+    _report_position_stds(s, gained, tilt, north, west, row)
+    _report_angle_stds(s, gained, tilt, north, west, row)
+    row.unmoved = s.unmoved
     row.distance, row.tilt_level, row.heading_level = s.distance, s.tilt_level, s.heading_level
     bias = sub_covariance(s.covariance, BA)
     across = vec.trace(bias) - vec.quadratic(bias, tilt)
@@ -98,8 +101,8 @@ def _follow_axis(s: Record, i: int, axis: Vec, north: Vec, west: Vec, tilt: Vec)
 
 
 @inner
-def _report_position_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
-    """σ of height, x and y.
+def _report_position_stds(s: Record, gained: float, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
+    """σ of height, x and y; `gained`: variance of a rotation about each axis since the covariance changed (rad²).
 
     With δZ in n and ψ, and d = (x, y, h) in n, they change by d·δZ + Zᵀδd, −h XᵀδZ − y ψ + Xᵀδd and
     −h YᵀδZ + x ψ + Yᵀδd.
@@ -110,11 +113,11 @@ def _report_position_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Reco
     to_z, to_heading = vec.load(s.lever_covariance[2]), vec.load(s.lever_covariance[3])
     attitude = vec.quadratic((t[0, 0], t[0, 1], t[0, 2], t[1, 1], t[1, 2], t[2, 2]), (x, y, height))
     both = vec.axpy(x, to_x, vec.axpy(y, to_y, vec.scale(height, to_z)))
-    row.std[HEIGHT] = _std(attitude, both, lever, tilt)
-    attitude = height * height * t[0, 0] + 2.0 * height * y * t[0, 3] + y * y * t[3, 3]
+    row.std[HEIGHT] = _std(attitude + gained * (x * x + y * y), both, lever, tilt)
+    attitude = height * height * (t[0, 0] + gained) + 2.0 * height * y * t[0, 3] + y * y * (t[3, 3] + gained)
     both = vec.axpy(-height, to_x, vec.scale(-y, to_heading))
     row.std[X] = _std(attitude, both, lever, north)
-    attitude = height * height * t[1, 1] - 2.0 * height * x * t[1, 3] + x * x * t[3, 3]
+    attitude = height * height * (t[1, 1] + gained) - 2.0 * height * x * t[1, 3] + x * x * (t[3, 3] + gained)
     both = vec.axpy(-height, to_y, vec.scale(x, to_heading))
     row.std[Y] = _std(attitude, both, lever, west)
 
@@ -126,15 +129,16 @@ def _std(attitude: float, both: Vec, lever: Sym, axis: Vec) -> float:
 
 
 @inner
-def _report_angle_stds(s: Record, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
-    """σ of roll, pitch and yaw.
+def _report_angle_stds(s: Record, gained: float, tilt: Vec, north: Vec, west: Vec, row: Record) -> None:
+    """σ of roll, pitch and yaw; `gained` as above.
 
     The attitude error is the rotation θ = ψ Z − Z × δZ; in n, it is (YᵀδZ, −XᵀδZ, ψ). With h = (X_x, Y_x), the
     horizontal part of the sensor's x axis in n, the angles change by h·θ / ‖h‖² (roll), (h × θ)_z / ‖h‖ (pitch) and
     θ_z − Z_x h·θ / ‖h‖² (yaw).
     """
     t = s.turn_covariance
-    xx, xy, xz, yy, yz, zz = t[1, 1], -t[0, 1], t[1, 3], t[0, 0], -t[0, 3], t[3, 3]
+    xx, yy, zz = t[1, 1] + gained, t[0, 0] + gained, t[3, 3] + gained
+    xy, xz, yz = -t[0, 1], t[1, 3], -t[0, 3]
     x, y = north[0], west[0]
     level = max(x * x + y * y, _LEAST_LEVEL)
     along = x * x * xx + 2.0 * x * y * xy + y * y * yy

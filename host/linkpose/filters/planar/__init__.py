@@ -92,8 +92,7 @@ class _PlanarFilter:
         self._placed, self._mice = mouse_records(rig.mouse)[: len(rig.mouse)], mouse_records(rig.mouse)
         self._parameters, self._planar = record_of(self.parameters), record_of(self.planar)
         self._mice_state = fresh_state(len(rig.mouse), BIAS_STD)
-        self._tangent = None if self._is_ukf else zeros(1, TANGENT)
-        self._points = zeros(1, SIGMA) if self._is_ukf else None
+        self._tangent, self._points = zeros(int(not self._is_ukf), TANGENT), zeros(int(self._is_ukf), SIGMA)
         self.state = fresh_planar_state(len(rig.mouse), self.planar, rig.imu.gyro_noise_rad_s**2)
 
     @property
@@ -156,8 +155,8 @@ class _PlanarFilter:
         state, limit = self.state[0], float(self._mice_state[0].speed_limit)
         if limit > 0.0:
             yield (
-                f"the mice show no speed above {limit:.2f} m/s, where the gyro shows faster turns: this is the limit "
-                "of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
+                f"the mice show no speed above {limit:.2f} m/s, where gyro or accelerometer show more: this is the "
+                "limit of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
                 "includes it. Drive slower, or use mice for higher speeds"
             )
         if state.resolution.changes:

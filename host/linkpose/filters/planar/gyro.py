@@ -64,7 +64,10 @@ def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
         return
     motion = _motion_by_mice(state, m, mice, p)
     if motion < 0 or m.missed > 0.0 or m.is_saturated:
-        _advance_other(state, complex(state.at.vx, state.at.vy), state.at.wz, m.step + m.missed)
+        if state.dispute.up == 0.0 and state.dispute.down == 0.0:
+            agree(state)  # the update of the bias at a rest corrects the heading of the past in one pose only
+        else:
+            _advance_other(state, complex(state.at.vx, state.at.vy), state.at.wz, m.step + m.missed)
         return
     _watch_dead_gyro(state, m, motion)
     turn_rate = m.fit_turn if motion else 0.0

@@ -12,6 +12,7 @@ from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
+from linkpose.filters.planar.acceleration import forget, watch_acceleration
 from linkpose.filters.planar.gyro import agree, is_undecided, restart_turns, watch_gyro, widen_way
 from linkpose.filters.planar.limit import watch_limit
 from linkpose.filters.planar.measure import arm, update
@@ -45,9 +46,10 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
-# Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
-# (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
-_ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# Another floor shows in two turns in a row, each of at least this much turning (rad²/s), equal within this share.
+# A turn ends below this rate (rad/s). A slip lasts for one turn. Doubled: a floor is found later. Doubled share: a
+# floor that varies is taken for another one.
+_ONE_TURN, _FLOOR_EQUAL, _TURN_END_RAD_S = 0.05, 0.3, 0.1
 # Turns in which the mice show different shares of the gyro's turn: noise of a share (1σ, by positions, angles and the
 # bias), standard deviations from which a difference counts, and turns over which it is averaged. Doubled noise: slips
 # of 3 % do not widen the position.
@@ -155,7 +157,8 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     latest, before = _off_of_turn(state), state.off_of_turn
     if latest == 0.0:
         latest, before = before, state.off_of_turn_before
-    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
+    varies = abs(latest - before) > _FLOOR_EQUAL * abs(off) or state.turn_spread > off * off
+    if varies or not latest / off > 0.5 or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
@@ -381,19 +384,16 @@ def _calibrate(state: Record, m: Record, mice: Records, rig: Records) -> None:
 
 
 @inner
-def _advance(state: Record, tangent: Records | None, points: Records | None, dt: float) -> bool:
-    """Carry the pose on by `dt` (s) with the velocity. The compiler drops the branch of the other filter."""
-    if tangent is not None:
-        linear.advance(state, dt)
-    if points is not None:
+def _advance(state: Record, points: Records, dt: float) -> bool:
+    """Carry the pose on by `dt` (s) with the velocity; False where the covariance is not positive definite."""
+    if len(points):
         return sigma.advance(state, points[0], dt)
+    linear.advance(state, dt)
     return True
 
 
 @inner
-def _correct(
-    state: Record, tangent: Records | None, points: Records | None, rig: Records, m: Record, dt: float
-) -> bool:  # fmt: skip
+def _correct(state: Record, tangent: Records, points: Records, rig: Records, m: Record, dt: float) -> bool:
     """Update with the measurement, for a while without mice that contradict the prediction.
 
     Mice that slip or are lifted contradict at once; the fault tests take a few steps to find them, in which they would
@@ -402,9 +402,9 @@ def _correct(
     if state.rows == 0:
         return True
     limit = fault_limit(state.rows)
-    if tangent is not None:
+    if not len(points):
         linear.moments(state, tangent[0], rig, m.mean_rate)
-    if points is not None and not sigma.moments(state, points[0], rig, m.mean_rate):
+    elif not sigma.moments(state, points[0], rig, m.mean_rate):
         return False
     before = complex(state.at.vx, state.at.vy)
     is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated or state.snapped)
@@ -433,6 +433,7 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
             _restore_way(state, shown)
         if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
             state.unconfirmed_s = -_SPREAD_S
+            forget(state.acceleration)  # it would contradict the jump back
     elif state.unconfirmed_s < 0.0:
         state.unconfirmed_s = min(state.unconfirmed_s + dt, 0.0)
     elif is_jump and square(shown - state.earlier) > limit * limit:
@@ -482,7 +483,8 @@ def _add_saturated_way(state: Record, m: Record, dt: float) -> None:
     """Add the variance of a way of which saturated mice show a lower bound only."""
     if not m.is_saturated:
         return
-    way = scaled(_SATURATED_SHARE * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+    share = max(_SATURATED_SHARE, state.limited_share)
+    way = scaled(share * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
     state.saturated_m += _add_systematic(state, way, state.saturated_m)
 
 
@@ -545,8 +547,8 @@ def _is_lone_count(mouse: Record) -> bool:
 
 @inner
 def _step(
-    state: Record, tangent: Records | None, points: Records | None, m: Record, mice: Records, rig: Records, p: Record,
-    q: Record, sample: Record,
+    state: Record, tangent: Records, points: Records, m: Record, mice: Records, rig: Records, p: Record, q: Record,
+    sample: Record,
 ) -> None:  # fmt: skip
     """One reading of the mice."""
     if not reading.begin_step(m, sample.time):
@@ -559,11 +561,11 @@ def _step(
     is_silent = _are_silent(m, mice)
     _restart_spoilt(state, m.excluded & ~before)
     watch_rest(state, is_silent, m.rate, dt, sample.time)
-    is_good = half == 0.0 or _advance(state, tangent, points, half)
+    is_good = half == 0.0 or _advance(state, points, half)
     _move_on(state, q, dt)
     _collect(state, m, mice, rig, sample, p)
     state.rejected += state.rows == 0 or (m.used == 0 and not state.at_rest)
-    is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, tangent, points, dt - half)
+    is_good = is_good and _correct(state, tangent, points, rig, m, dt) and _advance(state, points, dt - half)
     if not is_good:
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
@@ -572,6 +574,7 @@ def _step(
     _add_unconfirmed_way(state, m, dt)
     _add_saturated_way(state, m, dt)
     watch_limit(state, m, mice)
+    watch_acceleration(state, m, mice, sample.accel)
     _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)
@@ -599,9 +602,8 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     way = scaled(since, turned(turned(unit(at.heading), turned_mean(turn)), velocity))
     out.x, out.y, out.heading = at.x + way.real, at.y + way.imag, wrapped(at.heading + turn)
     out.vx, out.vy, out.wz = at.vx, at.vy, at.wz
-    lag = since
-    if not state.at_rest and math.isfinite(m.interval):
-        lag += 0.5 * m.interval
+    # At rest too: the robot starts before the first count, and before its rate exceeds the noise of the gyro.
+    lag = since + (0.5 * m.interval if math.isfinite(m.interval) else 0.0)
     by_scale, by_angle = _common_errors(state, m, mice)
     other = state.dispute.position - complex(at.x, at.y)
     spread, last = state.turn_spread, complex(at.x, at.y) - state.turn_end
@@ -616,12 +618,13 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
 @compiled
 def process(
     samples: Records, parameters: Records, planar: Records, rig: Records, mice: Records, mice_states: Records,
-    tangent: Records | None, points: Records | None, states: Records, out: Records,
+    tangent: Records, points: Records, states: Records, out: Records,
 ) -> None:  # fmt: skip
     """Every sample of a block: estimates (N,) of ESTIMATE into `out`.
 
     `parameters` are MiceParameters, `planar` PlanarParameters, `rig` the mice as the rig places them, `mice` as the
-    filter has calibrated them. The extended filter has a `tangent`, the unscented one has `points`; the other is None.
+    filter has calibrated them. The extended filter has one `tangent`, the unscented one has one `points`; the other
+    array is empty. Both run the same machine code, which is therefore compiled once.
     """
     state, m, p, q = states[0], mice_states[0], parameters[0], planar[0]
     for k in range(len(samples)):

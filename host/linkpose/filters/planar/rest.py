@@ -63,12 +63,33 @@ def _contradicts(state: Record, rate: float) -> bool:
 
 @inner
 def _end_rest(state: Record) -> None:
-    """The robot has begun to turn within the current block, in which the filter took it to stand still."""
-    if state.at_rest and state.block_count > 0:
-        state.at.heading += (state.block_sum / state.block_count - state.at.bias) * state.block_s
+    """The robot has begun to turn, perhaps up to QUEUE blocks ago: in this time, the gyro shows the turn."""
+    if state.at_rest:
+        turn, span, count = state.block_sum, state.block_s, state.block_count
+        turn = turn * span / count if count > 0 else 0.0
+        variance = span * span / count if count > 0 else 0.0
+        for k in range(max(0, state.queued - state.queued_at_rest), state.queued):
+            block = state.queue[k]
+            turn += block.mean * _BLOCK_S
+            variance += _BLOCK_S * _BLOCK_S / block.count
+            span += _BLOCK_S
+        _turn_by_gyro(state, turn, span, state.gyro_variance * variance)
     state.rest_s = state.block_s = state.block_sum = state.block_squares = 0.0
-    state.block_count = state.queued = 0
+    state.block_count = state.queued = state.queued_at_rest = 0
     state.at_rest = False
+
+
+@inner
+def _turn_by_gyro(state: Record, turn: float, span: float, variance: float) -> None:
+    """Turn the heading by a turn of the gyro (rad, its bias included, with its variance) over the time `span` (s)."""
+    p = state.covariance
+    state.at.heading += turn - state.at.bias * span
+    state.dispute.heading += turn - state.at.bias * span
+    for k in range(state.size):  # F P
+        p[HEADING, k] -= span * p[BIAS, k]
+    for k in range(state.size):  # (F P) Fᵀ
+        p[k, HEADING] -= span * p[k, BIAS]
+    p[HEADING, HEADING] += variance
 
 
 @inner
@@ -92,6 +113,7 @@ def _finish_block(state: Record, time_s: float) -> bool:
     block.mean, block.count = mean, count
     block.squares = max(0.0, state.block_squares - count * mean * mean)
     state.queued += 1
+    state.queued_at_rest += state.at_rest
     state.block_s = state.block_sum = state.block_squares = 0.0
     state.block_count = 0
     return True

@@ -100,6 +100,33 @@ _DISPUTE = np.dtype(
     align=True,
 )
 
+# The accelerometer against the mice, see `acceleration`. b are the axes of the sensor, n those in which the turn was 0.
+SLOTS = 14
+_SLOT = np.dtype(
+    [
+        ("span", "f8"),  # length (s)
+        ("force", "c16"),  # ∫ specific force dt in b (m/s)
+        ("way", "c16"),  # ∫ velocity by the mice dt in b (m)
+        ("facing", "c16"),  # ∫ e^{jψ} dt of the turn ψ (s)
+        ("force_n", "c16"),  # as `force` and `way`, in n
+        ("way_n", "c16"),
+        ("turn", "f8"),  # ψ at the end (rad)
+        ("rate", "f8"),  # largest turn rate, without its sign (rad/s)
+    ],
+    align=True,
+)
+_ACCELERATION = np.dtype(
+    [
+        ("last", "c16"),  # value of the accelerometer (m/s²)
+        ("repeats", "i8"),  # how often it has been the same to the last bit
+        ("turn", "f8"),  # by the gyro, less its bias (rad)
+        ("noise", "f8"),  # variance of one value, both axes together ((m/s²)²)
+        ("filled", "i8"),  # slots without a gap between them
+        ("slots", _SLOT, (SLOTS,)),
+    ],
+    align=True,
+)
+
 _FIELDS = [
     ("size", "i8"),  # of the state with the rig's mice
     ("mean", *_VECTOR),
@@ -116,6 +143,7 @@ _FIELDS = [
     ("block_count", "i8"),
     ("queue", _REST_BLOCK, (QUEUE,)),  # finished blocks
     ("queued", "i8"),
+    ("queued_at_rest", "i8"),  # those of them during which the filter took the robot to stand still
     # Common scale of the mice against the gyro: sums over the last turns.
     ("turn_square", "f8"),  # ∫ ω² dt of the gyro (rad²/s)
     ("turn_product", "f8"),  # ∫ ω ω_mice dt (rad²/s)
@@ -133,6 +161,7 @@ _FIELDS = [
     ("turns", "i8"),  # number of turns that have been compared
     ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("dispute", _DISPUTE),
+    ("acceleration", _ACCELERATION),
     ("resolution", _RESOLUTION),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
@@ -158,6 +187,7 @@ _FIELDS = [
     ("fastest", "f8"),  # largest speed of a mouse so far (m/s)
     ("limited_x", "f8"),  # way at about that speed, along either axis of n (m)
     ("limited_y", "f8"),
+    ("limited_share", "f8"),  # σ of the way at the limit, as a share of it; 0 until a limit has been found
     ("limit_s", "f8"),  # how long mice at that speed have contradicted the gyro (s)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
@@ -244,6 +274,7 @@ class PlanarParameters(NamedTuple):
     turn_s: float = 1.0
     # Gyro: random walk of the bias (rad/s per √s) with an Allan deviation of 0.0023 °/s at 100 s; the axes of a real
     # MPU-6050 had 0.003, 0.0013 and 0.0007 °/s. Doubled: a rest is trusted a quarter as long.
+    noise_factor: float = 2.5  # of the rig's gyro noise, until the first rest shows it: real sensors reach 0.13 °/s
     bias_rad_s: float = 0.35  # never calibrated: ±20 °/s (data sheet)
     bias_walk: float = math.radians(4e-4)
     # Mice: what `calibrate mice` leaves common to all mice: its line of 2 m, measured and driven straight to 2 mm ...
@@ -266,11 +297,11 @@ class PlanarParameters(NamedTuple):
 
 
 def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
-    """An array of one state record before the first sample."""
+    """An array of one state record before the first sample; `gyro_variance` is the rig's, of one sample ((rad/s)²)."""
     records = zeros(1, STATE)
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
-    state.gyro_variance, state.gyro_samples = gyro_variance, 20.0
+    state.gyro_variance, state.gyro_samples = p.noise_factor**2 * gyro_variance, 20.0
     state.resolution.share = 1.0
     covariance = state.covariance
     for index, std in (

@@ -1,0 +1,158 @@
+"""Signs that an estimate and a reference do not belong together: other runs, frames, units or signs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+
+import numpy as np
+
+from linkpose.evaluation.scoring import LINK, Compared
+from linkpose.evaluation.series import Pair, paired
+from linkpose.evaluation.takes import MOTION_CAPTURE
+from linkpose.quantities import ANGLE, CHAIN_ROTATION, HEADING, PITCH, ROLL, VX, VY, WZ, YAW, Quantity, X, Y
+from linkpose.recording.table import Table
+from linkpose.sensors.measurements import Floats
+
+_UNRELATED = 0.9  # share of the reference's motion that remains when even the best filter's is subtracted
+_SAME_TILT_DEG = 30.0
+_MIRRORED = 0.8  # correlation, negated
+# Two columns in different units or of different sign move alike: their correlation is above _ALIKE, and the ratio of
+# their motions is within _NEAR of one of _UNITS. Errors of estimates by a tenth change the correlation by 0.005.
+_ALIKE = 0.98
+_NEAR = 0.05
+_UNITS = (0.5, 2.0, np.pi / 180, 180 / np.pi, 0.001, 1000.0, 0.01, 100.0, -1.0)
+_STILL = 1e-3  # share of the estimate's motion; errors of a still reference are far below it
+_FEWEST = 20  # instants; fewer correlate by chance
+_MOVES_RAD, _MOVES_M = 0.1, 0.05  # standard deviations (rad; m, m/s or rad/s) of estimates that are no error alone
+
+
+def mismatches(
+    estimate: Table, reference: Table, compared: Mapping[str, Compared], offset_s: float, residual: float
+) -> list[str]:
+    """Evidence that the files are of different runs or frames, or have columns in different units.
+
+    `compared` has the filters by name; `offset_s` and `residual` are those of `common_offset`.
+    """
+    found = _of_frames(estimate, reference, compared.values(), residual, offset_s)
+    return [*found, *_of_units(estimate, reference, compared, offset_s)]
+
+
+def _of_frames(
+    estimate: Table, reference: Table, compared: Collection[Compared], residual: float, offset_s: float
+) -> list[str]:
+    both_files = f"{estimate.path} and {reference.path}"
+    tilts = [both.pairs for both in compared if ROLL in both.pairs and PITCH in both.pairs]
+    apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
+    if apart > _SAME_TILT_DEG:
+        cure = (
+            "try the other axis with --up y or z, and check the order of the markers"
+            if reference.kind == MOTION_CAPTURE
+            else "are they of the same run, and of the same axes?"
+        )
+        return [f"{both_files} have their tilts {apart:.0f}° apart (median, the nearest filter's): {cure}"]
+    if any(_is_mirrored(both.pairs[ANGLE]) for both in compared if ANGLE in both.pairs):
+        return [
+            f"{both_files} count the joint angle in opposite senses: the sense of an axis that a filter finds is "
+            "arbitrary; negate axis1 and axis2 in the rig file and estimate again"
+        ]
+    is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
+    if is_link and _UNRELATED < residual < np.inf:
+        return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
+    velocities = [both.pairs[q] for both in compared for q in (VX, VY, WZ) if q in both.pairs]
+    unrelated = [found for pair in velocities if (found := _is_unrelated(pair, offset_s)) is not None]
+    if unrelated and all(unrelated):
+        return [f"{both_files} have hardly any motion in common: are they of the same run, and their times in seconds?"]
+    return []
+
+
+def _is_unrelated(pair: Pair, offset_s: float) -> bool | None:
+    """Whether the difference of two velocities varies as much as each of them; None where the estimate is steady."""
+    moved = _moved(pair, offset_s)
+    if moved is None or np.std(moved[0]) < _MOVES_M:
+        return None
+    ours, theirs = moved
+    return bool(np.std(ours - theirs) > _UNRELATED * max(np.std(ours), np.std(theirs)))
+
+
+def _of_units(estimate: Table, reference: Table, compared: Mapping[str, Compared], offset_s: float) -> Iterator[str]:
+    """One sentence for each quantity in which estimate and reference move alike, but to another extent."""
+    for quantity in dict.fromkeys(q for both in compared.values() for q in both.pairs):
+        ratios = {
+            name: ratio
+            for name, both in compared.items()
+            if quantity in both.pairs and (ratio := _ratio(quantity, both, offset_s)) is not None
+        }
+        wrong = {name: near for name, ratio in ratios.items() if (near := _wrong_unit(ratio)) is not None}
+        if -1.0 in wrong.values() and quantity in (X, Y, ANGLE):  # a frame turned by half a turn; see _is_mirrored
+            continue
+        if wrong:
+            name = next(iter(wrong))
+            yield (
+                f"{reference.path}: {quantity.column} moves like the estimate of {name} in {estimate.path}, times "
+                f"{wrong[name]:.4g}: check its unit and its sign in both files"
+            )
+        elif any(_is_still(both.pairs[quantity], offset_s) for both in compared.values() if quantity in both.pairs):
+            yield (
+                f"{reference.path}: {quantity.column} is the same wherever the estimates move: check the column and "
+                "the times"
+            )
+
+
+def _ratio(quantity: Quantity, both: Compared, offset_s: float) -> float | None:
+    """By how much the reference moves more than the estimate, about the medians; None if they do not move alike.
+
+    Where a yaw may count from elsewhere, x and y may point elsewhere; their distance from the middle is compared then.
+    """
+    if quantity in CHAIN_ROTATION:
+        return None
+    is_turned = quantity in (X, Y) and (YAW in both.pairs or HEADING in both.pairs)
+    axes = [both.pairs[q] for q in ((X, Y) if is_turned else (quantity,)) if q in both.pairs]
+    moved = [found for pair in axes if (found := _moved(pair, offset_s)) is not None]
+    if not moved or len({len(ours) for ours, _ in moved}) > 1:
+        return None
+    ours, theirs = np.linalg.norm(moved, axis=0) if is_turned else moved[0]
+    sizes = np.linalg.norm(ours), np.linalg.norm(theirs)
+    if not min(sizes) > 0 or abs(ours @ theirs) < _ALIKE * sizes[0] * sizes[1]:
+        return None
+    return float(ours @ theirs / (ours @ ours))
+
+
+def _wrong_unit(ratio: float) -> float | None:
+    """The factor of a unit or a sign that this ratio is near to."""
+    return next((factor for factor in _UNITS if abs(ratio / factor - 1) < _NEAR), None)
+
+
+def _is_still(pair: Pair, offset_s: float) -> bool:
+    """Whether the reference is as good as constant while the estimate moves further than errors do."""
+    moved = _moved(pair, offset_s)
+    if moved is None or np.std(moved[1]) > _STILL * np.std(moved[0]):
+        return False
+    return bool(np.std(moved[0]) > (_MOVES_RAD if pair[0].is_angle else _MOVES_M))
+
+
+def _moved(pair: Pair, offset_s: float) -> tuple[Floats, Floats] | None:
+    """Estimate and reference (N,) without their medians where both are known; None for fewer than _FEWEST instants."""
+    ours, theirs = np.array(paired(*pair, offset_s))
+    known = np.isfinite(ours) & np.isfinite(theirs)
+    if np.count_nonzero(known) < _FEWEST:
+        return None
+    ours, theirs = (np.unwrap(angle[known]) if pair[0].is_angle else angle[known] for angle in (ours, theirs))
+    return ours - np.median(ours), theirs - np.median(theirs)
+
+
+def _is_mirrored(pair: Pair) -> bool:
+    """Whether an angle and its reference turn in opposite senses, on the clocks as they are."""
+    ours, theirs = np.array(paired(*pair, 0.0))
+    known = np.isfinite(ours) & np.isfinite(theirs)
+    if known.sum() < 3:
+        return False
+    turned = [angle[known] - np.median(angle[known]) for angle in (ours, theirs)]
+    return bool(turned[0] @ turned[1] < -_MIRRORED * np.linalg.norm(turned[0]) * np.linalg.norm(turned[1]))
+
+
+def _tilt_apart_deg(both: Mapping[Quantity, Pair], offset_s: float) -> float:
+    """Median angle between the two verticals, in the sensor's axes; 0 without an instant in common."""
+    roll, pitch = (np.array(paired(*both[quantity], offset_s)) for quantity in (ROLL, PITCH))
+    z = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])  # (3, 2, N)
+    angle = np.arccos(np.clip((z[:, 0] * z[:, 1]).sum(axis=0), -1.0, 1.0))
+    return float(np.degrees(np.median(angle[np.isfinite(angle)]))) if np.isfinite(angle).any() else 0.0

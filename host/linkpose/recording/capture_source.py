@@ -1,0 +1,189 @@
+"""A recording as a raw capture, the bytes that the board sent: its samples become measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.errors import FileFormatError
+from linkpose.inputs import open_binary
+from linkpose.recording.table import Progress
+from linkpose.sensors.conversion import (
+    COUNT_FIELDS,
+    GAP_BEFORE,
+    TIME_DECIMALS,
+    BoardSettings,
+    Converter,
+    RawSamples,
+)
+from linkpose.sensors.devices import impossible
+from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.rig import Rig
+from linkpose.sensors.timeline import OFF_TICKS, WINDOW_TICKS
+from linkpose.wire.frames import OtherProtocol
+from linkpose.wire.messages import PROTOCOL_MAJOR, Hello
+
+if TYPE_CHECKING:
+    from linkpose.wire.capture import Capture
+
+_T_WRAP = 1 << 32
+_SEQ_WRAP = 1 << 16
+
+
+class CaptureSource:
+    """A recording as the bytes that came from the board."""
+
+    closing: dict[str, Any] | None = None
+    rig: Rig | None = None
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._file = open_binary(path)
+        self._size = max(1, self._file.seek(0, 2))
+        self._restarts: list[int] = []  # samples before each
+        self._mouse_ports = self._samples = self._corrupt = self._lost = self._gaps = self._jumps = 0
+        self.settings = self._find_settings()
+        self.rate_hz = self.stated_rate_hz = float(self.settings.sample_rate_hz)
+        self.metadata: dict[str, Any] = {
+            "device": str(path),
+            "settings": self.settings.as_dict(),
+            "devices": [{"family": family} for family in self.settings.imu_families],
+        }
+        self.listed_sensors: list[str] = []
+        others = ["imu2"] * self.settings.has_imu2 + ["baro"] + ["mag"] * self.settings.has_mag
+        self.sensors = ["imu", *others, *(f"mouse{port}" for port in range(1, self._mouse_ports + 1))]
+
+    def blocks(self, progress: Progress | None) -> Iterator[Measurements]:
+        """All samples in SI units."""
+        converter = Converter(self.settings, self._mouse_ports)
+        clock = _CaptureClock(self._restarts, self.rate_hz)
+        for capture in self._parts(progress):
+            if len(capture.samples):
+                time_s, gap_before = clock.place(capture.samples)
+                flags = (capture.samples["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
+                yield converter.convert(_raw_samples(capture, self._mouse_ports), time_s, flags)
+        self._lost, self._gaps, self._jumps = clock.lost, clock.gaps, clock.jumps
+
+    def remarks(self) -> list[str]:
+        """On the capture, after a pass over all blocks."""
+        found = [f"{self._path}: times are the board's own, because a raw capture holds no other clock"]
+        if self._corrupt:
+            found.append(f"{self._path}: {self._corrupt} corrupt frames left out")
+        if self._gaps:
+            found.append(f"{self._path}: {self._lost} samples lost in {self._gaps} gaps")
+        if self._jumps:
+            found.append(
+                f"{self._path}: the board's clock jumped {self._jumps} times; its count of ticks gives the times there"
+            )
+        return found
+
+    def _parts(self, progress: Progress | None) -> Iterator[Capture]:
+        from linkpose.wire.capture import read_capture
+
+        self._file.seek(0)
+        for capture in read_capture(self._file):
+            if progress is not None:
+                progress(self._file.tell() / self._size)
+            yield capture
+
+    def _find_settings(self) -> BoardSettings:
+        """Reads all messages but the samples; the settings in force. Raises FileFormatError where there are none."""
+        found: Hello | None = None
+        other: OtherProtocol | None = None
+        for capture in self._parts(None):
+            for before, message in capture.others:
+                if isinstance(message, Hello):
+                    found = self._hello(message, before, found)
+                elif isinstance(message, OtherProtocol):
+                    other = other or message
+            self._samples += len(capture.samples)
+            self._mouse_ports = max(self._mouse_ports, int(capture.mouse_count.max(initial=0)))
+            self._corrupt = capture.corrupt.total
+        self._restarts = sorted({before for before in self._restarts if before < self._samples})
+        self._check_complete(found, other)
+        assert found is not None
+        return BoardSettings.of(found)
+
+    def _hello(self, hello: Hello, before: int, found: Hello | None) -> Hello:
+        """The HELLO whose settings are in force: the last before the first sample, or else the first."""
+        if wrong := impossible(hello):
+            raise FileFormatError(
+                self._path, f"{self._path}: its HELLO states {wrong}, which is impossible; the capture is damaged"
+            )
+        if before and not hello.streaming and before not in self._restarts[-1:]:
+            self._restarts.append(before)
+        return hello if found is None or before == 0 else found
+
+    def _check_complete(self, hello: Hello | None, other: OtherProtocol | None) -> None:
+        if hello is None and other is not None:
+            raise FileFormatError(
+                self._path,
+                f"{self._path} was captured with protocol {other.protocol_major}.{other.protocol_minor}, and this "
+                f"linkpose reads protocol {PROTOCOL_MAJOR}: read it with the linkpose that captured it, or use the CSV "
+                "recording",
+            )
+        if hello is None:
+            raise FileFormatError(self._path, f"{self._path} holds no HELLO of a board; it is not a raw capture")
+        if not self._samples:
+            raise FileFormatError(self._path, f"{self._path} holds no sample; the board was never started")
+
+
+class _CaptureClock:
+    """Board time from 0 over its wraps.
+
+    The duration of a restart is unknown. The next sample is placed one interval later and flagged.
+    """
+
+    def __init__(self, restarts: list[int], rate_hz: float) -> None:
+        """`restarts`: number of samples before each restart."""
+        self._restarts = np.array(restarts, dtype=np.int64)
+        self._period_us = round(1e6 / rate_hz)
+        self._placed = self._elapsed_us = 0
+        self._last: tuple[int, int] | None = None  # t_us and seq
+        self.gaps = self.lost = self.jumps = 0
+
+    def place(self, raw: NDArray[np.void]) -> tuple[Floats, NDArray[np.int64]]:
+        """Times (N,) of the next samples, s, and the flag of those after a gap."""
+        t_us, seq = raw["t_us"].astype(np.int64), raw["seq"].astype(np.int64)
+        before = self._last or (int(t_us[0]), -1)
+        step_us = np.diff(t_us, prepend=before[0]) % _T_WRAP
+        ticks = np.diff(seq, prepend=before[1]) % _SEQ_WRAP
+        inside = (self._restarts >= self._placed) & (self._restarts < self._placed + len(raw))
+        restarts = self._restarts[inside] - self._placed
+        jumped = self._jumps(step_us, ticks)
+        step_us[jumped] = ticks[jumped] * self._period_us
+        self.jumps += int(np.count_nonzero(jumped))
+        step_us[restarts], ticks[restarts] = self._period_us, 1
+        elapsed_us = self._elapsed_us + np.cumsum(step_us)
+        marked = ticks > 1
+        self.gaps += int(np.count_nonzero(marked))
+        self.lost += int(np.sum(ticks[marked] - 1))
+        marked[restarts] = True
+        self._placed, self._elapsed_us = self._placed + len(raw), int(elapsed_us[-1])
+        self._last = int(t_us[-1]), int(seq[-1])
+        return np.round(elapsed_us * 1e-6, TIME_DECIMALS), np.where(marked, GAP_BEFORE, 0)
+
+    def _jumps(self, step_us: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which steps of the board's clock contradict its count of ticks, as `sensors.timeline.Stamps` finds live."""
+        off_us = (step_us - ticks * self._period_us + _T_WRAP // 2) % _T_WRAP - _T_WRAP // 2
+        wrap_us = _SEQ_WRAP * self._period_us
+        off_us -= np.maximum(0, np.rint(off_us / wrap_us)).astype(np.int64) * wrap_us
+        jumps = (ticks > 0) & (ticks <= WINDOW_TICKS) & (np.abs(off_us) > OFF_TICKS * self._period_us)
+        if self._last is None:
+            jumps[0] = False
+        return np.asarray(jumps)
+
+
+def _raw_samples(capture: Capture, ports: int) -> RawSamples:
+    """The capture's samples, with these mouse ports."""
+    raw = capture.samples
+    mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports]
+    return RawSamples(
+        np.stack([raw[name].astype(np.int64) for name in COUNT_FIELDS], axis=1),
+        mice.astype(np.int64),
+        capture.mouse_count.astype(np.int64),
+    )
