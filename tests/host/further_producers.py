@@ -453,7 +453,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "the beacons are near one line, and the first ranges fit a start at … m; add --start X,Y,0 with the true one, or a beacon off the line": written(
             lambda path: lp.localize(path, beacons={"1": (0.0, 0.0), "2": (4.0, 0.0), "3": (8.0, 0.0)}),
-            EVENTS.replace("0,pose,0,0,0\n", "") + "0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
+            "time_s,kind,a,b,c\n0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
         ),
         "… holds no ranges from which a scale or bias could be estimated; leave out --estimate": written(
             lambda path: lp.localize(path, map=small_map(path.parent), estimate=("bias",)), SCANS, "a.log"
