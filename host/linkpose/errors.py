@@ -332,6 +332,15 @@ class MissingStart(LinkposeError):
         super().__init__("the log does not state where the robot starts")
 
 
+class AmbiguousStart(LinkposeError):
+    """The beacons are near one line, and the log fits two starts on its two sides; `places` are their x and y (m)."""
+
+    def __init__(self, *places: tuple[float, float]) -> None:
+        words = " and ".join(f"({x:.1f}, {y:.1f})" for x, y in places)
+        super().__init__(f"the beacons are near one line, and the first ranges fit a start at {words} m")
+        self.places = places
+
+
 class NothingToEstimate(LinkposeError):
     """Errors of the ranges are to be estimated, and the log holds no ranges. `log` names it."""
 

@@ -19,9 +19,14 @@ def wrapped(angle: Angle) -> Angle:
 
 def product(a: Floats, b: Floats) -> Floats:
     """The quaternions (..., 4) a b: first the rotation b, then a."""
-    scalar = a[..., :1] * b[..., :1] - (a[..., 1:] * b[..., 1:]).sum(axis=-1, keepdims=True)
-    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
-    return np.concatenate([scalar, vector], axis=-1)
+    (aw, ax, ay, az), (bw, bx, by, bz) = (np.moveaxis(q, -1, 0) for q in (a, b))
+    parts = [
+        aw * bw - (ax * bx + ay * by + az * bz),
+        aw * bx + bw * ax + (ay * bz - az * by),
+        aw * by + bw * ay + (az * bx - ax * bz),
+        aw * bz + bw * az + (ax * by - ay * bx),
+    ]
+    return np.stack(parts, axis=-1)
 
 
 def rotation_vectors(q: Floats) -> Floats:

@@ -35,6 +35,7 @@ from vqf import VQF, offlineVQF
 
 from linkpose import filters
 from linkpose.filters.smoother import JointInertialSmoother
+from linkpose.filters.tilt_inertial import ERRORS
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Rig
@@ -262,9 +263,14 @@ def block_of(case: Case) -> Measurements:
     )  # fmt: skip
 
 
+def imu_of(name: str, delay_s: float) -> Imu:
+    """For `tilt-inertial`, the sensor is declared calibrated, as it is; σ would include the errors of one as sold."""
+    return Imu(delay_s=delay_s, accel_offset_std_m_s2=ERRORS.accel_bias_m_s2 if name == "tilt-inertial" else None)
+
+
 def estimate_of(name: str, case: Case) -> dict[str, Floats]:
     """A filter's estimates (N,) by column, without the filter's name."""
-    rig = Rig(joint=case.joint or Joint(), imu=Imu(delay_s=case.delay_s))
+    rig = Rig(joint=case.joint or Joint(), imu=imu_of(name, case.delay_s))
     made = JointInertialSmoother(rig) if name == "--smooth" else filters.create(name, rig)
     prefix = made.name.replace("-", "_") + "_"
     names = (column.removeprefix(prefix) for column in made.columns)

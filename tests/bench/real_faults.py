@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 from _report import print_rows, recordings_parser
 from numpy.typing import NDArray
-from real_data import SETS, Case, block_of, tilt_from, vqf_tilt
+from real_data import SETS, Case, block_of, imu_of, tilt_from, vqf_tilt
 
 from linkpose import filters
 from linkpose.sensors.measurements import Floats, Measurements
-from linkpose.sensors.rig import Imu, Joint, Rig
+from linkpose.sensors.rig import Joint, Rig
 from linkpose.wire.messages import SampleFlags
 
 SETTLE_S = 10.0
@@ -116,7 +116,7 @@ def _block(case: Case, faulty: Faulty) -> Measurements:
 
 def ours(name: str, case: Case, faulty: Faulty) -> tuple[Floats, Floats, int]:
     """Tilts (N, 3), NaN where no sample arrived, height and its σ (N, 2) (m), and the number of restarts."""
-    rig = Rig(joint=case.joint or Joint(LEVER_M, 1e-6), imu=Imu(delay_s=case.delay_s))
+    rig = Rig(joint=case.joint or Joint(LEVER_M, 1e-6), imu=imu_of(name, case.delay_s))
     made = filters.create(name, rig)
     found = np.full((len(case.time_s), 4), np.nan)
     found[faulty.arrived] = made.process(_block(case, faulty))[:, :4]

@@ -451,6 +451,10 @@ FURTHER: dict[str, dict[str, Producer]] = {
             lambda path: lp.localize(path, beacons={"1": (1.0, 2.0)}),
             EVENTS.replace("0,pose,0,0,0\n", "") + "1,range,1,1,\n",
         ),
+        "the beacons are near one line, and the first ranges fit a start at … m; add --start X,Y,0 with the true one, or a beacon off the line": written(
+            lambda path: lp.localize(path, beacons={"1": (0.0, 0.0), "2": (4.0, 0.0), "3": (8.0, 0.0)}),
+            EVENTS.replace("0,pose,0,0,0\n", "") + "0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
+        ),
         "… holds no ranges from which a scale or bias could be estimated; leave out --estimate": written(
             lambda path: lp.localize(path, map=small_map(path.parent), estimate=("bias",)), SCANS, "a.log"
         ),
@@ -505,7 +509,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "the motion is too slow or too short to find J2S: two of its three directions are known to … m or worse; swing the link faster and in all directions": "test_calibration_link.py::test_motion_that_is_too_slow_is_refused",
         "the readings fit no joint that stays in its place (… m/s² rms are left over): fix the joint, and the sensor firmly on the link": "test_calibration_link.py::test_a_sensor_on_no_joint_is_refused",
-        "the fit needs an accelerometer with an offset of … m/s² and a scale of …, which no MPU-6050 has: is the joint fixed, and the range set right?": "test_calibration_link.py::test_a_sensor_that_cannot_be_is_refused",
+        "the fit needs an accelerometer with an offset of … m/s² and a scale of …, which no MPU-6050 has: is the joint fixed, the sensor firmly on the link, and the range right?": "test_calibration_link.py::test_a_sensor_that_cannot_be_is_refused",
         "…, too little to calibrate the magnetometer: turn the sensor by hand through all attitudes, each axis up, down and sideways, for a minute, away from iron": raises(
             lambda: calibrate_mag([of_magnetometer(tumbled(5.0, about=(0.0, 0.0, 0.0)))], Rig())
         ),
@@ -520,14 +524,14 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… has … full turns; more than … cannot be counted with a gyro that may be … % off. Drive … turns or fewer.": mice_of(
             _many_turns
         ),
-        "… turns by …°, so it is neither a straight line nor full turns; drive it anew": mice("half a turn"),
+        "… turns by …°, so it is neither a straight line nor full turns; repeat the drive": mice("half a turn"),
         "…: mouse … counts only …; drive a longer line, of a metre or more": mice_of(_short_line),
-        "…: mouse … is away at … s, while the robot moves; drive it anew": mice("a mouse away"),
-        "…: samples were lost before … s, and their counts with them; drive it anew": mice("lost samples"),
+        "…: mouse … is away at … s, while the robot moves; repeat the drive": mice("a mouse away"),
+        "…: samples were lost before … s, and their counts with them; repeat the drive": mice("lost samples"),
         "… holds no gyro, which distinguishes lines from turns: check the MPU6050's wiring": mice("no gyro"),
         "… begins in motion; stand still for a second, then drive": mice("no rest"),
-        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then drive it anew": "test_calibrate_mice.py::test_what_is_missing_is_named",
-        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and drive both anew on a floor on which no mouse slips": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "…: mouse … counts … while another counts …; check that it lies flat on the floor and that its plug sits, then repeat the drive": "test_calibrate_mice.py::test_what_is_missing_is_named",
+        "line and turn contradict each other: by the turn, the mice count … % … per metre than by the line. Check --length and the x_m and y_m of the mice, and repeat both on a floor on which no mouse slips": "test_calibrate_mice.py::test_what_is_missing_is_named",
         "the … mice contradict one another (… standard deviations, mouse … most of all): check their x_m and y_m in the rig file, the --length of the line, and that no mouse slipped or died": mice_of(
             _contradicting_mice
         ),

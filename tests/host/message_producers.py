@@ -200,7 +200,7 @@ MORE: dict[str, dict[str, Producer]] = {
         "… line …: … needs …; complete or delete the row": events("0,odometry,1,,\n"),
         "… line …: … is not a number; correct or delete the row": events("0,odometry,fast,0,\n"),
         "… line …: the clock jumps back from … to … s; split the log at this line": events(TWICE),
-        "standard input line …: the clock jumps back from … to … s; start the stream anew": raises(
+        "standard input line …: the clock jumps back from … to … s; restart the stream": raises(
             lambda: list(Stream("ekf", LocalizationOptions(), BEACONS, print).rows([EVENTS, *TWICE.splitlines(True)]))
         ),
         "… is not a CSV file: …; give a log with the header …": events("0,odometry," + "9" * 200_000),

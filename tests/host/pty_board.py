@@ -95,7 +95,7 @@ class PtyBoard:
         os.close(self._master)
 
     def reset(self, says_hello: bool = True) -> None:
-        """The board starts anew at the same port, and sends HELLO unless that gets lost."""
+        """The board restarts at the same port, and sends HELLO unless that gets lost."""
         from linkpose.simulation import board as simulated
         from linkpose.wire.frames import encode
 

@@ -172,7 +172,7 @@ def test_the_code_is_kept_in_the_users_cache(platform, variables, place, package
 
 
 @pytest.mark.parametrize(("damage", "ending"), [("cut", ".nbi"), ("flip", ".nbc")])
-def test_a_damaged_file_is_compiled_and_stored_anew(ending, damage, package, tmp_path):
+def test_a_damaged_file_is_compiled_and_stored_again(ending, damage, package, tmp_path):
     host, place = package.parent, {"NUMBA_CACHE_DIR": tmp_path / "cache"}
     run(TEXT, host, **place)
     for path in (tmp_path / "cache").rglob(f"*{ending}"):

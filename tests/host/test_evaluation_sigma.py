@@ -213,7 +213,7 @@ SCALED = {
     "radians": ("roll_deg", np.radians, "roll_deg moves like", "times 0.01745"),
     "reversed": ("roll_deg", np.negative, "roll_deg moves like", "times -1"),
     "centimetres, about another axis": ("x_m", lambda v: 100 * v, "x_m moves like", "times 100"),
-    "constant": ("height_m", lambda v: 0 * v + 1, "height_m is the same in all rows", "the estimates move"),
+    "constant": ("height_m", lambda v: 0 * v + 1, "height_m is the same wherever", "check the column"),
 }
 
 
@@ -240,3 +240,24 @@ def test_a_negative_sigma_is_refused():
     estimate = table(joint_height_m=SWAY, joint_height_std_m=np.where(T[5] == T, -0.1, 0.1))
     with pytest.raises(LinkposeError, match="joint_height_std_m is negative, which no standard deviation is"):
         evaluate(estimate, table("truth", height_m=SWAY))
+
+
+DRIVE = {"vx_m_s": 0.3 + 0.2 * np.sin(T), "wz_rad_s": np.cos(0.8 * T), "heading_rad": np.sin(0.8 * T) / 0.8 + 2 * T}
+
+
+@pytest.mark.parametrize("seconds", [1, 2])
+def test_odometry_and_a_truth_with_other_times_are_named(seconds):
+    """The truth states twice the time."""
+    ours = table(**{f"mice_{name}": value + 1e-3 * NOISE for name, value in DRIVE.items()})
+    theirs = Table(Path("truth.csv"), "truth", {"time_s": seconds * T, **DRIVE}, {}, None, 2)
+    found = evaluate(ours, theirs).remarks
+    assert any("hardly any motion in common" in remark for remark in found) == (seconds == 2)
+    assert seconds == 2 or not found
+
+
+def test_a_heading_in_degrees_is_named():
+    """Headings that turn round and round."""
+    ours = table(mice_heading_rad=np.angle(np.exp(1j * DRIVE["heading_rad"])))
+    theirs = table("truth", heading_rad=np.radians(DRIVE["heading_rad"]))
+    (remark,) = evaluate(ours, theirs).remarks
+    assert "heading_rad moves like the estimate of mice" in remark and "times 0.01745" in remark

@@ -289,7 +289,7 @@ def test_a_sensor_that_is_often_absent_is_not_taken_for_one_in_another_unit() ->
     assert not any("mean acceleration" in remark for remark in remarks)
 
 
-def test_a_sensor_that_is_mounted_anew_is_found_again() -> None:
+def test_a_sensor_that_is_remounted_is_found_again() -> None:
     run = ChainRun("hinge", 3, 60.0)
     measured = run.measurements()
     truth = run.truth_columns(measured.time_s)

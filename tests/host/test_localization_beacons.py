@@ -10,11 +10,13 @@ import pytest
 from click.testing import CliRunner
 
 from linkpose.cli.localize import command
+from linkpose.errors import AmbiguousStart
 from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.likelihood import run_filter
 from linkpose.localization.localizer import estimate_track
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.options import LocalizationOptions
+from linkpose.localization.paths import localize
 from linkpose.localization.settings import Settings
 from linkpose.localization.stream import Stream
 from linkpose.localization.tables import Truth, score_track
@@ -255,3 +257,53 @@ def test_a_stream_estimates_errors_that_drift(monkeypatch: pytest.MonkeyPatch) -
         track = stream.run.track([row for row in rows if row.time_s > 40.0])
         shares.append(score_track(track, truth).within_2_sigma or 0.0)
     assert shares[0] > 0.9 > shares[1] + 0.2
+
+
+@pytest.mark.parametrize("depth_m", [0.5, 0.0])
+def test_a_tag_beside_anchors_near_one_line_is_not_mirrored_in_silence(depth_m: float) -> None:
+    """The first ranges fit both sides. The rest of the log decides where the anchors are 0.5 m off their line."""
+    rng = np.random.default_rng(4)
+    anchors = {"A": (0.0, 0.0), "B": (4.0, depth_m), "C": (8.0, 0.0), "D": (12.0, depth_m)}
+    log: Log = []
+    for i in range(1200):
+        time_s, (name, (x, y)) = i / 20.0, list(anchors.items())[i % 4]
+        distance = math.hypot(6.0 + 4.0 * math.sin(0.1 * time_s) - x, 5.0 + 2.0 * math.cos(0.17 * time_s) - y)
+        outlier = rng.exponential(0.7) if rng.random() < 0.1 else 0.0
+        log.append(Event(time_s, "range", (distance + rng.normal(0.0, 0.08) + outlier,), name))
+    if depth_m == 0.0:
+        with pytest.raises(AmbiguousStart, match="near one line"):
+            localize(log, beacons=anchors)
+        return
+    paths = localize(log, beacons=anchors, drift_std_m=0.0)
+    assert any("fits the log better than its mirror image" in remark for remark in paths.remarks)
+    assert paths.ekf.position_m[-1, 1] == pytest.approx(5.0 + 2.0 * math.cos(0.17 * 59.95), abs=0.4)
+
+
+def test_a_current_and_a_wrong_speed_of_sound_are_constants_of_a_dive() -> None:
+    """A Doppler log that measures the velocity through the water, ranges 1.5 % long with echoes, and a gap of 80 s."""
+    rng = np.random.default_rng(5)
+    places = ((-400.0, -300.0, -60.0), (450.0, -350.0, -55.0), (400.0, 420.0, -70.0), (-380.0, 380.0, -65.0))
+    beacons = dict(zip("1234", places, strict=True))
+    place, heading, truth = np.array([-50.0, -50.0, -10.0]), 0.0, []
+    log: Log = [Event(0.0, "pose", (place[0], place[1], heading))]
+    for i in range(1800):
+        time_s, heading = 0.5 * i, (i // 240) * math.pi / 2
+        truth.append((time_s, *place[:2]))
+        log.append(Event(time_s, "attitude", (0.0, 0.0, math.remainder(heading, math.tau) + rng.normal(0.0, 0.01))))
+        log.append(Event(time_s, "velocity", (1.4 + rng.normal(0.0, 0.05), rng.normal(0.0, 0.05), 0.0)))
+        log.append(Event(time_s, "depth", (10.0 + rng.normal(0.0, 0.05),)))
+        if i % 6 == 3 and not 300.0 < time_s < 380.0:
+            name = str(i // 6 % 4 + 1)
+            echo = rng.uniform(5.0, 60.0) if rng.random() < 0.1 else 0.0
+            distance = 1.015 * math.dist(place, beacons[name]) + rng.normal(0.0, 0.5) + echo
+            log.append(Event(time_s, "range", (distance,), name))
+        place = place + 0.5 * np.array([1.4 * math.cos(heading) + 0.12, 1.4 * math.sin(heading) - 0.08, 0.0])
+    paths = localize(log, beacons=beacons)
+    assert "a constant current, the speed of sound" in paths.remarks[-1]
+    assert paths["ekf_x_current_m_s"][-1] == pytest.approx(0.12, abs=0.03)
+    assert paths["ekf_y_current_m_s"][-1] == pytest.approx(-0.08, abs=0.03)
+    assert paths["ekf_range_scale_error"][-1] == pytest.approx(0.015, abs=0.004)
+    path = np.array(truth)
+    score = paths.score(Truth(path[:, 0], path[:, 1:], None))["ekf"]
+    assert score.position_rmse_m < 4.0
+    assert score.within_2_sigma is not None and score.within_2_sigma > 0.9

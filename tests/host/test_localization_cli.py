@@ -281,7 +281,7 @@ def test_an_interrupted_stream_ends_well(streamed):
     ("rows", "options", "reason"),
     [
         ([], [], "standard input holds no measurements"),
-        (["x\n"], [], "line 1: the header is 'x'"),
+        (["x\n"], [], "standard input line 1: the header is 'x'"),
         ([*START, "1,range,Z9,5,\n"], [], "line 4: beacon Z9 is not in the beacon file"),
         ([*START, "1,range,A1,five,\n"], [], "'five' is not a number"),
         ([*START[:1], "0,odometry,0,0,\n", "1,range,A1,5,\n"], [], "add --start"),
@@ -294,7 +294,7 @@ def test_an_interrupted_stream_ends_well(streamed):
         (
             [*START, *(f"{i % 15},range,A1,5,\n" for i in range(30))],
             [],
-            "line 28: the clock jumps back from 14 to 9 s; start the stream anew",
+            "line 28: the clock jumps back from 14 to 9 s; restart the stream",
         ),
         (START, ["--plot", "a.png", "--json"], "does not use --plot, --json"),
         (START, ["--smooth"], "no --smooth"),
@@ -399,3 +399,12 @@ def test_arguments_that_cannot_be_are_named(options, reason):
     with pytest.raises(InvalidValue) as raised:
         lp.localize(log, **({"beacons": {"1": (5.0, 0.0)}} | options))
     assert reason in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("option", "reason"),
+    [("range_std", "localize has no option range_std; write range_std_m"), ("luck", "the options are range_std_m, ")],
+)
+def test_an_option_that_does_not_exist_is_named(option, reason):
+    with pytest.raises(TypeError, match=reason):
+        lp.localize([], **{option: 1.0})

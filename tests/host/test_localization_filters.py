@@ -19,6 +19,7 @@ from linkpose.localization.kalman import (
     CONSTANT_VELOCITY,
     HOLONOMIC,
     SUBMERSIBLE,
+    SUBMERSIBLE_IN_CURRENT,
     UNICYCLE,
     KalmanFilter,
     Measurement,
@@ -38,6 +39,7 @@ MOTIONS = {
     "unicycle": UNICYCLE,
     "holonomic": HOLONOMIC,
     "submersible": SUBMERSIBLE,
+    "submersible_in_current": SUBMERSIBLE_IN_CURRENT,
 }
 
 
@@ -186,8 +188,9 @@ def test_beam_slopes_of_a_plain_wall():
 
 def test_model_numbers_differ():
     motions = [models.UNICYCLE, models.HOLONOMIC, models.SUBMERSIBLE, models.CONSTANT_VELOCITY]
+    motions.append(models.SUBMERSIBLE_IN_CURRENT)
     sensors = [models.BEAMS, models.BEACON_RANGE, models.LANDMARK, models.DIRECT]
-    assert sorted(motions) == [0, 1, 2, 3]
+    assert sorted(motions) == [0, 1, 2, 3, 4]
     assert sorted(sensors) == [0, 1, 2, 3]
 
 

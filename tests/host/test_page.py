@@ -128,7 +128,7 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         page.show(np.empty(0), lambda: PageStatus(status()().health, found))
         browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
         browser.open("about:blank")  # and back: the page goes on
-        page.begin_anew(rows + np.array([0.0, 0.1, *[0.0] * 5]))  # a better filter has caught up
+        page.restart(rows + np.array([0.0, 0.1, *[0.0] * 5]))  # a better filter has caught up
         browser.open(page.url)
         browser.wait_for_text("not excited yet")
         browser.wait_for_text(f"{rows[-1, 1] + 0.1:.3f} m ±2.0 cm")

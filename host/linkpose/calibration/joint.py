@@ -255,7 +255,8 @@ def _refuse_impossible(found: JointCalibration) -> None:
     if np.abs(offset).max() > LARGEST_OFFSET_M_S2 or np.abs(scale - 1).max() > LARGEST_SCALE:
         raise LinkposeError(
             f"the fit needs an accelerometer with an offset of {np.round(offset, 2)} m/s² and a scale of "
-            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, and the range set right?"
+            f"{np.round(scale, 3)}, which no MPU-6050 has: is the joint fixed, the sensor firmly on the link, and the "
+            "range right?"
         )
 
 

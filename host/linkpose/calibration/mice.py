@@ -132,7 +132,8 @@ def _sums(recording: Recording, mice: int) -> _DriveSums:
         )
     if abs(turn - turns * FULL_TURN) > TURN_TOLERANCE_RAD + GYRO_SCALE * abs(turn):
         raise LinkposeError(
-            f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; drive it anew"
+            f"{name} turns by {math.degrees(turn):.0f}°, so it is neither a straight line nor full turns; repeat the "
+            "drive"
         )
     total = counts[first:last].sum(axis=0)
     if not turns:
@@ -147,7 +148,7 @@ def _check_line(name: str, counts: Floats, total: Floats) -> None:
     if size[worst] < 0.1 * size.max() or not counts[len(counts) // 2 :, worst].any():
         raise LinkposeError(
             f"{name}: mouse {worst + 1} counts {size[worst]:.0f} while another counts {size.max():.0f}; check that it "
-            "lies flat on the floor and that its plug sits, then drive it anew"
+            "lies flat on the floor and that its plug sits, then repeat the drive"
         )
     if size[worst] < FEWEST_COUNTS:
         raise LinkposeError(
@@ -161,11 +162,15 @@ def _check_whole(name: str, m: Measurements, counts: Floats, first: int, last: i
     if len(away):
         row, mouse = away[0]
         when = m.time_s[first + row]
-        raise LinkposeError(f"{name}: mouse {mouse + 1} is away at {when:.2f} s, while the robot moves; drive it anew")
+        raise LinkposeError(
+            f"{name}: mouse {mouse + 1} is away at {when:.2f} s, while the robot moves; repeat the drive"
+        )
     lost = np.flatnonzero(m.flags[first + 1 : last] & int(SampleFlags.GAP_BEFORE))
     if len(lost):
         when = m.time_s[first + 1 + lost[0]]
-        raise LinkposeError(f"{name}: samples were lost before {when:.2f} s, and their counts with them; drive it anew")
+        raise LinkposeError(
+            f"{name}: samples were lost before {when:.2f} s, and their counts with them; repeat the drive"
+        )
 
 
 def _turned(name: str, m: Measurements, first: int, last: int) -> float:
@@ -309,7 +314,7 @@ def _scale_disagreement(drives: Sequence[_DriveSums], places: NDArray[np.complex
         raise LinkposeError(
             f"line and turn contradict each other: by the turn, the mice count {100 * abs(off):.1f} % "
             f"{'fewer' if off > 0 else 'more'} per metre than by the line. Check --length and the x_m and y_m of the "
-            "mice, and drive both anew on a floor on which no mouse slips"
+            "mice, and repeat both on a floor on which no mouse slips"
         )
     return math.sqrt(max(0.0, off * off - std * std))
 

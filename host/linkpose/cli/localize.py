@@ -421,7 +421,7 @@ def _sentence(name: str, track: Track, result: PathScore | None) -> str:
         often = counted(track.widened, "time")
         text += f"\n  {often} most measurements were rejected, so the pose was made uncertain again"
     if track.relocated:
-        text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found anew"
+        text += f"\n  {counted(track.relocated, 'time')} the pose was lost and found again"
     for verdict in track.consistency.verdicts():
         text += f"\n  {verdict.sentence()}" + (f" ({figures})" if (figures := verdict.figures()) else "")
     if result is not None:

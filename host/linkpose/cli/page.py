@@ -128,13 +128,13 @@ def show_newest(
     estimator: Estimator,
     compiling: Precompilation,
 ) -> None:
-    """Shows the newest row of a live run, or all rows anew. Raises KeyboardInterrupt once "stop" was pressed."""
+    """Shows the newest row of a live run, or all rows again. Raises KeyboardInterrupt once "stop" was pressed."""
     if page is None:
         return
     from linkpose.page.status import PageStatus  # 0.06 s, by which the first sample without a page would be late
 
     if len(rows.caught_up):
-        page.begin_anew(rows.caught_up)
+        page.restart(rows.caught_up)
     page.show(rows.newest, lambda: PageStatus(health(), estimator.found_j2s, compiling.progress))
     page.raise_if_stopped()
 

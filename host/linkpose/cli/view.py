@@ -29,7 +29,7 @@ class View:
         """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys."""
         self._screen = Screen(title, columns, keys)
         self._waiting: list[Floats] = []  # rows (N, columns) since the screen was drawn
-        self._begins_anew = False  # whether they replace all rows before
+        self._replaces_all = False  # whether they replace all rows before
         self._live: Live | None = None
         self._size: tuple[int, int] = (0, 0)
         self._drawn_at = -math.inf
@@ -81,16 +81,16 @@ class View:
         if not self._is_wanted:
             return
         if len(rows.caught_up):
-            self._waiting, self._begins_anew = [rows.caught_up], True
+            self._waiting, self._replaces_all = [rows.caught_up], True
         elif len(rows.newest):
             self._waiting.append(rows.newest[np.newaxis])
 
     def _take_waiting(self) -> None:
-        if self._begins_anew:
+        if self._replaces_all:
             self._screen.forget()
         if self._waiting:
             self._screen.add(np.concatenate(self._waiting))
-        self._waiting, self._begins_anew = [], False
+        self._waiting, self._replaces_all = [], False
 
     def redraw(self, health: Callable[[], Health], status: str = "") -> None:
         """Redraws a few times a second, also while no estimates arrive.

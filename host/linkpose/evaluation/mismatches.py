@@ -9,7 +9,7 @@ import numpy as np
 from linkpose.evaluation.scoring import LINK, Compared
 from linkpose.evaluation.series import Pair, paired
 from linkpose.evaluation.takes import MOTION_CAPTURE
-from linkpose.quantities import ANGLE, CHAIN_ROTATION, HEADING, PITCH, ROLL, YAW, Quantity, X, Y
+from linkpose.quantities import ANGLE, CHAIN_ROTATION, HEADING, PITCH, ROLL, VX, VY, WZ, YAW, Quantity, X, Y
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
@@ -21,8 +21,9 @@ _MIRRORED = 0.8  # correlation, negated
 _ALIKE = 0.98
 _NEAR = 0.05
 _UNITS = (0.5, 2.0, np.pi / 180, 180 / np.pi, 0.001, 1000.0, 0.01, 100.0, -1.0)
+_STILL = 1e-3  # share of the estimate's motion; errors of a still reference are far below it
 _FEWEST = 20  # instants; fewer correlate by chance
-_MOVES_RAD, _MOVES_M = 0.1, 0.05  # standard deviations of estimates that are no error alone
+_MOVES_RAD, _MOVES_M = 0.1, 0.05  # standard deviations (rad; m, m/s or rad/s) of estimates that are no error alone
 
 
 def mismatches(
@@ -57,7 +58,20 @@ def _of_frames(
     is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
     if is_link and _UNRELATED < residual < np.inf:
         return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
+    velocities = [both.pairs[q] for both in compared for q in (VX, VY, WZ) if q in both.pairs]
+    unrelated = [found for pair in velocities if (found := _is_unrelated(pair, offset_s)) is not None]
+    if unrelated and all(unrelated):
+        return [f"{both_files} have hardly any motion in common: are they of the same run, and their times in seconds?"]
     return []
+
+
+def _is_unrelated(pair: Pair, offset_s: float) -> bool | None:
+    """Whether the difference of two velocities varies as much as each of them; None where the estimate is steady."""
+    moved = _moved(pair, offset_s)
+    if moved is None or np.std(moved[0]) < _MOVES_M:
+        return None
+    ours, theirs = moved
+    return bool(np.std(ours - theirs) > _UNRELATED * max(np.std(ours), np.std(theirs)))
 
 
 def _of_units(estimate: Table, reference: Table, compared: Mapping[str, Compared], offset_s: float) -> Iterator[str]:
@@ -78,7 +92,10 @@ def _of_units(estimate: Table, reference: Table, compared: Mapping[str, Compared
                 f"{wrong[name]:.4g}: check its unit and its sign in both files"
             )
         elif any(_is_still(both.pairs[quantity], offset_s) for both in compared.values() if quantity in both.pairs):
-            yield f"{reference.path}: {quantity.column} is the same in all rows, but the estimates move"
+            yield (
+                f"{reference.path}: {quantity.column} is the same wherever the estimates move: check the column and "
+                "the times"
+            )
 
 
 def _ratio(quantity: Quantity, both: Compared, offset_s: float) -> float | None:
@@ -106,20 +123,21 @@ def _wrong_unit(ratio: float) -> float | None:
 
 
 def _is_still(pair: Pair, offset_s: float) -> bool:
-    """Whether the reference is constant while the estimate moves further than errors do."""
+    """Whether the reference is as good as constant while the estimate moves further than errors do."""
     moved = _moved(pair, offset_s)
-    if moved is None or moved[1].any():
+    if moved is None or np.std(moved[1]) > _STILL * np.std(moved[0]):
         return False
     return bool(np.std(moved[0]) > (_MOVES_RAD if pair[0].is_angle else _MOVES_M))
 
 
 def _moved(pair: Pair, offset_s: float) -> tuple[Floats, Floats] | None:
     """Estimate and reference (N,) without their medians where both are known; None for fewer than _FEWEST instants."""
-    ours, theirs = paired(*pair, offset_s)
+    ours, theirs = np.array(paired(*pair, offset_s))
     known = np.isfinite(ours) & np.isfinite(theirs)
     if np.count_nonzero(known) < _FEWEST:
         return None
-    return ours[known] - np.median(ours[known]), theirs[known] - np.median(theirs[known])
+    ours, theirs = (np.unwrap(angle[known]) if pair[0].is_angle else angle[known] for angle in (ours, theirs))
+    return ours - np.median(ours), theirs - np.median(theirs)
 
 
 def _is_mirrored(pair: Pair) -> bool:

@@ -74,7 +74,7 @@ class JointInertialSmoother:
     def process(self, block: Measurements) -> Floats:
         """Estimates at each of the N samples: (N, 14) in the order of `columns`.
 
-        The block is a whole recording; each call starts anew.
+        The block is a whole recording; each call is independent.
         """
         self._ahead = JointInertialFilter(self._rig)
         self._ahead.process(block)

@@ -29,7 +29,7 @@ from linkpose.presentation import counted
 KEYWORDS = ("ODOM", "FLASER", "ROBOTLASER1")
 BEAM_ANGLES_RAD = np.radians(np.arange(-90.0, 91.0, 10.0))  # the thesis's 19 beams
 FLASER_MAX_RANGE_M = 80.0  # a SICK scanner's; the line does not contain it
-# Readings this near to the longest of the log are equal to it, and so many of them are no coincidence.
+# Readings this near to the longest of the log are equal to it, and this many of them are no coincidence.
 SAME_RANGE_M, SHARED_READINGS = 0.005, 10
 QUARTERS = 720  # quarters of a degree in a FLASER's field of view
 FIRST_TIME_S = 60.0  # a log whose clock starts at 0 has its next line within this time

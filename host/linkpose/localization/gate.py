@@ -16,8 +16,8 @@ from linkpose.localization.linalg import Floats, lower_cholesky, mahalanobis_squ
 
 @functools.cache
 def chi_square_quantile(probability: float, degrees: int) -> float:
-    """The value that a χ² variable of so many degrees of freedom stays below with this probability. Raises ValueError
-    outside (0, 1).
+    """The value below which a χ² variable with `degrees` degrees of freedom stays with this probability. Raises
+    ValueError outside (0, 1).
     """
     if not 0.0 < probability < 1.0 or degrees < 1:
         raise ValueError(f"no χ² quantile for probability {probability} and {degrees} degrees of freedom")

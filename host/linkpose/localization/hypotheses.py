@@ -27,7 +27,7 @@ HOPELESS = 25.0  # a hypothesis so far behind is dropped
 # was lost silently from two of four starts within the log.
 LEAD_SHARE, HOPELESS_SHARE = 0.5, 0.75
 # Scans from one place repeat each other: a scan counts when the robot has moved this far (m) or turned (rad) since the
-# last one that counted. So many must count before one decides, as a single scan may fit two corridors that look alike.
+# last one that counted. SCANS must count before one decides: a single scan may fit two corridors alike.
 COUNTS_AFTER_M, COUNTS_AFTER_RAD = 0.2, 0.2
 # Against a tracked pose more are required: in an old map, a wrong place can fit better for two metres.
 SCANS, SCANS_AGAINST_INCUMBENT = 4, 10

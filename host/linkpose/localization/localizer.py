@@ -10,11 +10,19 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError, MissingBeacons, MissingMap, MissingStart, NeedsScans, NothingToEstimate
+from linkpose.errors import (
+    AmbiguousStart,
+    LinkposeError,
+    MissingBeacons,
+    MissingMap,
+    MissingStart,
+    NeedsScans,
+    NothingToEstimate,
+)
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.grid import FREE, OCCUPIED, GridMap, no_map
-from linkpose.localization.kalman import CONSTANT_VELOCITY, UNICYCLE, FilterName, KalmanFilter
+from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE_IN_CURRENT, UNICYCLE, FilterName, KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import MeasurementBuilder, constant_states, drift_states, thesis_beams
 from linkpose.localization.noise import check_correlation
@@ -32,7 +40,7 @@ from linkpose.localization.vehicle import (
     first_pose,
     kinds_of,
     noise_root,
-    place_from_ranges,
+    places_from_ranges,
     start_state,
     vehicle_of,
 )
@@ -41,12 +49,12 @@ if TYPE_CHECKING:
     from linkpose.localization.scan_tracking import ScanTracker
 
 Method = Literal["scan-match", "ekf", "ukf", "mcl"]
-# When most of so many measurements of a kind were rejected, the pose is taken to be wrong, not the sensor.
+# When most of this many measurements of a kind were rejected, the pose is assumed to be wrong, not the sensor.
 PATIENCE = 10
 WIDENING = 3.0  # factor on the pose's standard deviations then
 
 # Standard deviation (rad/s) of a vehicle's turn rate at one instant around the mean rate that attitudes show: waves and
-# thrusters turn it unevenly. That of the simulated commands of Table 2.2. Twice it doubles the stated σ of wz.
+# thrusters turn it unevenly. Value of the simulated commands of Table 2.2. Doubling it doubles the stated σ of wz.
 UNEVEN_TURN_RAD_S = 0.01
 
 # An unscented filter predicts longer intervals (s) by linearisation: the headings of its sigma points spread around the
@@ -145,11 +153,12 @@ class Localizer:
         self.control_kind = CONTROLS.get(self.vehicle.model, "")
         names = list(beacons)
         constants = constant_states(settings.estimate, names)
-        motion = self.vehicle.extended((*constants, *drift_states(settings, names)))
+        vehicle = SUBMERSIBLE_IN_CURRENT if settings.current_std_m_s else self.vehicle
+        motion = vehicle.extended((*constants, *drift_states(settings, names)))
         self.prior = first_pose(head) if settings.start is None else None
         start = settings.start if self.prior is None else _pose_of(self.prior)
         if start is None and self.vehicle is CONSTANT_VELOCITY:
-            start = place_from_ranges(head, beacons)
+            start = next(iter(places_from_ranges(head, beacons)), None)
         depth = next((event.values[0] for event in head if isinstance(event, Event) and event.kind == "depth"), 0.0)
         state, std = start_state(start or (0.0, 0.0, 0.0), depth, settings, motion)
         kalman: FilterName = "ukf" if name == "ukf" else "ekf"
@@ -391,14 +400,13 @@ def check(
         raise NothingToEstimate(origin)
     if name in ("mcl", "scan-match") and "scan" not in kinds:
         raise NeedsScans(origin, name)
-    if not _has_start(log, name, settings, beacons, kinds):
-        raise MissingStart
     for event in log:
         if isinstance(event, Event) and event.kind in NAMED and event.beacon not in beacons:
             raise LinkposeError(
                 f"{origin} line {event.line}: {event.kind} to beacon {event.beacon}, whose place is not known "
                 f"(known are {', '.join(beacons)}); add it to the beacon file or delete the row"
             )
+    _check_start(log, name, settings, beacons, kinds)
     if settings.ranges.correlation:
         check_correlation(settings.ranges.correlation, most_at_once(log), "the correlation of the ranges")
     check_correlation(
@@ -408,12 +416,15 @@ def check(
     )
 
 
-def _has_start(log: Log, name: Method, settings: Settings, beacons: Beacons, kinds: set[str]) -> bool:
-    """Whether the start is given, or can be found."""
+def _check_start(log: Log, name: Method, settings: Settings, beacons: Beacons, kinds: set[str]) -> None:
+    """Raises MissingStart or AmbiguousStart where the start is not given and cannot be found."""
     if settings.start is not None or first_pose(log) is not None or (name == "scan-match" and "scan" in kinds):
-        return True
-    known = all(event.beacon in beacons for event in log if isinstance(event, Event) and event.kind == "range")
-    return vehicle_of(kinds) is CONSTANT_VELOCITY and known and place_from_ranges(log, beacons) is not None
+        return
+    places = places_from_ranges(log, beacons) if vehicle_of(kinds) is CONSTANT_VELOCITY else []
+    if not places:
+        raise MissingStart
+    if len(places) > 1:
+        raise AmbiguousStart(places[0][:2], places[1][:2])
 
 
 def most_at_once(log: Log) -> int:

@@ -29,7 +29,7 @@ _SHARED_DRIFT = f"{DRIFT}_m"
 
 def default_constants(kinds: set[str], beacons: int) -> tuple[str, ...]:
     """The constants of ranges to estimate where the user names none, for a log with these kinds of measurement and
-    ranges to so many beacons. Acoustic ranges under water have no common bias.
+    ranges to that many beacons. Acoustic ranges under water have no common bias.
     """
     if beacons < BEACONS_FOR_CONSTANTS or vehicle_of(kinds) is SUBMERSIBLE:
         return ()
@@ -148,7 +148,7 @@ class MeasurementBuilder:
         return True
 
     def note(self, event: Event) -> None:
-        """Remembers a sighting, which the next one of the same beacon may repeat."""
+        """Stores a sighting, which the next one of the same beacon may repeat."""
         self.last_sighting_s[event.beacon] = event.time_s
 
     def _pose(self, event: Event) -> Measurement:

@@ -114,11 +114,11 @@ class LocalizationOptions:
 
     @property
     def free(self) -> tuple[str, ...]:
-        """The names in `tuning` of the noises that are estimated from the log."""
+        """The names in `tuning` of the noises and constants that are estimated from the log."""
         free = [noise for option, (noise, _) in ESTIMATED_NOISES.items() if getattr(self, option) is None]
         if self.noise != "affine" and "growth" in free:
             free.remove("growth")
-        return (*free, "yaw")
+        return (*free, "yaw", "current", *(("sound",) if self.estimate is None else ()))
 
     def settings(self, constants: tuple[str, ...] = (), start: Pose | None = None) -> Settings:
         """The settings of a filter that estimates these constants of the ranges, from this start where none is given.

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import functools
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
@@ -26,8 +27,16 @@ from linkpose.localization.plausibility import check_units
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons, PathScore, Truth, read_beacons, read_truth, score_track
 from linkpose.localization.track import Track
-from linkpose.localization.tuning import described, tune
-from linkpose.localization.vehicle import WALK_M_S, WALK_RAD_S, kinds_of, never_moves, vehicle_of
+from linkpose.localization.tuning import described, likelier_start, tune
+from linkpose.localization.vehicle import (
+    WALK_M_S,
+    WALK_RAD_S,
+    first_pose,
+    kinds_of,
+    never_moves,
+    places_from_ranges,
+    vehicle_of,
+)
 from linkpose.presentation import counted
 from linkpose.recording.table import Table
 
@@ -138,9 +147,20 @@ def localize(
 
     Raises:
         MissingMap, MissingBeacons, MissingStart, NeedsScans, NothingToEstimate, NothingApplied, InvalidValue, FileError
-        and other kinds of LinkposeError.
+        and other kinds of LinkposeError; TypeError for an option that does not exist.
     """
+    _check_names(options)
     return prepare(log, map, beacons, odometry, filters, LocalizationOptions(**options)).run()
+
+
+def _check_names(options: Iterable[str]) -> None:
+    """Raises TypeError, as a Python function does, for a name that is no attribute of `LocalizationOptions`."""
+    known = [field.name for field in fields(LocalizationOptions)]
+    for name in options:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            cure = f"write {near[0]}" if near else f"the options are {', '.join(known)}"
+            raise TypeError(f"localize has no option {name}; {cure}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +237,9 @@ def prepare(
         remarks.append("the odometry of the log is always at rest: the motion is taken from the scans; give --start")
     if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
         check_units(events, places, str(origin))
+    if vehicle_of(kinds) is CONSTANT_VELOCITY:
+        settings, side = _with_side(events, settings, places, options.free)
+        remarks += side
     for method, chosen in settings.items():
         check(events, method, chosen, grid, places, str(origin))
     if options.correlation and most_at_once(events) == 1:
@@ -224,6 +247,24 @@ def prepare(
     if vehicle_of(kinds) is CONSTANT_VELOCITY:
         remarks.append("the log has no odometry: a constant-velocity model is used, at the mean height of the beacons")
     return PreparedLog(events, origin, grid, places, settings, options.free, tuple(remarks))
+
+
+def _with_side(
+    log: Log, settings: dict[Method, Settings], beacons: Beacons, free: tuple[str, ...]
+) -> tuple[dict[Method, Settings], list[str]]:
+    """The settings with the likelier start where the first ranges to beacons near one line fit two, and a remark."""
+    one = next(iter(settings.values()))
+    if one.start is not None or first_pose(log) or len(places := places_from_ranges(log, beacons)) < 2:
+        return settings, []
+    start = likelier_start(log, one, beacons, free)
+    if start is None:
+        return settings, []
+    other = next(place for place in places if place != start)
+    remark = (
+        f"the beacons are near one line: the start ({start[0]:.1f}, {start[1]:.1f}) m fits the log better than its "
+        f"mirror image ({other[0]:.1f}, {other[1]:.1f}) m; give --start if this is the wrong side"
+    )
+    return {method: replace(chosen, start=start) for method, chosen in settings.items()}, [remark]
 
 
 def _places(beacons: Places | PathName | None) -> Beacons:

@@ -19,12 +19,18 @@ from numpy.typing import NDArray
 from linkpose.localization import models
 from linkpose.localization.events import Event
 from linkpose.localization.gate import chi_square_quantile
-from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE, KalmanFilter, MotionModel
+from linkpose.localization.kalman import (
+    CONSTANT_VELOCITY,
+    SUBMERSIBLE,
+    SUBMERSIBLE_IN_CURRENT,
+    KalmanFilter,
+    MotionModel,
+)
 from linkpose.localization.linalg import Floats
 from linkpose.localization.measuring import MeasurementBuilder
 from linkpose.rotations import wrapped
 
-# Of the latest so many measurements, so many contradict the pose: fewer are outliers, more delay the recovery.
+# Of the LATEST measurements, this many must contradict the pose: fewer are outliers, more delay the recovery.
 LATEST, CONTRADICTIONS = 4, 3
 CONTRADICTS = 0.997  # probability below which the χ² test calls an innovation possible
 EXPLAINS = 0.95  # the same for the sum of squares of a fit: it replaces a pose only if it is good
@@ -35,6 +41,7 @@ WAY_ERROR = 0.05  # of the way between two sightings: the error of dead reckonin
 # The fit replaces the pose when its cost (χ², half of −2 ln likelihood) is lower by LEAD than the pose's, and by
 # UNIQUE than any other place's. Odds of e^12 and e^4.5; doubling them delays the recovery by some seconds.
 LEAD, UNIQUE = 24.0, 9.0
+DIVES = (SUBMERSIBLE.model, SUBMERSIBLE_IN_CURRENT.model)  # whose heading an attitude sensor reads
 SURPLUS = 1  # rows beyond the number of unknowns
 HEADING_KNOWN_RAD = 0.2  # standard deviation of the heading below which the filter continues from a fit
 HUBER = 2.5  # standard deviations beyond which a residual counts linearly
@@ -78,9 +85,9 @@ class Relocator:
 
     def __init__(self, motion: MotionModel, sensors: MeasurementBuilder) -> None:
         self.motion, self.sensors = motion, sensors
-        free = ("x_m", "y_m") if motion.model == SUBMERSIBLE.model else tuple(PRIOR)
+        free = ("x_m", "y_m") if motion.model in DIVES else tuple(PRIOR)
         self.at = np.array([i for i, name in enumerate(motion.states) if name in free])
-        self.turns = "heading_rad" in motion.states and motion.model != SUBMERSIBLE.model
+        self.turns = "heading_rad" in motion.states and motion.model not in DIVES
         self.moves = motion.model == CONSTANT_VELOCITY.model
         self.prior = np.array([PRIOR[motion.states[i]] for i in self.at])
         self.travel = np.zeros(len(motion.states))

@@ -111,8 +111,12 @@ def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Float
 
 
 @compiled
-def misfit(walls: Walls, scan: Weighted, pose: Floats, pull: Floats) -> float:
-    """How far (m) beams end from the walls that they hit: the root of Σ v² w d² / Σ v², seen from `pose`.
+def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -> float:
+    """Σ v_i v_j √(w_i w_j) d_i d_j / Σ v_i v_j (m²) over the beams i and j = i − lag, seen from `pose`.
+
+    With a lag of 0, it is the mean square of the distances from the walls that beams hit. With a lag of 1, it is the
+    part that neighbouring beams share: the error of the wall that both hit, without the noise of the beams. It may be
+    negative.
 
     Fills `pull` (3,) with Σ ±v J, where the sign turns each wall's normal to the laser: how the walls move the pose
     when all of them are nearer than in the map.
@@ -122,6 +126,7 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, pull: Floats) -> float:
     at = np.empty(3)
     pull[:] = 0.0
     total, weights = 0.0, 1e-12
+    distances, robusts = np.empty(beams.shape[0]), np.empty(beams.shape[0])
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
@@ -132,9 +137,11 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, pull: Floats) -> float:
         pull[0] += facing * at[1]
         pull[1] += facing * at[2]
         pull[2] += facing * (at[2] * rx - at[1] * ry)
-        total += robust * robust * square
-        weights += robust * robust
-    return math.sqrt(total / weights)
+        distances[i], robusts[i] = math.sqrt(scan.weights[i]) * at[0], robust
+        if i >= lag:
+            total += robust * robusts[i - lag] * distances[i] * distances[i - lag]
+            weights += robust * robusts[i - lag]
+    return total / weights
 
 
 @compiled

@@ -41,7 +41,7 @@ CERTAIN_M, CERTAIN_RAD = 0.15, 0.1
 # in a corridor of an old map pull the pose to a place that looks alike.
 SLIP, SLIP_LEAD = (0.3, 0.3, 0.3), 1.0
 NEARBY = 12  # starts of that fit
-# Weight of one scan when hypotheses are compared: its beams count as so many independent ones. Too many, and two
+# Weight of one scan when hypotheses are compared: its beams count as this many independent ones. Too many, and two
 # the map's errors decide between corridors that look alike.
 COMPARED_BEAMS = 10.0
 NO_WALL = 0.1  # probability that a beam meets what the map does not have
@@ -53,7 +53,8 @@ class Fit:
 
     `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `walls` (3, 3) is Σ v J Jᵀ at
     the fitted pose, the information of walls whose places are uncertain by 1 m, and `pull` (3,) the effect of an error
-    that all of them share. `misfit_m` is how far beams end from the walls that they hit.
+    that all of them share. `misfit_m2` is the mean square of how far beams end from the walls that they hit (m²), in a
+    drawn map only the part that neighbouring beams share.
     """
 
     share: float
@@ -62,7 +63,7 @@ class Fit:
     beams: int
     walls: Floats
     pull: Floats
-    misfit_m: float
+    misfit_m2: float
 
 
 def beams_of(scan: Scan) -> Floats:
@@ -116,8 +117,9 @@ class ScanMatcher:
         # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
         d2 = _condition(run, at, best, covariance, prior + hessians[0] / self.beam_std_m**2)
         pull = np.empty(3)
-        off_m = misfit(self.walls, self._weighted(beams, best, LOSS_SCALE * self.beam_std_m), best, pull)
-        return Fit(share, log_likelihood, d2, len(beams), hessians[1], pull, off_m)
+        weighted = self._weighted(beams, best, LOSS_SCALE * self.beam_std_m)
+        off_m2 = misfit(self.walls, weighted, best, int(self.field.is_drawn), pull)
+        return Fit(share, log_likelihood, d2, len(beams), hessians[1], pull, off_m2)
 
     def compare(self, beams: Floats, pose: Floats) -> tuple[float, float]:
         """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""

@@ -37,6 +37,9 @@ class Settings:
     With `drift_std_m` above 0, the ranges of each beacon have an error of this standard deviation that persists for
     `drift_time_s` (a first-order Gauss-Markov process). It is estimated beside the pose. With `drift_is_shared`, the
     ranges of all beacons have one such error in common.
+
+    With `current_std_m_s` above 0, the velocities of an underwater vehicle are relative to the water, whose constant
+    velocity is estimated, with this standard deviation on each axis at the start.
     """
 
     ranges: RangeNoise = field(default_factory=RangeNoise)
@@ -62,3 +65,4 @@ class Settings:
     drift_std_m: float = 0.0
     drift_time_s: float = 10.0
     drift_is_shared: bool = False
+    current_std_m_s: float = 0.0

@@ -25,7 +25,7 @@ class _Step:
     predicted_covariance: Floats
     state: Floats
     covariance: Floats
-    is_new_start: bool = False  # the pose was found anew here, so that it carries no information on the steps before
+    is_new_start: bool = False  # the pose was found again here, so that it carries no information on the steps before
 
 
 @dataclass(slots=True)

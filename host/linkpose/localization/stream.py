@@ -34,7 +34,7 @@ ORIGIN = "standard input"
 # The beginning of the stream from which the motion model and the start follow (s of the log, and rows at the most).
 # Longer delays the first pose; shorter may miss a slow sensor.
 HEAD_S, HEAD_ROWS = 1.0, 500
-# After so many ranges and bearings the noises are estimated from the rows so far, and in use this much later: a fixed
+# After this many ranges and bearings the noises are estimated from the rows so far, and in use this much later: a fixed
 # number, so that the same rows give the same poses however fast they come. The estimate takes up to 8 s.
 TUNED_AFTER, USED_AFTER = (100, 300, 1200), 1.5
 UNITS_CHECKED_AFTER = (20, 200)  # rows: a median needs some
@@ -54,6 +54,8 @@ class Stream:
         self.report = report
         self.method, self.options, self.beacons = method, options, beacons
         self.settings = options.settings(options.estimate or ())
+        # A filter under way has no states for the constants of the water.
+        self._free = tuple(name for name in options.free if name not in ("current", "sound"))
         self.run: Localizer | None = None
         self.last: Row | None = None
         self.late = self.negative = 0
@@ -112,8 +114,8 @@ class Stream:
         self._late_in_a_row = self._late_in_a_row + 1 if event.time_s < now_s - SET_BACK_S else 0
         if self._late_in_a_row >= FEWEST_SET_BACK:
             raise LinkposeError(
-                f"{ORIGIN} line {event.line}: the clock jumps back from {now_s:.6g} to {event.time_s:.6g} s; start the "
-                "stream anew"
+                f"{ORIGIN} line {event.line}: the clock jumps back from {now_s:.6g} to {event.time_s:.6g} s; restart "
+                "the stream"
             )
 
     def remarks(self) -> list[str]:
@@ -127,7 +129,7 @@ class Stream:
         """The measurements of the lines."""
         ended = _Ended()
         try:
-            for event in stream_events(ended.watch(lines), Path("-")):
+            for event in stream_events(ended.watch(lines), Path(ORIGIN)):
                 if event.beacon and event.beacon not in self.beacons:
                     raise LinkposeError(f"{ORIGIN} line {event.line}: beacon {event.beacon} is not in the beacon file")
                 if is_negative(event):
@@ -157,7 +159,7 @@ class Stream:
             return
         self._sightings += 1
         if self._sightings in TUNED_AFTER:
-            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self.options.free)
+            self._tuning = pool.submit(tune, self._rows.copy(), self.settings, self.beacons, self._free)
         elif self._tuning is not None and self._sightings in [int(USED_AFTER * after) for after in TUNED_AFTER]:
             tuned = self._tuning.result()
             run.use(tuned)

@@ -19,7 +19,7 @@ class Track:
     `state` (N, n) in the order of `names`, `covariance` (N, n, n); NaN while the pose is not known yet. `applied` and
     `rejected` count measurements: a range, a beam, a landmark, a depth, an attitude. `rejected_sightings` holds time
     and beacon of each range and each landmark outside the gate. `widened` counts how often the standard deviations of
-    the pose were raised because most measurements were rejected, `relocated` how often the pose was found anew.
+    the pose were raised because most measurements were rejected, `relocated` how often the pose was found again.
     `consistency` holds the normalised innovations squared by sensor.
     """
 

@@ -22,10 +22,18 @@ from linkpose.localization.kalman import SUBMERSIBLE
 from linkpose.localization.likelihood import Rows, run_filter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import Localizer
-from linkpose.localization.settings import Settings
+from linkpose.localization.settings import Pose, Settings
 from linkpose.localization.steps import Gaussian
 from linkpose.localization.tables import Beacons
-from linkpose.localization.vehicle import CONTROLS, control_holds, drifts_of, kinds_of, noise_root, vehicle_of
+from linkpose.localization.vehicle import (
+    CONTROLS,
+    control_holds,
+    drifts_of,
+    kinds_of,
+    noise_root,
+    places_from_ranges,
+    vehicle_of,
+)
 
 # Fewer measurements do not determine four noises, or drifts beside them; more than MOST add time, not accuracy. Of a
 # longer log of ranges, the first DENSE show how errors change from one to the next, and the rest, evenly spread, how
@@ -58,11 +66,16 @@ PAIRS = (
     {"range": -1.0, "growth": 1.0}, {"speed": 1.0, "turn": -1.0}, {"range": -1.0, "drift": 1.0},
     {"drift": 1.0, "drift_time": 2.0}, {"drift": -1.0, "speed": 1.0},
 )  # fmt: skip
+# One of two starts is taken where it makes the log more likely by e^SIDE_LEAD; with less, the user states it.
+SIDE_LEAD = 20.0
 MOST_DRIFTING = 16  # beacons: each adds a state, and the time of a step grows with their square
 TUNABLE = (
-    "range", "growth", "bearing", "speed", "turn", "velocity", "yaw", "acceleration", "error_time", "drift",
+    "range", "growth", "bearing", "speed", "turn", "velocity", "yaw", "acceleration", "error_time", "drift", "current",
+    "sound",
 )  # fmt: skip
 PASSES = 3
+# Standard deviation of a sea current on each axis (m/s), at the start; twice it widens the first minute.
+CURRENT_STD_M_S = 0.3
 # Lower bounds of the odometry's noises (m/s and rad/s of one sample): wheels slip now and then, which Student's t
 # ignores as outliers. In the public log Plaza 1, whose turn rates are those of the truth, 0.01 takes the errors within
 # 2σ of the smoothed path from 89 to 94 %.
@@ -105,14 +118,30 @@ def tune(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) 
     return _with_slip(tuned, free)
 
 
+def likelier_start(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Pose | None:
+    """The start, of two on both sides of beacons near one line, that makes the log clearly more likely, or None."""
+    part = thinned(log, 0.0)
+    names = [name for name in free if name in _present(log) | {"range", "growth"}]
+    places = places_from_ranges(log, beacons)
+    costs = [_search(part, replace(settings, start=place), beacons, dict.fromkeys(names, 0.0))[1] for place in places]
+    best = int(np.argmin(costs))
+    return places[best] if min(np.delete(costs, best), default=math.inf) > costs[best] + SIDE_LEAD else None
+
+
 def _tune_ranges(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Settings:
     """As `tune`, for ranges whose errors may drift."""
     white = replace(settings, error_time_s=settings.error_time_s or 0.0)
-    spread = spread_out(_apart(log))
+    spread, is_diving = spread_out(_apart(log)), vehicle_of(kinds_of(log)) is SUBMERSIBLE
     names = [name for name in free if name in _present(log) | {"range", "growth"}]
     found, cost = _search(spread, white, beacons, dict.fromkeys(names, 0.0))
     if not math.isfinite(cost):
         return white
+    for further in ("current", "sound"):
+        if further in free and is_diving:
+            water = _with_water(white, further)
+            other, other_cost = _search(spread, water, beacons, dict.fromkeys(names, 0.0))
+            if other_cost < cost - DRIFT_LEAD:
+                white, found, cost = water, other, other_cost
     tuned = _applied(white, found)
     bounds = _drift_times(log)
     if bounds[0] < bounds[1]:
@@ -124,10 +153,17 @@ def _tune_ranges(log: Log, settings: Settings, beacons: Beacons, free: tuple[str
             if drift_cost < lowest:
                 tuned, lowest = _applied(drifting, drift), drift_cost
         hides = tuned.drift_time_s > SEEN_DRIFT * (log[-1].time_s - log[0].time_s)
-        if tuned.drift_std_m and hides and vehicle_of(kinds_of(log)) is SUBMERSIBLE:
+        if tuned.drift_std_m and hides and is_diving:
             usual = float(np.median([e.values[0] for e in log if isinstance(e, Event) and e.kind == "range"]))
             tuned = replace(tuned, drift_std_m=max(tuned.drift_std_m, LEAST_ACOUSTIC * usual))
     return _with_slip(_as_large_as_innovations(log, tuned, beacons, names)[0], free)
+
+
+def _with_water(settings: Settings, constant: str) -> Settings:
+    """The settings with one more constant of the water to estimate: its current, or the speed of sound."""
+    if constant == "current":
+        return replace(settings, current_std_m_s=CURRENT_STD_M_S)
+    return replace(settings, estimate=(*settings.estimate, "scale"))
 
 
 def _with_slip(settings: Settings, free: tuple[str, ...]) -> Settings:
@@ -166,6 +202,10 @@ def described(settings: Settings, log: Log) -> str:
         ("acceleration", settings.acceleration_std_m_s2, "m/s²"),
     )  # fmt: skip
     parts += [f"{name} {value:.3g} {unit}" for name, value, unit in words if name in present]
+    if settings.current_std_m_s:
+        parts.append("a constant current")
+    if vehicle_of(kinds_of(log)) is SUBMERSIBLE and "scale" in settings.estimate:
+        parts.append("the speed of sound")
     if settings.drift_std_m:
         shared = " in common" if settings.drift_is_shared else ""
         parts.append(f"drift {settings.drift_std_m:.3g} m over {settings.drift_time_s:.2g} s{shared}")

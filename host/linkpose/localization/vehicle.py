@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -25,6 +26,9 @@ DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehi
 CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
 FIRST_S = 5.0  # of ranges from which a tag's first place is fitted; a walk of a few metres at the most
 FIT_STEPS = 20
+# A place and its mirror image on the other side of beacons near one line are two where they are so far apart (m), and
+# the ranges fit the image up to so much worse (m): the usual error of a radio range. Twice it compares more starts.
+MIRRORED_M, MIRROR_MISFIT_M = 1.0, 0.5
 # Standard deviations of speed and turn rate of a robot whose log has no odometry (m/s, rad/s): a walk. With twice them,
 # a scan may be fitted to the next door.
 WALK_M_S, WALK_RAD_S = 1.0, 0.8
@@ -80,28 +84,39 @@ def at_their_height(beacons: Beacons) -> Beacons:
     return {name: (x, y, z - mean) for name, (x, y, z) in beacons.items()}
 
 
-def place_from_ranges(log: Log, beacons: Beacons) -> Pose | None:
-    """Where a tag is at the log's start, from the first ranges to at least three beacons; None where there are fewer.
+def places_from_ranges(log: Log, beacons: Beacons) -> list[Pose]:
+    """Where a tag may be at the log's start, from the first ranges to at least three beacons; empty where there are
+    fewer.
 
-    The ranges of FIRST_S are fitted by Gauss-Newton from each beacon and from their centre; the best fit counts.
+    The ranges of FIRST_S are fitted by Gauss-Newton from each beacon and from their centre; the best fit is the first
+    place. Beacons near one line have a second one, its mirror image, where that explains the ranges nearly as well.
     """
     first = [e for e in log if isinstance(e, Event) and e.kind == "range" and e.time_s <= log[0].time_s + FIRST_S]
     latest = {event.beacon: event.values[0] for event in reversed(first)}
     if len(latest) < 3:
-        return None
-    places = np.array([beacons[name] for name in latest])
+        return []
+    at = np.array([beacons[name] for name in latest])
     ranges = np.array(list(latest.values()))
-    fits = []
-    for start in (places.mean(axis=0), *places):
-        place = np.array([start[0] + 0.1, start[1] - 0.1])
-        for _ in range(FIT_STEPS):
-            off = place - places[:, :2]
-            distance = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
-            slopes = off / distance[:, np.newaxis]
-            place = place + np.linalg.lstsq(slopes, ranges - distance, rcond=None)[0]
-        fits.append((float(np.sum((ranges - distance) ** 2)), float(place[0]), float(place[1])))
-    _, x, y = min(fits)
-    return (x, y, 0.0) if np.isfinite([x, y]).all() else None
+    cost, place = min((_fitted(at, ranges, start) for start in (at.mean(axis=0), *at)), key=lambda fit: fit[0])
+    if not np.isfinite(place).all():
+        return []
+    centre = at[:, :2].mean(axis=0)
+    along = np.linalg.svd(at[:, :2] - centre)[2][0]
+    mirrored = 2.0 * (centre + ((place - centre) @ along) * along) - place
+    other_cost, other = _fitted(at, ranges, mirrored)
+    is_apart = math.dist(place, other) > MIRRORED_M
+    explains = other_cost < cost + len(at) * MIRROR_MISFIT_M**2
+    return [(float(x), float(y), 0.0) for x, y in ([place, other] if is_apart and explains else [place])]
+
+
+def _fitted(beacons: Floats, ranges: Floats, start: Floats) -> tuple[float, Floats]:
+    """The sum of squares (m²) and the place (2,) of the least-squares fit of ranges (n,) to beacons (n, 3)."""
+    place = np.array([start[0] + 0.1, start[1] - 0.1])
+    for _ in range(FIT_STEPS):
+        off = place - beacons[:, :2]
+        distance = np.maximum(np.linalg.norm(off, axis=1), 1e-6)
+        place = place + np.linalg.lstsq(off / distance[:, np.newaxis], ranges - distance, rcond=None)[0]
+    return float(np.sum((ranges - distance) ** 2)), place
 
 
 def start_state(pose: Pose, depth_m: float, settings: Settings, motion: MotionModel) -> tuple[Floats, Floats]:
@@ -114,6 +129,8 @@ def start_state(pose: Pose, depth_m: float, settings: Settings, motion: MotionMo
         "heading_rad": (pose[2], turned),
         "z_m": (-depth_m, max(far, settings.depth_std_m)),
         "wz_rad_s": (0.0, 0.5),
+        "x_current_m_s": (0.0, settings.current_std_m_s),
+        "y_current_m_s": (0.0, settings.current_std_m_s),
         "x_rate_m_s": (0.0, FASTEST_M_S),
         "y_rate_m_s": (0.0, FASTEST_M_S),
     }

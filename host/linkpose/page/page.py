@@ -104,7 +104,7 @@ class Page:
         self._blocks += 1
         self._is_changed = True
 
-    def begin_anew(self, estimates: Floats) -> None:
+    def restart(self, estimates: Floats) -> None:
         """Takes estimates (N, columns) in place of all before: a filter has caught up with the samples so far."""
         self._queue.append((estimates, True))
 
@@ -205,9 +205,9 @@ class Page:
         blocks = [self._queue.popleft() for _ in range(len(self._queue))]
         if not blocks or not isinstance(self._history, History):
             return
-        last_anew = max((at for at, (_, is_anew) in enumerate(blocks) if is_anew), default=None)
-        if last_anew is not None:
-            del blocks[:last_anew]
+        last_restart = max((at for at, (_, is_restart) in enumerate(blocks) if is_restart), default=None)
+        if last_restart is not None:
+            del blocks[:last_restart]
             self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
         rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
         self._history.add(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -28,6 +29,7 @@ _LARGEST = 1e9  # of any number in a rig file, in the unit of its key: larger on
 
 CHAIN_JOINTS = ("ball", "hinge")
 FIRST_JOINTS = ("fixed", "free")  # from which the first link hangs
+_MOST_PARTS = 64  # of a dotted key, and dots between two separators; linkpose's keys have two parts
 _UNIT = 0.01  # by which the length of a quaternion may differ from 1: numbers typed with two digits
 _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 
@@ -232,7 +234,9 @@ class Rig:
     def load(path: str | PathLike[str]) -> Rig:
         """Reads a rig file. Raises CannotRead, or FileFormatError naming the file, the key and the cure."""
         try:
-            tables = tomllib.loads(read_bytes(Path(path), "the rig file").decode())
+            text = read_bytes(Path(path), "the rig file").decode()
+            _check_keys(text)
+            tables = tomllib.loads(text)
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError, RecursionError) as error:
             raise FileFormatError(path, f"{path} is not a rig file: {str(error)[:200]}") from error
         return Rig.from_dict(tables, str(path))
@@ -385,3 +389,12 @@ def as_rig(rig: Rig | str | PathLike[str] | None, own: Rig | None = None) -> Rig
     if own is not None and loaded.imu.delay_s is None:
         loaded = replace(loaded, imu=replace(loaded.imu, delay_s=own.imu.delay_s))
     return loaded
+
+
+def _check_keys(text: str) -> None:
+    """Raises ValueError for a dotted key of too many parts: the time of tomllib grows with their square."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.count(".") <= _MOST_PARTS or line.lstrip().startswith("#"):
+            continue
+        if any(part.count(".") > _MOST_PARTS for part in re.split(r"[,=\[\]{}]", line)):
+            raise ValueError(f"line {number}: a key has more than {_MOST_PARTS} parts")

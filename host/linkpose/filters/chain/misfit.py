@@ -1,9 +1,9 @@
 """Readings that two links with one joint cannot give.
 
-Wrong units, a gyro that repeats one value, a saturated sensor without flags, and a sensor that was mounted anew leave
+Wrong units, a gyro that repeats one value, a saturated sensor without flags, and a sensor that was remounted leave
 the joint's constraint with innovations that last, with a large residual, or with accelerometer biases that no sensor
 has. The estimates and their σ then mean nothing. They are blank until the readings fit again. After some seconds the
-filter forgets the mounting and the biases, so that it recovers from a sensor that was mounted anew. Readings that keep
+filter forgets the mounting and the biases, so that it recovers from a sensor that was remounted. Readings that keep
 failing to fit have to fit for twice as long each time.
 """
 
@@ -23,13 +23,13 @@ _MOST_RESIDUAL, _LEAST_REACH_M_S = 0.3, 0.1
 # Mean norm of the rate (rad/s): a runner's shank has 5; a leg whose rates are in °/s has 50.
 MOST_MEAN_RATE_RAD_S = 20.0
 # Mean square of the joint's lasting innovations, in multiples of its value for a right σ: 6 at most in [D] and [O]; a
-# gyro that repeats one value makes it 23, a sensor mounted anew 11 to 20.
+# gyro that repeats one value makes it 23, a sensor remounted 11 to 20.
 _MOST_LASTING = 10.0
 # Factor of the acceleration's noise that the innovations demand: 3 at most in [D] and [O], up to 100 for a sensor that
-# was mounted anew.
+# was remounted.
 _MOST_WIDENING = 15.0
 _FORGET_S = 5.0  # of misfit before mounting and biases are forgotten; knocks are shorter
-# Share of the misfit's time that as much time with a fit takes off. At 1, a sensor mounted anew that fits now and then
+# Share of the misfit's time that as much time with a fit takes off. At 1, a sensor remounted that fits now and then
 # has estimates with a wrong heading.
 _RECOVERY = 0.5
 _PROBATION_S = 10.0  # without estimates after that: a second misfit shows within it

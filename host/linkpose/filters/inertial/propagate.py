@@ -13,7 +13,6 @@ from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuCalibration
 from linkpose.filters._vector import Turn, Vec
 from linkpose.filters.inertial.state import BA, BG, MA, MG, PSI, SIZE, D, Floats, Record, V, Z
-from linkpose.filters.inertial.update import multiply_row
 
 # Acceleration that a step without a force may hold (m/s², 1σ): a blow. The velocity is then unknown after a few
 # samples, which is the intention. Doubling it changes nothing visible.
@@ -87,11 +86,15 @@ def velocity_variance(s: Record, change: Vec, bend: Vec, h: float, imu: ImuCalib
     return (imu.accel_variance + min(unknown, GAP_ACCEL_M_S2) ** 2) * h * h
 
 
-@inner
-def fill_transition(s: Record, rate: Vec, force: Vec) -> None:
-    """Rows of the transition matrix F for the errors of Z, v and ψ over the accumulated increments.
+# Where each of thirteen errors begins that the propagation combines: of Z, v, ω and f, and last ψ.
+_Z, _V, _RATE, _FORCE, _PSI = 0, 3, 6, 9, 12
 
-    `rate` (rad/s) and `force` (m/s²) are the mean readings, which multiply M_g and M_a. With R = exp(−[turned×]),
+
+@inner
+def fill_transition(s: Record) -> None:
+    """Rows of the transition matrix for the errors of Z, v and ψ over the accumulated increments.
+
+    Its columns are for the errors of Z, v, ω, f and ψ. With R = exp(−[turned×]),
 
         δZ' = R δZ + h Z × δω                                 δω = −δb_g − δM_g s_G
         δv' = R δv − g h R δZ + h (v × δω + δf)               δf = −δb_a − δM_a s_A
@@ -99,59 +102,83 @@ def fill_transition(s: Record, rate: Vec, force: Vec) -> None:
     """
     f, h, x = s.transition, s.span, s.nominal
     for i in range(7):
-        for j in range(SIZE):
+        for j in range(13):
             f[i, j] = 0.0
     turn = vec.turn_of(vec.load(s.turned))
     for k in range(3):
         column = vec.turn_back(turn, (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0))
         for c in range(3):
-            f[Z + c, Z + k] = column[c]
-            f[V + c, V + k] = column[c]
-            f[V + c, Z + k] = -GRAVITY * h * column[c]
-    f[6, PSI] = 1.0
+            f[c, _Z + k] = f[3 + c, _V + k] = column[c]
+            f[3 + c, _Z + k] = -GRAVITY * h * column[c]
     for c in range(3):
         a, b = (c + 1) % 3, (c + 2) % 3
-        f[V + c, BA + c] = -h
-        f[6, BG + c] = -h * x[Z + c]
+        f[3 + c, _FORCE + c] = h
+        f[6, _RATE + c] = h * x[Z + c]
         for first in range(0, 6, 3):  # Z × δω, v × δω
-            f[first + c, BG + b] = -h * x[first + a]
-            f[first + c, BG + a] = h * x[first + b]
-        for k in range(3):
-            f[V + c, MA + 3 * c + k] = -h * force[k]
-            f[6, MG + 3 * c + k] = -h * x[Z + c] * rate[k]
-            for first in range(0, 6, 3):
-                f[first + c, MG + 3 * b + k] = -h * x[first + a] * rate[k]
-                f[first + c, MG + 3 * a + k] = h * x[first + b] * rate[k]
+            f[first + c, _RATE + b] = h * x[first + a]
+            f[first + c, _RATE + a] = -h * x[first + b]
+    f[6, _PSI] = 1.0
 
 
 @inner
-def apply_transition(s: Record) -> None:
-    """P ← F P Fᵀ; only the rows and columns of Z, v and ψ change."""
+def apply_transition(s: Record, rate: Vec, force: Vec) -> None:
+    """P ← F P Fᵀ; only the rows and columns of Z, v and ψ change.
+
+    `rate` (rad/s) and `force` (m/s²) are the mean readings, which multiply M_g and M_a.
+    """
     p, f, w = s.covariance, s.transition, s.work
+    _combine_rows(p, s.combined, rate, force)
     for i in range(7):
-        multiply_row(f[i], p, w[i])
-    for i in range(6, -1, -1):
+        _multiply_combined(f[i], s.combined, w[i])
+    for i in range(7):
         row = i if i < 6 else PSI
         for j in range(6, PSI):
             p[row, j] = p[j, row] = w[i, j]
-        z, v, heading = _times_transposed(w, f[i])
-        for j in range(3):
-            p[row, Z + j] = p[Z + j, row] = z[j]
-            p[row, V + j] = p[V + j, row] = v[j]
-        p[row, PSI] = p[PSI, row] = heading
+        _combine_columns(w[i], s.combined[0], rate, force)
+        for k in range(i + 1):
+            total = 0.0
+            for j in range(13):
+                total += s.combined[0, j] * f[k, j]
+            column = k if k < 6 else PSI
+            p[row, column] = p[column, row] = total
 
 
 @inner
-def _times_transposed(w: Floats, f: Floats) -> tuple[Vec, Vec, float]:
-    """w fᵀ for seven rows w and one row f: its parts of Z, v and ψ."""
-    z, v, heading = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
-    for k in range(SIZE):
-        share = f[k]
-        if share != 0.0:
-            z = vec.axpy(share, (w[0, k], w[1, k], w[2, k]), z)
-            v = vec.axpy(share, (w[3, k], w[4, k], w[5, k]), v)
-            heading += share * w[6, k]
-    return z, v, heading
+def _combine_rows(p: Floats, out: Floats, rate: Vec, force: Vec) -> None:
+    """Covariance (13, 34) of the errors of Z, v, ω, f and ψ with each error of the state."""
+    for j in range(SIZE):
+        for i in range(6):
+            out[i, j] = p[i, j]
+        out[_PSI, j] = p[PSI, j]
+    for c in range(3):
+        m, a = MG + 3 * c, MA + 3 * c
+        for j in range(SIZE):
+            out[_RATE + c, j] = -p[BG + c, j] - rate[0] * p[m, j] - rate[1] * p[m + 1, j] - rate[2] * p[m + 2, j]
+            out[_FORCE + c, j] = -p[BA + c, j] - force[0] * p[a, j] - force[1] * p[a + 1, j] - force[2] * p[a + 2, j]
+
+
+@inner
+def _combine_columns(w: Floats, out: Floats, rate: Vec, force: Vec) -> None:
+    """The same of one row (34,): its covariances with the errors of Z, v, ω, f and ψ, into the first 13 of `out`."""
+    for i in range(6):
+        out[i] = w[i]
+    for c in range(3):
+        m, a = MG + 3 * c, MA + 3 * c
+        out[_RATE + c] = -w[BG + c] - rate[0] * w[m] - rate[1] * w[m + 1] - rate[2] * w[m + 2]
+        out[_FORCE + c] = -w[BA + c] - force[0] * w[a] - force[1] * w[a + 1] - force[2] * w[a + 2]
+    out[_PSI] = w[PSI]
+
+
+@inner
+def _multiply_combined(factors: Floats, rows: Floats, out: Floats) -> None:
+    """out ← factors rows: 13 factors, some of them zero, times 13 rows of 34."""
+    for j in range(SIZE):
+        out[j] = factors[_PSI] * rows[_PSI, j]
+    for k in range(0, _PSI, 3):
+        a, b, c = factors[k], factors[k + 1], factors[k + 2]
+        if a != 0.0 or b != 0.0 or c != 0.0:
+            for j in range(SIZE):
+                out[j] = out[j] + a * rows[k, j] + b * rows[k + 1, j] + c * rows[k + 2, j]
 
 
 @inner
@@ -184,8 +211,8 @@ def propagate_covariance(s: Record, force: Vec, rotation: float, velocity: float
     `force` (m/s²) is the mean reading; `rotation` (rad²), `velocity` (m²/s²) and `bias_walk` ((rad/s)²) are added to
     the variances of the readings' noise.
     """
-    fill_transition(s, vec.scale(1.0 / s.span, vec.load(s.turned)), force)
-    apply_transition(s)
+    fill_transition(s)
+    apply_transition(s, vec.scale(1.0 / s.span, vec.load(s.turned)), force)
     add_noise(s, s.rotation_variance + rotation, s.velocity_variance + velocity)
     for i in range(BG, BA):
         s.covariance[i, i] += bias_walk

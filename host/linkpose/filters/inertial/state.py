@@ -108,7 +108,8 @@ _FIELDS = np.dtype(
         ("turn_covariance", "f8", (4, 4)),  # of XᵀδZ, YᵀδZ, ZᵀδZ and ψ (rad²)
         ("lever_covariance", "f8", (4, 3)),  # of these with the error of J2S (rad m)
         # Scratch.
-        ("transition", "f8", (7, SIZE)),  # rows of Z, v and ψ
+        ("transition", "f8", (7, 13)),  # rows of Z, v and ψ, columns of Z, v, ω, f and ψ
+        ("combined", "f8", (13, SIZE)),  # covariance of the errors of Z, v, ω, f and ψ with each error
         ("jacobian", "f8", (3, SIZE)),
         ("direction", "f8", (SIZE,)),  # the one that cannot be observed
         ("work", "f8", (7, SIZE)),

@@ -17,7 +17,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters import _vector as vec
-from linkpose.filters._vector import Vec
+from linkpose.filters._vector import Sym, Vec
 from linkpose.filters.inertial.state import BA, MA, MG, PSI, SIZE, D, Floats, Record, V, Z
 from linkpose.filters.inertial.update import constrain_attitude
 
@@ -31,16 +31,18 @@ def restore_unobservable(s: Record) -> None:
     length = math.sqrt(vec.dot(d, d))
     along = vec.scale(1.0 / length, d) if length > 0.0 else (0.0, 0.0, 1.0)
     across = vec.unit(vec.cross(along, (1.0, 0.0, 0.0) if abs(along[0]) < _ALONG else (0.0, 1.0, 0.0)))
-    _restore(s, along)
-    _restore(s, across)
-    _restore(s, vec.cross(along, across))
+    turn = _turn_covariance(s)
+    _restore(s, along, turn)
+    _restore(s, across, turn)
+    _restore(s, vec.cross(along, across), turn)
 
 
 @inner
-def _restore(s: Record, axis: Vec) -> None:
+def _restore(s: Record, axis: Vec, covariance: Sym) -> None:
     """Set φ about `axis` back: the mean of the state along this direction, and the variance where it lacks.
 
-    The inverse variances of the misalignment and of J2S add up; their means are weighted with them.
+    `covariance` of φ (rad²) may be that before other axes, across this one, were set back: their part is zero here. The
+    inverse variances of the misalignment and of J2S add up; their means are weighted with them.
     """
     p, u, prior = s.covariance, s.direction, s.prior
     fill_direction(s, axis)
@@ -55,7 +57,7 @@ def _restore(s: Record, axis: Vec) -> None:
     for i in range(SIZE):
         s.nominal[i] -= variance * turn * u[i]
     constrain_attitude(s)
-    lacking = variance - _turn_variance(s)
+    lacking = variance - vec.quadratic(covariance, axis)
     if lacking <= 0.0:
         return
     for i in range(SIZE):
@@ -92,10 +94,23 @@ def _misalignment_variance(prior: Floats, axis: Vec) -> float:
 
 
 @inner
-def _turn_variance(s: Record) -> float:
-    """Variance of φ in the covariance: φ is a quarter of the product of M_a, M_g with the direction's own part."""
-    p, u, total = s.covariance, s.direction, 0.0
-    for i in range(MA, D):
-        for j in range(MA, D):
-            total += u[i] * p[i, j] * u[j]
+def _turn_covariance(s: Record) -> Sym:
+    """Covariance of φ (rad²): the mean, over both sensors, of the antisymmetric part of M, about each axis."""
+    p = s.covariance
+    return (
+        _turn_part(p, 0, 0), _turn_part(p, 0, 1), _turn_part(p, 0, 2),
+        _turn_part(p, 1, 1), _turn_part(p, 1, 2), _turn_part(p, 2, 2),
+    )  # fmt: skip
+
+
+@inner
+def _turn_part(p: Floats, first: int, second: int) -> float:
+    """Element (first, second) of it: of four signed elements of M_a and M_g with the four others."""
+    up, down = 3 * ((first + 1) % 3) + (first + 2) % 3, 3 * ((first + 2) % 3) + (first + 1) % 3
+    right, left = 3 * ((second + 1) % 3) + (second + 2) % 3, 3 * ((second + 2) % 3) + (second + 1) % 3
+    total = 0.0
+    for sensor in (MA, MG):
+        for other in (MA, MG):
+            total += p[sensor + up, other + right] - p[sensor + up, other + left]
+            total += p[sensor + down, other + left] - p[sensor + down, other + right]
     return total / 16.0

@@ -18,11 +18,12 @@ from linkpose.localization.models import (
     holonomic,
     landmark,
     submersible,
+    submersible_in_current,
     unicycle,
 )
 
 UNICYCLE, HOLONOMIC, SUBMERSIBLE = unicycle.ID, holonomic.ID, submersible.ID
-CONSTANT_VELOCITY = constant_velocity.ID
+CONSTANT_VELOCITY, SUBMERSIBLE_IN_CURRENT = constant_velocity.ID, submersible_in_current.ID
 BEAMS, BEACON_RANGE, LANDMARK, DIRECT = beams.ID, beacon_range.ID, landmark.ID, direct.ID
 COLUMNS = {model.ID: model.COLUMNS for model in (beams, beacon_range, landmark, direct)}  # of a model's parameters
 
@@ -36,6 +37,8 @@ def propagate(motion: int, state: Floats, control: Floats, noise: Floats, interv
         holonomic.propagate(state, control, noise, interval, out)
     elif motion == SUBMERSIBLE:
         submersible.propagate(state, control, noise, interval, out)
+    elif motion == SUBMERSIBLE_IN_CURRENT:
+        submersible_in_current.propagate(state, control, noise, interval, out)
     else:
         constant_velocity.propagate(state, control, noise, interval, out)
 
@@ -51,6 +54,8 @@ def motion_jacobians(
         holonomic.jacobians(state, control, interval, by_state, by_noise)
     elif motion == SUBMERSIBLE:
         submersible.jacobians(state, control, interval, by_state, by_noise)
+    elif motion == SUBMERSIBLE_IN_CURRENT:
+        submersible_in_current.jacobians(state, control, interval, by_state, by_noise)
     else:
         constant_velocity.jacobians(state, control, interval, by_state, by_noise)
 
