@@ -10,9 +10,11 @@ field's direction over all attitudes, after the constant rotation that fits best
 those that a method refuses (`…_refused`).
 
 Yaw with and without the magnetometer, beside VQF's with (9D) and without (6D):
-Simulated link (Test 1, five minutes), calibrated or data-sheet sensors, in an undisturbed field and beside a desk, a
-motor and iron. The seeds from FIRST_SEED on chose no constant. Sensors of the data sheet get the magnetometer's
-calibration that `calibrate mag` finds from a recording of the same sensors in an undisturbed field, as a user would.
+Simulated link (Test 1, five minutes), calibrated or data-sheet sensors, in an undisturbed field and in each disturbance
+of `simulation.mag_disturbances`. The seeds from FIRST_SEED on chose no constant. Sensors of the data sheet get the
+magnetometer's calibration that `calibrate mag` finds from a recording of the same sensors in an undisturbed field, as a
+user would.
+Drifting yaw: ten minutes of a filter whose yaw drifts by 0.01 °/s (1σ), in the same fields (`tests/host/drifting_yaw`).
 Real: BROAD, whose authors calibrated the magnetometer; strength and dip of the field are those of the first second.
 
 The error is that of the heading of the whole attitude, less that at the start: none of the filters knows north. For a
@@ -24,6 +26,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -44,10 +47,14 @@ from linkpose.recording.reader import Recording
 from linkpose.rotations import matrices, of_vectors, product, rotation_vectors, wrapped
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Mag, Rig
+from linkpose.simulation import mag_disturbances
 from linkpose.simulation.link import LinkRun
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / "host"))
+import drifting_yaw
+
 FIRST_SEED, SECONDS = 100, 300.0
-DISTURBANCES = (None, "desk", "motor", "iron")
+DISTURBANCES = (None, *mag_disturbances.KINDS)
 WORSE, LEAST_DEG = 1.1, 0.2
 # Over which the first heading is averaged (s): the link rests for 2 s, and the first second gives the gyro biases.
 _START_S = (1.0, 2.0)
@@ -193,6 +200,16 @@ def _calibrated(seed: int) -> Rig:
     return with_calibration(turned.rig, calibrate_mag([recording], turned.rig))
 
 
+def drifting_row(kind: str | None, seed: int) -> dict[str, object]:
+    """RMSE of the drifting yaw, and with the magnetometer."""
+    inner, block, drift = drifting_yaw.run(seed, kind)
+    error, std, _, f = drifting_yaw.held(inner, block, drift)
+    own, mag = (float(np.sqrt(np.mean(np.square(values)))) for values in (drift, error))
+    row = {"case": f"drifting {kind or 'undisturbed'} {seed}", "own_deg": own, "mag_deg": mag}
+    row |= {"within_2sigma": float(np.mean(np.abs(error) < 2 * std)), "used_s": f.found.used_s}
+    return {**row, "never_worse": bool(mag < max(WORSE * own, own + LEAST_DEG))}
+
+
 def broad(folder: Path) -> Iterator[Case]:
     """Free motion, optical reference."""
     for path in sorted(folder.glob("*.mat")):
@@ -270,19 +287,35 @@ def main() -> None:
             print_row(calibration_row(name, options.seeds), options.json)
     sources = [simulated(options.seeds), broad(options.data / "broad")]
     rows = []
+    for kind, seed in itertools.product(DISTURBANCES, range(FIRST_SEED, FIRST_SEED + options.seeds)):
+        if options.only in f"drifting {kind or 'undisturbed'} {seed}":
+            rows.append(drifting_row(kind, seed))
+            print_row(rows[-1], options.json)
     for case in itertools.chain(*sources):
         if options.only in case.name:
             rows.append(row_of(case))
             print_row(rows[-1], options.json)
-    kinds = dict.fromkeys(str(row["case"]).rsplit(" ", 1)[0] for row in rows)
-    for kind in kinds:
-        mine = [row for row in rows if str(row["case"]).startswith(kind)]
-        means = {
-            name: float(np.sqrt(np.mean([cast(float, row[name]) ** 2 for row in mine])))
-            for name in ("own_deg", "mag_deg", "vqf_6d_deg", "vqf_9d_deg")
-        }
-        worse = sum(not row["never_worse"] for row in mine)
-        print_row({"case": f"all {kind}", **means, "runs": len(mine), "worse": worse}, options.json)
+    for mine in _by_kind(rows).values():
+        print_row(_summary(mine), options.json)
+
+
+def _by_kind(rows: list[dict[str, object]]) -> dict[str, list[dict[str, object]]]:
+    """The rows of each kind of case: names end with the seed or the trial."""
+    kinds: dict[str, list[dict[str, object]]] = {}
+    for row in rows:
+        kinds.setdefault(str(row["case"]).rsplit(" ", 1)[0], []).append(row)
+    return kinds
+
+
+def _summary(rows: list[dict[str, object]]) -> dict[str, object]:
+    """Root mean square over the runs of a kind, and in how many the magnetometer made yaw worse."""
+    means = {
+        name: float(np.sqrt(np.mean([cast(float, row[name]) ** 2 for row in rows])))
+        for name in ("own_deg", "mag_deg", "vqf_6d_deg", "vqf_9d_deg")
+        if name in rows[0]
+    }
+    worse = sum(not row["never_worse"] for row in rows)
+    return {"case": f"all {str(rows[0]['case']).rsplit(' ', 1)[0]}", **means, "runs": len(rows), "worse": worse}
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from linkpose.filters.inertial.state import BA, BG, ESTIMATE, MA, MG, PSI, SIZE,
 from linkpose.filters.joint_inertial import InertialParameters
 from linkpose.sensors.rig import Imu
 
-RUNS = 5
+RUNS = 3
 IMU = ImuCalibration.of(Imu(gyro_noise_rad_s=0.01))
 Q = record_of(InertialParameters())[0]
 

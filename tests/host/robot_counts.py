@@ -80,8 +80,26 @@ def rig(places: tuple[tuple[float, float], ...] = TRIANGLE, counts_per_m: float 
     return Rig(mouse=tuple(Mouse(x, y, 0.0, counts_per_m) for x, y in places))
 
 
-def measurements(run: Robot, mice_counts: np.ndarray, rate_rad_s: np.ndarray) -> Measurements:
+def forces(run: Robot, tilt_deg: float, offset_m_s2: float, place_m: float, turned_deg: float) -> np.ndarray:
+    """(N, 2): an accelerometer on a tilted floor, `place_m` ahead of the centre, turned about the vertical."""
+    rng = np.random.default_rng([run.seed, 3])
+    force = np.gradient(run.speed, STEP_S) + 1j * run.turn_rate * run.speed
+    force += place_m * (1j * np.gradient(run.turn_rate, STEP_S) - run.turn_rate**2)
+    force = np.convolve(force, np.ones(10) / 10)[: len(force) : STEPS_PER_SAMPLE]  # the sensor's low-pass filter
+    down, offset = np.exp(1j * rng.uniform(0, 6, 2))
+    force += 9.81 * np.sin(tilt_deg * DEG) * down * np.exp(-1j * run.pose[:, 2]) + offset_m_s2 * offset
+    vibration = 0.04 + 0.2 * (np.abs(run.speed[::STEPS_PER_SAMPLE]) > 0.01)
+    force += vibration * (rng.standard_normal((len(force), 2)) @ [1, 1j])
+    force *= np.exp(1j * turned_deg * DEG)
+    return np.column_stack([force.real, force.imag])
+
+
+def measurements(
+    run: Robot, mice_counts: np.ndarray, rate_rad_s: np.ndarray, force: np.ndarray | None = None
+) -> Measurements:
+    """Without `force` (N, 2; m/s²) the accelerometer repeats one value."""
     zero = np.zeros(len(run.time_s))
-    still = np.column_stack([zero, zero, zero + 9.81])
-    block = Measurements.from_imu(run.time_s, still, np.column_stack([zero, zero, rate_rad_s]))
+    level = np.zeros((len(run.time_s), 2)) if force is None else force
+    specific_force = np.column_stack([level, zero + 9.81])
+    block = Measurements.from_imu(run.time_s, specific_force, np.column_stack([zero, zero, rate_rad_s]))
     return replace(block, mice_counts=mice_counts)

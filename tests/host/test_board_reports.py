@@ -149,6 +149,28 @@ def test_where_the_firmware_hung_is_reported(board: ScriptedBoard, linkpose: Cal
     assert "the firmware hung at program counter 0x1234" in linkpose("info", "--port", FAST).out
 
 
+def test_another_firmware_after_a_reset_is_reported(board: ScriptedBoard) -> None:
+    """As after an upload to another board of the same kind, which takes its place."""
+    board.resets = [50]
+    board.hello = lambda hello: hello._replace(source_revision=0x1234 if board.resets else 0xABCD)
+    messages: list[str] = []
+    with Session(FAST, messages.append) as session:
+        for _ in session.stream(1.5):
+            pass
+    assert "the board's firmware is another one now: source revision 0000abcd instead of 00001234" in messages, messages
+
+
+def test_a_mouse_that_is_connected_later_is_reported(board: ScriptedBoard) -> None:
+    """The recording has columns for the two mice of the first HELLO."""
+    board.hello = lambda hello: hello._replace(sections=hello.sections & ~0x70 | 2 << 4, mice=hello.mice[:2])
+    messages: list[str] = []
+    with Board(FAST, notify=messages.append, rig=Rig()) as connected:
+        for _ in connected.stream(1.0):
+            pass
+    found = [line for line in messages if "a mouse was found at port 3, which had none at the start" in line]
+    assert len(found) == 1, messages
+
+
 @pytest.mark.parametrize(
     ("url", "prefixes"),
     [("sim://link?speed=0", [""]), ("sim://link?speed=0&imu2=1", ["", "imu2_"])],

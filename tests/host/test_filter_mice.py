@@ -236,6 +236,7 @@ def test_samples_between_two_readings_change_nothing_at_the_readings(rate_hz):
     read = block.flags & STALE == 0
     alone = replace(
         block, time_s=block.time_s[read], mice_counts=block.mice_counts[read], gyro_rad_s=block.gyro_rad_s[read],
+        accel_m_s2=block.accel_m_s2[read],
         flags=block.flags[read],
     )  # fmt: skip
     out = estimate(run, block)

@@ -87,7 +87,7 @@ def test_another_minor_version_is_told_and_goes_on(
         status, _, output = linkpose(*command)
     assert status == 0
     assert f"the board uses protocol 2.{minor}, this linkpose 2.5" in output
-    assert f"the {older} should be updated" in output
+    assert f"they are compatible, but the {older} should be updated" in output
 
 
 def pull_and_plug(board: PtyBoard) -> None:

@@ -341,13 +341,16 @@ def alone(produce: Callable[[Path], object] | str) -> Producer | str:
     return produce if isinstance(produce, str) else lambda folder, _: produce(folder)
 
 
-def check_asserted(message: str, test: str) -> None:
-    """Fails unless that test exists, and its file holds a part of the message with which it compares."""
+def check_asserted(message: str, test: str, shortest: int = 10) -> None:
+    """Fails unless that test exists, and its file holds a part of the message with which it compares.
+
+    `shortest`: characters of a part.
+    """
     file, function = test.split("::")
     source = (Path(__file__).parent / file).read_text(encoding="utf-8")
     assert f"def {function}(" in source, f"there is no test {test}"
     source = re.sub(r"[\\`]", "", source)
-    words = [part for piece in message.split("…") for part in re.findall(r"[^;:]{10,}", piece)]
+    words = [part for piece in message.split("…") for part in re.findall(rf"[^;:]{{{shortest},}}", piece)]
     assert any(words_of[at : at + 12] in source for words_of in words for at in range(max(1, len(words_of) - 12))), (
         f"{test} does not compare with {message!r}"
     )
@@ -417,6 +420,46 @@ def test_each_promise_of_the_page_has_its_tests() -> None:
         file, function = name.split("::")
         source = (Path(__file__).parent / file).read_text(encoding="utf-8")
         assert f"def {function}(" in source, f"there is no test {name}"
+
+
+# The tests that assert each report of the page, in its order.
+REPORTS = [
+    "test_flash_mismatch.py::test_another_minor_version_is_told_and_goes_on",
+    "test_board_reports.py::test_mice_that_are_being_set_up_are_waited_for",
+    "test_board_reports.py::test_another_program_at_the_same_socket_is_reported_once",
+    "test_board_reports.py::test_acks_that_get_lost_while_resuming_do_not_end_the_recording",
+    "test_device.py::test_a_board_that_returns_silent_is_waited_for_to_the_end",
+    "test_device.py::test_a_board_that_returns_under_another_name_is_found",
+    "test_board_reports.py::test_where_the_firmware_hung_is_reported",
+    "test_board_reports.py::test_another_firmware_after_a_reset_is_reported",
+    "test_device.py::test_a_stream_that_turns_to_noise_is_reported",
+    "test_device.py::test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts",
+    "test_device.py::test_a_board_clock_that_stands_still_or_jumps_is_reported_once",
+    "test_device.py::test_a_board_that_repeats_the_number_of_a_sample_is_reported_once",
+    "test_board_reports.py::test_a_low_supply_is_reported_once",
+    "test_board_reports.py::test_a_mouse_that_is_connected_later_is_reported",
+    "test_device.py::test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file",
+]
+
+
+def test_each_report_of_a_run_is_on_the_page_and_asserted() -> None:
+    """Whatever the program notifies its user of while a board runs."""
+    text = PAGE.read_text(encoding="utf-8").split("\n## Reports during a run")[1].split("\n## ")[0]
+    shown = re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE)
+    for report, test in zip(shown, REPORTS, strict=True):
+        check_asserted(report, test, shortest=5)
+    missing = {of: where for of, where in notices() if not any(re.fullmatch(pattern(row), of) for row in shown)}
+    assert not missing, f"host/docs/messages.md has no row for {missing}"
+
+
+def notices() -> Iterator[tuple[str, str]]:
+    """The sentences that the library gives to `notify`, as `sentences` does, and where they are."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and name_of(node.func) == "notify" and node.args:
+                text = text_of(node.args[0])
+                if " " in text:
+                    yield text, f"{path.relative_to(PACKAGE)}:{node.lineno}"
 
 
 SHORTEST = 16  # characters of a sentence; shorter texts are the names of arguments

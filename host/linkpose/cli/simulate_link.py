@@ -32,8 +32,9 @@ from linkpose.sensors.rig import Rig, Vector
 @click.option("--mag", is_flag=True, help="Add a magnetometer.")
 @click.option(
     "--mag-disturbance",
-    type=click.Choice(["desk", "motor", "iron"]),
-    help="Disturb the magnetometer, which is added: a steel desk, a motor on the link, or iron that is carried past.",
+    type=click.Choice(["desk", "desks", "motor", "iron", "building", "floor", "lift", "car"]),
+    help="Disturb the magnetometer, which is added: a steel desk that arrives, several desks, a motor on the link, "
+    "iron that is carried past, a building, a steel floor, a lift or a car.",
 )
 @options.force
 @options.quiet

@@ -16,6 +16,13 @@ the yaw of that moment, and nothing jumps. If it is the old field but for a smal
 a disturbance below the gates had moved it. A calibration that does not fit shows as a strength that varies with
 attitude; this variation is measured and widens c.
 
+A disturbance within the gates that changes slowly would still be taken for a drift. Its component across the field is
+not observed, and is assumed to be as large as the two that are: the changes of the horizontal strength and of the
+vertical component since the reference. From their variance follows that of the direction, V. V is not averaged over
+time, since the disturbance may last; the correction is the part own² / (own² + m + V) of what the directions state,
+with σ² = own² of the filter's own yaw and the variance m of the directions. Where the field varies by as much as the
+yaw may have drifted, the yaw therefore stays almost as it is.
+
 Sources: gates of norm and dip and the temporary rejection as in [VQF], section 3.4; ρ and c are first-order
 Gauss-Markov processes.
 """
@@ -47,7 +54,7 @@ _GATE = 9.0  # χ² with one degree of freedom: three standard deviations
 # Difference of strength and vertical component from the reference (share of the field, and multiple of the residual).
 # At 4 % (2 µT), a disturbance along the field passes that turns the heading by no more than the gate lets pass.
 _FIELD_SHARE, _FIELD_RESIDUALS = 0.04, 3.0
-# Share of a difference from the calibrated strength that counts as error. Doubled, the field holds half as well.
+# Share of a difference from the calibrated field that counts as error. Doubled, the field holds half as well.
 _FOREIGN_SHARE = 0.5
 _PLAUSIBLE_SHARE = 0.5  # of the calibrated strength: beside steel it differs by this
 _LEAST_LEVEL_UT = 5.0  # horizontal field below which there is no heading
@@ -58,6 +65,16 @@ _RENEW_S = 20  # windows of a steady but different field before it becomes the r
 _STRENGTH_S = 60.0  # over which the strength's variation with attitude is measured
 _UNKNOWN_RAD2 = 100.0  # variance of an unknown direction
 _DRIFT, _RATE, _NORTH, _ERROR = range(4)
+# Variance of the disturbance within the gates. Windows closer than this are not independent (s); memory (s).
+_INDEPENDENT_S, _VARIATION_S = 30.0, 300.0
+# Standard deviation along one axis before it is measured (µT), and how many independent windows this prior counts as.
+# Doubled, the first minutes of an undisturbed field hold half as well.
+_PRIOR_UT, _PRIOR_WINDOWS = 1.0, 1.0
+# Factor of that standard deviation: it is measured from a few independent windows, of which one in ten shows a third of
+# the true value. At 1, yaw with the magnetometer is worse than without it in some buildings.
+_CAUTION = 3.0
+_LEAST_FREE = 0.1  # of the tolerance: beyond it the variance is not observed
+_SLEW_S = 20.0  # over which the applied part of the correction follows its value: the yaw does not jump
 
 
 @dataclass(slots=True)
@@ -79,6 +96,42 @@ class FieldRecord:
             "largest_disturbance_uT": round(self.largest_disturbance_uT, 3),
             "magnetic_north_deg": None if self.north_deg is None else round(self.north_deg, 3),
         }
+
+
+class _Variation:
+    """Variance of a disturbance along one axis, from the changes of accepted fields."""
+
+    def __init__(self, tolerance_uT: float) -> None:
+        self._tolerance_uT = tolerance_uT
+        self._sum = self._renewals = 0.0  # squares over independent windows (µT²)
+        self._count = 0.0
+
+    def add(self, change_uT: tuple[float, float]) -> None:
+        """A window's change of level and vertical component since the reference."""
+        keep, weight = math.exp(-_WINDOW_S / _VARIATION_S), _WINDOW_S / _INDEPENDENT_S
+        self._sum = keep * self._sum + weight * _mean_square(change_uT)
+        self._renewals *= keep
+        self._count = keep * self._count + weight
+
+    def renew(self, change_uT: tuple[float, float]) -> None:
+        """That of a field which becomes the reference."""
+        self._renewals += _mean_square(change_uT)
+
+    @property
+    def square_uT2(self) -> float:
+        """The variance (µT²).
+
+        Accepted fields lie within the tolerance L of the reference. Of a variance s² they show 1 / (1/s² + 3/L²): for a
+        large s that of a uniform distribution.
+        """
+        count = self._count + _PRIOR_WINDOWS
+        seen = (self._sum + _PRIOR_WINDOWS * _PRIOR_UT**2) / count
+        free = max(1.0 - 3.0 * seen / self._tolerance_uT**2, _LEAST_FREE)
+        return seen / free + self._renewals / count
+
+
+def _mean_square(change_uT: tuple[float, float]) -> float:
+    return 0.5 * (change_uT[0] ** 2 + change_uT[1] ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +179,9 @@ class MagneticHeading:
         self._residual_uT = max(mag.residual_uT, _LEAST_ERROR_UT)
         self._tolerance_uT = max(_FIELD_RESIDUALS * self._residual_uT, _FIELD_SHARE * mag.field_uT)
         self._strength_square = 0.0
+        self._variation = _Variation(self._tolerance_uT)
+        self._disturbance_rad2 = 0.0  # V
+        self._applied = 0.0  # part of the estimated drift that is removed
         self._index = -math.inf  # of the window that is being filled
         self._readings: list[Floats] = []  # its rows of time, field (3), angles (3), their σ (3)
         self._unlike: list[Floats] = []  # fields of the last windows, all rejected
@@ -182,11 +238,31 @@ class MagneticHeading:
         variance = p[_DRIFT, _DRIFT] + ahead * (2 * p[_DRIFT, _RATE] + ahead * p[_RATE, _RATE])
         _, _, yaw = self._angles
         own = np.radians(rows[:, self._stds[2]])
-        variance = np.minimum(np.maximum(variance, 0.0), own**2)
+        drift, variance = self._applied * drift, self._remaining(np.minimum(np.maximum(variance, 0.0), own**2), own**2)
         rows[:, yaw] = (rows[:, yaw] - np.degrees(drift) + 180.0) % 360.0 - 180.0
         rows[:, self._stds[2]] = np.degrees(np.sqrt(variance))
         if self._level:
             self._turn_position(rows, drift, own**2 - variance)
+
+    def _remaining(self, variance: Floats, own: Floats) -> Floats:
+        """Variance (rad²) of the yaw less the applied part of the drift.
+
+        `variance` is that of the drift without V, `own` that of the filter's own yaw. The directions z with variance m
+        and the gain G = own / (own + m) give the drift G z; the applied part A G z leaves (1 − A G)² own + (A G)²
+        (m + V).
+        """
+        gain = self._applied * (1.0 - variance / np.maximum(own, 1e-12))
+        directions = gain * self._applied * variance + gain**2 * self._disturbance_rad2
+        return np.minimum((1.0 - gain) ** 2 * own + directions, own)
+
+    def _follow_applied(self, window: _Window) -> None:
+        """Let the applied part follow (own + m) / (own + m + V)."""
+        level = max(window.level_uT, _LEAST_LEVEL_UT)
+        self._disturbance_rad2 = 2.0 * (_CAUTION / level) ** 2 * self._variation.square_uT2  # at the reference, and now
+        own, variance = window.yaw_std_rad**2, float(self._covariance[_DRIFT, _DRIFT])
+        share = max(1.0 - variance / max(own, 1e-12), 0.0)  # of own in own + m
+        wanted = own / (own + share * self._disturbance_rad2) if own > 0.0 else 0.0
+        self._applied += _WINDOW_S / _SLEW_S * (wanted - self._applied)
 
     def _turn_position(self, rows: Floats, drift: Floats, gained: Floats) -> None:
         """x and y turned by −drift; their σ less the variance of the yaw that the anchor has `gained` (rad²)."""
@@ -209,6 +285,7 @@ class MagneticHeading:
         if math.isnan(self._begun_s):
             self._begun_s = float(readings[0, 0])
         is_used = self._consider(window)
+        self._follow_applied(window)
         span = min(_WINDOW_S, float(readings[-1, 0] - readings[0, 0]))
         self.found.used_s += span * is_used
         self.found.rejected_s += span * (not is_used)
@@ -228,13 +305,19 @@ class MagneticHeading:
 
     @property
     def _foreign_uT(self) -> float:
-        """By how much the reference's strength differs from the calibrated one beyond the tolerance."""
-        return max(abs(self._reference_uT[0] - self._calibrated_uT) - self._tolerance_uT, 0.0)
+        """By how much strength or vertical component of the reference differ from the calibrated ones, beyond the
+        tolerance.
+        """
+        strength, vertical = self._reference_uT
+        apart = abs(strength - self._calibrated_uT)
+        if self._dip_deg is not None:
+            apart = max(apart, abs(vertical + self._calibrated_uT * math.sin(math.radians(self._dip_deg))))
+        return max(apart - self._tolerance_uT, 0.0)
 
     def _error_std(self, window: _Window) -> float:
         """σ of c (rad).
 
-        A strength that is not the calibrated one shows a calibration that does not fit, or iron so near that the field
+        A field that is not the calibrated one shows a calibration that does not fit, or iron so near that the field
         varies with the sensor's place: c may be as large as the share of it that counts.
         """
         error = max(self._residual_uT, math.sqrt(self._strength_square), _FOREIGN_SHARE * self._foreign_uT)
@@ -292,6 +375,7 @@ class MagneticHeading:
         self._predict(window)
         innovation, measured, variance = self._innovation(window)
         self._correct(measured, innovation, variance)
+        self._variation.add(self._change(window))
         self._strength_square += _WINDOW_S / _STRENGTH_S * (window.strength_square - self._strength_square)
         if self._foreign_uT == 0.0:
             self.found.north_deg = math.degrees(wrapped(float(self._mean[_NORTH])))
@@ -299,11 +383,18 @@ class MagneticHeading:
     def _accept_again(self, window: _Window, is_same: bool) -> None:
         """Take a field that was rejected but is steady: the old one but for a small angle, or a new reference."""
         if not is_same:
+            self._variation.renew(self._change(window))
             self._reference_uT = (window.strength_uT, float(window.field_uT[2]))
         self._forget(_ERROR, self._error_std(window) ** 2)
         if not is_same or not self._agrees(window, 2 * _GATE):
             self._renew(window)
         self._unlike = []
+
+    def _change(self, window: _Window) -> tuple[float, float]:
+        """Changes of level and vertical component since the reference (µT)."""
+        strength, vertical = self._reference_uT
+        level = math.sqrt(max(strength**2 - vertical**2, 0.0))
+        return window.level_uT - level, float(window.field_uT[2]) - vertical
 
     def _begin(self, window: _Window) -> None:
         """The first reference: ε is what the filter states, c what the calibration leaves."""

@@ -21,7 +21,7 @@ from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Imu, Joint, Mag, Noise, Rig, Vector
-from linkpose.simulation import baro, imu
+from linkpose.simulation import baro, imu, mag_disturbances
 from linkpose.simulation import mag as mag_model
 from linkpose.simulation.motion import HandMotion, SixSides
 from linkpose.wire.frames import sample
@@ -140,7 +140,7 @@ class LinkRun:
         swing_rad: float | None = None,
     ) -> None:
         """`imu2` adds a second inertial sensor half-way to the joint, with the axes of the first; `mag` a magnetometer,
-        whose field `mag_disturbance` (a key of mag.DISTURBANCES) disturbs.
+        whose field `mag_disturbance` (a key of mag_disturbances.KINDS) disturbs.
 
         `duration_s` None never ends (a live board). `motion` is "swing", "sides" (the sensor is laid on its six sides
         in turn, as `calibrate imu` requires it) or "rest" (as `calibrate noise` does). `noise_of` is a rig whose noise
@@ -176,12 +176,12 @@ class LinkRun:
             self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw_from(noise_of, rng, rate_hz) for rng in rngs)
         noise = noise_of.noise if noise_of is not None else Noise()
         self._drifts = {s: imu.BiasDrift(noise, (seed, s, _DRIFT, test)) for s in (_IMU_NOISE, _IMU2_NOISE)}
-        if mag_disturbance is not None and (mag_disturbance not in mag_model.DISTURBANCES or not mag):
-            known = ", ".join(mag_model.DISTURBANCES)
+        if mag_disturbance is not None and (mag_disturbance not in mag_disturbances.KINDS or not mag):
+            known = ", ".join(mag_disturbances.KINDS)
             raise LinkposeError(
                 f"there is no magnetic disturbance {mag_disturbance!r}: take {known}, and a magnetometer"
             )
-        self.mag_disturbance = mag_disturbance
+        self._mag_disturbance = None if mag_disturbance is None else mag_disturbances.Disturbance(mag_disturbance, seed)
         self._hard_iron_uT = mag_model.hard_iron(errors, np.random.default_rng([seed, _MAG_ERRORS, test]))
         self._weather = baro.Weather.draw(np.random.default_rng([seed, _WEATHER, test]), errors != "none")
         self._schedule = baro.Schedule(1 / rate_hz, oversampling)
@@ -267,8 +267,8 @@ class LinkRun:
         noise = mag_model.NOISE_UT * (self.errors != "none") * noise
         moving = self._motion.at(time_s)
         field = mag_model.field(moving) + self._hard_iron_uT + noise
-        if self.mag_disturbance is not None:
-            field = field + mag_model.disturbance(self.mag_disturbance, moving, time_s)
+        if self._mag_disturbance is not None:
+            field = field + self._mag_disturbance.field(moving, time_s)
         return field
 
     def _imu_counts(

@@ -21,17 +21,6 @@ NOISE_UT = 0.2  # QMC5883L, 13-52-04, table 2: 2 mG RMS at 8 G
 # Hard iron of the board: ±20 µT uncalibrated (GY-87 boards with steel screws); 2.5 % of that after a calibration.
 _HARD_IRON_UT = {"none": 0.0, "calibrated": 0.5, "datasheet": 20.0}
 
-# What disturbs the field, and from when on (s). Strengths (µT) are those that a magnetometer shows half a metre away.
-DISTURBANCES = {
-    "desk": "a steel desk is rolled near and stays",
-    "motor": "a motor on the link switches on and off",
-    "iron": "somebody walks past with iron, once in a minute",
-}
-_BEGINS_S, _ROLLING_S = 20.0, 3.0
-_DESK_UT, _MOTOR_UT, _IRON_UT = np.array([9.0, 14.0, -8.0]), np.array([6.0, -9.0, 4.0]), 25.0
-_MOTOR_PERIOD_S, _MOTOR_RIPPLE_HZ = 16.0, 7.0
-_WALK_PERIOD_S, _WALK_S = 60.0, 2.5
-
 
 def hard_iron(level: str, rng: np.random.Generator) -> Floats:
     """Constant offset (3,) of one specimen, µT."""
@@ -45,25 +34,6 @@ def calibration(level: str) -> Mag:
     strength, dip = math.hypot(NORTH_UT, UP_UT), math.degrees(math.atan2(-UP_UT, NORTH_UT))
     residual = math.hypot(NOISE_UT, 0.5 * _HARD_IRON_UT[level])
     return Mag((0.0, 0.0, 0.0), field_uT=round(strength, 3), residual_uT=round(residual, 3), dip_deg=round(dip, 2))
-
-
-def disturbance(kind: str, moving: Kinematics, time_s: Floats) -> Floats:
-    """Field of iron or a motor (N, 3) in the sensor's axes, µT; `kind` is a key of DISTURBANCES."""
-    since = np.maximum(time_s - _BEGINS_S, 0.0)
-    if kind == "motor":  # fixed to the link
-        runs = (since > 0) & (since % _MOTOR_PERIOD_S < _MOTOR_PERIOD_S / 2)
-        ripple = 1.0 + 0.5 * np.sin(2 * np.pi * _MOTOR_RIPPLE_HZ * time_s)
-        return np.outer(runs * ripple, _MOTOR_UT)
-    x, y, z = axes(moving)
-    if kind == "desk":
-        share = np.minimum(since / _ROLLING_S, 1.0)
-        east, north, up = np.outer(_DESK_UT, share)
-    else:
-        phase = (since + _WALK_PERIOD_S / 2) % _WALK_PERIOD_S - _WALK_PERIOD_S / 2
-        strength = (since > 0) * _IRON_UT / (1 + (phase / _WALK_S) ** 2) ** 1.5
-        angle = np.arctan2(phase, _WALK_S)
-        east, north, up = strength * np.cos(angle), strength * np.sin(angle), -0.3 * strength
-    return np.asarray(north[:, None] * x + east[:, None] * y + up[:, None] * z)
 
 
 def field(moving: Kinematics) -> Floats:

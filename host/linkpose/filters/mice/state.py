@@ -29,6 +29,7 @@ NOBODY = cast(int, np.int64(0))
 
 STALE = int(SampleFlags.MICE_STALE)
 _GAP_BEFORE, _GYRO_SATURATED = int(SampleFlags.GAP_BEFORE), int(SampleFlags.GYRO_SATURATED)
+_ACCEL_SATURATED = int(SampleFlags.ACCEL_SATURATED)
 _OVERFLOW = int(SampleFlags.MOUSE1_OVERFLOW)  # for mouse i, shifted left by i
 _MOST_RAD_S = 1e4  # beyond what any gyro reads
 
@@ -36,6 +37,7 @@ SAMPLE = np.dtype(
     [
         ("time", "f8"),  # s
         ("rate", "f8"),  # of the gyro about z, calibrated (rad/s); NaN where it cannot be used
+        ("accel", "c16"),  # specific force along x and y of the sensor (m/s²); NaN where it cannot be used
         ("counts", "c16", (MOST,)),  # of each mouse, in its own axes; NaN without a mouse, or when its counter ran over
         ("is_stale", "?"),  # whether the mice were not read for this sample
         ("is_after_gap", "?"),
@@ -191,6 +193,8 @@ def sample_records(block: Measurements, imu: Imu) -> NDArray[Any]:
     rate = block.gyro_rad_s - imu.gyro_bias_rad_s
     is_usable = (np.abs(rate) < _MOST_RAD_S).all(axis=1) & (block.flags & _GYRO_SATURATED == 0)
     samples["rate"] = np.where(is_usable, rate[:, 2], np.nan)
+    force = block.accel_m_s2[:, 0] + 1j * block.accel_m_s2[:, 1]
+    samples["accel"] = np.where(block.flags & _ACCEL_SATURATED == 0, force, np.nan)
     samples["is_stale"] = block.flags & STALE != 0
     samples["is_after_gap"] = block.flags & _GAP_BEFORE != 0
     ports = min(MOST, block.mice_counts.shape[1])

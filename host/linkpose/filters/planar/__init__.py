@@ -155,8 +155,8 @@ class _PlanarFilter:
         state, limit = self.state[0], float(self._mice_state[0].speed_limit)
         if limit > 0.0:
             yield (
-                f"the mice show no speed above {limit:.2f} m/s, where the gyro shows faster turns: this is the limit "
-                "of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
+                f"the mice show no speed above {limit:.2f} m/s, where gyro or accelerometer show more: this is the "
+                "limit of their sensors. Where the robot was faster, the path is too short, and the σ of the position "
                 "includes it. Drive slower, or use mice for higher speeds"
             )
         if state.resolution.changes:

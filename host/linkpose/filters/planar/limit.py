@@ -1,10 +1,10 @@
 """A speed above which the mice count too little: the sensor limit of all mice, which no flag shows.
 
-On a straight, all mice lose the same share, and no measurement contradicts them. In a bend the mice have different
-speeds, and the gyro shows by how much: mice at their limit show the same speed instead, or less than the slower ones
-imply. The limit is then the largest speed that has been seen. From there on, a mouse at the limit is left out where
-another one is slower; where all are at the limit, they show a lower bound. The way driven at the limit before it was
-found widens the position.
+On a straight, all mice lose the same share, and only the accelerometer can contradict them (see `acceleration`). In a
+bend the mice have different speeds, and the gyro shows by how much: mice at their limit show the same speed instead, or
+less than the slower ones imply. The limit is then the largest speed that has been seen. From there on, a mouse at the
+limit is left out where another one is slower; where all are at the limit, they show a lower bound. The way driven at
+the limit before it was found widens the position.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _TOO_SLOW = 1.05  # expected speed of the mouse at the limit over the one that i
 # Contradiction for so long (s), less the time, with this weight, of contradictions that a limit does not explain.
 # Doubled time: a limit is found one bend later.
 _EVIDENCE_S, _OTHERWISE = 0.3, 0.5
-_LIMITED_SHARE = 0.5  # of the way driven at the limit, as in the saturation of counters: its σ
+LIMITED_SHARE = 0.5  # of the way driven at the limit, as in the saturation of counters: its σ
 _MARGIN = 0.95  # of the largest speed seen: from here on, counts are a lower bound
 
 
@@ -36,17 +36,16 @@ def watch_limit(state: Record, m: Record, mice: Records) -> None:
     """Compare the speeds of the mice over the window with each other and with the gyro."""
     if not m.step > 0.0 or m.missed > 0.0 or m.speed_limit > 0.0 or state.at_rest or not m.window_s > 0.0:
         return
-    top, slowest = 0.0, math.inf
+    top = 0.0
     for i in range(m.count):
         if m.sound >> i & 1:
-            speed = math.sqrt(square(mice[i].window)) / m.window_s
-            top, slowest = max(top, speed), min(slowest, speed)
+            top = max(top, math.sqrt(square(mice[i].window)) / m.window_s)
     if top < _LEAST_M_S:
         return
     if top > _FASTER * state.fastest:
         state.fastest = top
         state.limit_s = state.limited_x = state.limited_y = 0.0
-    if slowest > _AT_LIMIT * state.fastest:
+    if are_at_limit(state, m, mice):
         way = scaled(m.step, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
         state.limited_x += abs(way.real)
         state.limited_y += abs(way.imag)
@@ -54,9 +53,26 @@ def watch_limit(state: Record, m: Record, mice: Records) -> None:
     if verdict != 0:
         state.limit_s += m.step if verdict > 0 else -_OTHERWISE * m.step
         if state.limit_s > _EVIDENCE_S:
-            m.speed_limit = _MARGIN * state.fastest
-            state.covariance[X, X] += (_LIMITED_SHARE * state.limited_x) ** 2
-            state.covariance[Y, Y] += (_LIMITED_SHARE * state.limited_y) ** 2
+            accept_limit(state, m, LIMITED_SHARE)
+
+
+@inner
+def are_at_limit(state: Record, m: Record, mice: Records) -> bool:
+    """Whether all mice move at about the largest speed so far, above the lowest limit that mice have."""
+    limit = _AT_LIMIT * state.fastest
+    is_at_limit = state.fastest > _LEAST_M_S
+    for i in range(m.count):
+        if m.sound >> i & 1:
+            is_at_limit = is_at_limit & (square(mice[i].window) > (limit * m.window_s) ** 2)
+    return bool(is_at_limit)
+
+
+@inner
+def accept_limit(state: Record, m: Record, share: float) -> None:
+    """The largest speed so far is the mice's limit: `share` of the way at this speed is the σ of the position."""
+    m.speed_limit, state.limited_share = _MARGIN * state.fastest, share
+    state.covariance[X, X] += (share * state.limited_x) ** 2
+    state.covariance[Y, Y] += (share * state.limited_y) ** 2
 
 
 @inner

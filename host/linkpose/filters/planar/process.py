@@ -12,6 +12,7 @@ from linkpose.filters.mice.least_squares import squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
+from linkpose.filters.planar.acceleration import forget, watch_acceleration
 from linkpose.filters.planar.gyro import agree, is_undecided, restart_turns, watch_gyro, widen_way
 from linkpose.filters.planar.limit import watch_limit
 from linkpose.filters.planar.measure import arm, update
@@ -45,9 +46,10 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
-# Another floor shows in two turns in a row, each of at least this much turning (rad²/s); a turn ends below this rate
-# (rad/s). Doubled: a floor is found later. A slip lasts for one turn.
-_ONE_TURN, _TURN_END_RAD_S = 0.05, 0.1
+# Another floor shows in two turns in a row, each of at least this much turning (rad²/s), equal within this share.
+# A turn ends below this rate (rad/s). A slip lasts for one turn. Doubled: a floor is found later. Doubled share: a
+# floor that varies is taken for another one.
+_ONE_TURN, _FLOOR_EQUAL, _TURN_END_RAD_S = 0.05, 0.3, 0.1
 # Turns in which the mice show different shares of the gyro's turn: noise of a share (1σ, by positions, angles and the
 # bias), standard deviations from which a difference counts, and turns over which it is averaged. Doubled noise: slips
 # of 3 % do not widen the position.
@@ -155,7 +157,8 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     latest, before = _off_of_turn(state), state.off_of_turn
     if latest == 0.0:
         latest, before = before, state.off_of_turn_before
-    if not (latest / off > 0.5 and before / off > 0.5) or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
+    varies = abs(latest - before) > _FLOOR_EQUAL * abs(off) or state.turn_spread > off * off
+    if varies or not latest / off > 0.5 or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
         return
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         for b in range(MICE + SCALE, state.size, OF_MOUSE):
@@ -430,6 +433,7 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
             _restore_way(state, shown)
         if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
             state.unconfirmed_s = -_SPREAD_S
+            forget(state.acceleration)  # it would contradict the jump back
     elif state.unconfirmed_s < 0.0:
         state.unconfirmed_s = min(state.unconfirmed_s + dt, 0.0)
     elif is_jump and square(shown - state.earlier) > limit * limit:
@@ -479,7 +483,8 @@ def _add_saturated_way(state: Record, m: Record, dt: float) -> None:
     """Add the variance of a way of which saturated mice show a lower bound only."""
     if not m.is_saturated:
         return
-    way = scaled(_SATURATED_SHARE * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
+    share = max(_SATURATED_SHARE, state.limited_share)
+    way = scaled(share * dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
     state.saturated_m += _add_systematic(state, way, state.saturated_m)
 
 
@@ -569,6 +574,7 @@ def _step(
     _add_unconfirmed_way(state, m, dt)
     _add_saturated_way(state, m, dt)
     watch_limit(state, m, mice)
+    watch_acceleration(state, m, mice, sample.accel)
     _watch_floor(state, m, mice, q)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)

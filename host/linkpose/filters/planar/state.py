@@ -100,6 +100,33 @@ _DISPUTE = np.dtype(
     align=True,
 )
 
+# The accelerometer against the mice, see `acceleration`. b are the axes of the sensor, n those in which the turn was 0.
+SLOTS = 14
+_SLOT = np.dtype(
+    [
+        ("span", "f8"),  # length (s)
+        ("force", "c16"),  # ∫ specific force dt in b (m/s)
+        ("way", "c16"),  # ∫ velocity by the mice dt in b (m)
+        ("facing", "c16"),  # ∫ e^{jψ} dt of the turn ψ (s)
+        ("force_n", "c16"),  # as `force` and `way`, in n
+        ("way_n", "c16"),
+        ("turn", "f8"),  # ψ at the end (rad)
+        ("rate", "f8"),  # largest turn rate, without its sign (rad/s)
+    ],
+    align=True,
+)
+_ACCELERATION = np.dtype(
+    [
+        ("last", "c16"),  # value of the accelerometer (m/s²)
+        ("repeats", "i8"),  # how often it has been the same to the last bit
+        ("turn", "f8"),  # by the gyro, less its bias (rad)
+        ("noise", "f8"),  # variance of one value, both axes together ((m/s²)²)
+        ("filled", "i8"),  # slots without a gap between them
+        ("slots", _SLOT, (SLOTS,)),
+    ],
+    align=True,
+)
+
 _FIELDS = [
     ("size", "i8"),  # of the state with the rig's mice
     ("mean", *_VECTOR),
@@ -134,6 +161,7 @@ _FIELDS = [
     ("turns", "i8"),  # number of turns that have been compared
     ("is_off", "?"),  # whether the last turn was off by more than calibration and noise explain
     ("dispute", _DISPUTE),
+    ("acceleration", _ACCELERATION),
     ("resolution", _RESOLUTION),
     ("jumps", "i8"),  # how often the gyro's bias has jumped
     ("jump", "f8"),  # the last jump (rad/s)
@@ -159,6 +187,7 @@ _FIELDS = [
     ("fastest", "f8"),  # largest speed of a mouse so far (m/s)
     ("limited_x", "f8"),  # way at about that speed, along either axis of n (m)
     ("limited_y", "f8"),
+    ("limited_share", "f8"),  # σ of the way at the limit, as a share of it; 0 until a limit has been found
     ("limit_s", "f8"),  # how long mice at that speed have contradicted the gyro (s)
     # The measurement of a step. At rest: v_x, v_y, ω. Else the gyro's rate, if any, x and y of mice in `seen_by`.
     ("rows", "i8"),
