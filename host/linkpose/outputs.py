@@ -52,6 +52,9 @@ def create(path: Path, force: bool) -> int:
         if force:  # another program created it in between; the last one has the name
             return create(path, force)
         raise FileExists(path) from None
+    except FileNotFoundError as error:
+        folder = path.absolute().parent
+        raise CannotWrite(path, error.strerror if folder.exists() else f"there is no folder {folder}") from error
     except OSError as error:
         raise CannotWrite(path, error.strerror) from error
 

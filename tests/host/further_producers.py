@@ -453,7 +453,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "the beacons are near one line, and the first ranges fit a start at … m; add --start X,Y,0 with the true one, or a beacon off the line": written(
             lambda path: lp.localize(path, beacons={"1": (0.0, 0.0), "2": (4.0, 0.0), "3": (8.0, 0.0)}),
-            EVENTS.replace("0,pose,0,0,0\n", "") + "0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
+            "time_s,kind,a,b,c\n0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
         ),
         "… holds no ranges from which a scale or bias could be estimated; leave out --estimate": written(
             lambda path: lp.localize(path, map=small_map(path.parent), estimate=("bias",)), SCANS, "a.log"
@@ -654,6 +654,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… has none of the endings …": typed("convert a.csv -o b.xyz"),
         "--label … must consist of letters, digits and _": typed("convert a.csv -o b.trc --label ,"),
         "… is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)": typed("estimate a.csv --j2s 1,2"),
+        "--j2s takes its three numbers without spaces: type --j2s=…": typed("estimate a.csv --j2s -0.09 -0.04 1.65"),
         "… is longer than … m; J2S is in metres": typed("estimate a.csv --j2s 900,0,0"),
         "… is not a number of seconds above 0": typed("record --duration -1"),
         "… is not finite": typed("estimate a.csv --j2s 0,0,inf"),

@@ -302,6 +302,7 @@ def test_info_json(linkpose):
     assert info["sample_rate_hz"] == 100 and info["mice"] == []
     assert info["samples_lost"] == info["frames_corrupt"] == 0
     assert {"protocol", "firmware", "clock_drift_ppm"} <= info.keys()
+    assert info["board"]["stack_free"] is info["board"]["vcc_mv"] is None, "a simulated board has no processor"
 
 
 UNO = PortInfo("/dev/ttyACM0", "Arduino Uno", 0x2341, 0x0043, "55", True, False)

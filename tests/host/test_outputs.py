@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import stat
 from collections.abc import Callable
@@ -139,6 +140,11 @@ def test_what_a_network_file_system_reports_at_the_end_is_reported(
     with monkeypatch.context() as patch, pytest.raises(CannotWrite, match=os.strerror(code)):
         patch.setattr(os, call, fail)
         file.close({})
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    with pytest.raises(CannotWrite, match=re.escape(f"there is no folder {tmp_path / 'none'}")):
+        create(tmp_path / "none" / "a.csv", force=False)
 
 
 def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,10 @@ def test_live_csv_and_capture_give_the_same_measurements(tmp_path_factory, raw, 
     converter = Converter(BoardSettings.of(hello))
     live = joined([converter.convert_placed([s], [Placed(0.01 * i, i, s.flags)]) for i, s in enumerate(raw)])
     live, _ = HealthMonitor(100.0, {"imu": "ok", "baro": "ok"}).check(live)
-    from_csv = load_recording(folder / "r.csv")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ResourceWarning)
+        from_csv = load_recording(folder / "r.csv")
+    assert not caught, "a file stays open"
     from_capture = load_recording(folder / "r.bin").measurements
     assert equal(live, from_csv.measurements)
     assert from_csv.rig == Rig(joint=Joint((1.0, 2.0, 3.0)))
@@ -204,6 +208,14 @@ BAD_FILES = {
     "an unknown column": (
         lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_x_rad"),
         "unknown column gyro_x_rad; did you mean gyro_x_rad_s, with values in its unit?",
+    ),
+    "an axis as another program names it": (
+        lambda lines: swap(lines, 2, "gyro_x_rad_s", "gx"),
+        "unknown column gx; did you mean gyro_x_rad_s, with values in its unit?",
+    ),
+    "an accelerometer as another program names it": (
+        lambda lines: swap(lines, 2, "accel_z_m_s2", "Acc_Z"),
+        "unknown column Acc_Z; did you mean accel_z_m_s2, with values in its unit?",
     ),
     "a column twice": (lambda lines: swap(lines, 2, "gyro_x_rad_s", "gyro_y_rad_s"), "gyro_y_rad_s stands twice"),
     "no inertial sensor": (

@@ -5,9 +5,10 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
+import re
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import click
@@ -33,6 +34,9 @@ COMMANDS = {
 }
 
 
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
+
+
 class LazyGroup(click.Group):
     """A group that lists its commands by name and imports a command only to run it or to show its help."""
 
@@ -53,7 +57,9 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does, with the nearest name for one that is not known."""
+        """As click does, with the nearest name for one that is not known, and for a vector typed as several words."""
+        if vector := _spaced_vector(args):
+            ctx.fail(f"--j2s takes its three numbers without spaces: type --j2s={vector}")
         name = args[0] if args else ""
         if name and name not in self._table and not name.startswith("-"):
             near = difflib.get_close_matches(name, self._table, 1)
@@ -113,6 +119,13 @@ def _run() -> int:
         )
         return 1
     return status if isinstance(status, int) else 0
+
+
+def _spaced_vector(words: Sequence[str]) -> str:
+    """The vector of --j2s that was typed as several words, as one; "" if there is none."""
+    after = words[words.index("--j2s") + 1 :] if "--j2s" in words else []
+    numbers = [word.rstrip(",") for word in after[:3]]
+    return ",".join(numbers) if len(numbers) == 3 and all(map(_NUMBER.fullmatch, numbers)) else ""
 
 
 def _of_the_system(error: Exception) -> str:

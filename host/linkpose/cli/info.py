@@ -110,13 +110,19 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "frames_corrupt": health.corrupt.total,
         "clock_drift_ppm": _rounded(health.drift_ppm),
         "clock_drift_std_ppm": _rounded(health.drift_std_ppm),
-        "board": None if status is None else _counters(status),
+        "board": None if status is None else _counters(status, session.port),
     }
 
 
-def _counters(status: Status) -> dict[str, Any]:
-    """The board's own counters, except those of single devices."""
-    return {name: value for name, value in status._asdict().items() if name not in ("t_us", "devices", "mice")}
+# Counters of the processor, which a simulated board does not have.
+_OF_PROCESSOR = ("loop_worst_us", "stack_free", "cpu_load", "vcc_mv")
+
+
+def _counters(status: Status, port: str) -> dict[str, Any]:
+    """The board's own counters, except those of single devices; None for one that is not measured."""
+    counters = {name: value for name, value in status._asdict().items() if name not in ("t_us", "devices", "mice")}
+    missing = _OF_PROCESSOR if port.startswith("sim://") else ("vcc_mv",) * (status.vcc_mv == 0)
+    return counters | dict.fromkeys(missing)
 
 
 def _device(device: HelloDevice) -> dict[str, Any]:
@@ -209,7 +215,7 @@ def _label(name: str) -> tuple[str, str]:
 
 def _item(name: str, value: Any) -> tuple[str, str, str]:
     label, unit = _label(name)
-    return label, _text(value), unit
+    return (label, "not measured", "") if value is None else (label, _text(value), unit)
 
 
 def _device_line(device: dict[str, Any]) -> str:

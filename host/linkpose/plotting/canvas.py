@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import io
+import logging
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,9 +43,22 @@ _FURTHER_FONTS = (
 )  # fmt: skip
 
 
+@contextlib.contextmanager
+def _without_warnings_of_matplotlib() -> Iterator[None]:
+    """For its import: without a writable home it uses a temporary folder, and the pictures are the same."""
+    logger = logging.getLogger("matplotlib")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
 def new_figure(width_inches: float, height_inches: float) -> Figure:
     """An empty figure."""
-    from matplotlib.figure import Figure
+    with _without_warnings_of_matplotlib():
+        from matplotlib.figure import Figure
 
     return Figure(figsize=(width_inches, height_inches), layout="constrained")
 

@@ -57,6 +57,10 @@ class CaptureSource:
         others = ["imu2"] * self.settings.has_imu2 + ["baro"] + ["mag"] * self.settings.has_mag
         self.sensors = ["imu", *others, *(f"mouse{port}" for port in range(1, self._mouse_ports + 1))]
 
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
+
     def blocks(self, progress: Progress | None) -> Iterator[Measurements]:
         """All samples in SI units."""
         converter = Converter(self.settings, self._mouse_ports)

@@ -6,6 +6,7 @@ blocks. A short recording stays in memory and is read once.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from os import PathLike
@@ -84,12 +85,12 @@ def load_recording(path: str | PathLike[str]) -> Recording:
     The result holds `measurements` (SI units, in the sensors' axes), the `rig` of the recording, and `remarks` on what
     is wrong with the data. Raises FileError, whose message names file, line and reason, for any other file.
     """
-    file = RecordingFile(Path(path))
-    measurements = file.load()
-    remarks = [*file.remarks, *file.contradictions(file.rig)]
-    return Recording(
-        file.path, measurements, file.rig, file.sample_rate_hz, file.metadata, remarks, file.health, file.unusable
-    )
+    with contextlib.closing(RecordingFile(Path(path))) as file:
+        measurements = file.load()
+        remarks = [*file.remarks, *file.contradictions(file.rig)]
+        return Recording(
+            file.path, measurements, file.rig, file.sample_rate_hz, file.metadata, remarks, file.health, file.unusable
+        )
 
 
 def _joined(blocks: list[Measurements]) -> Measurements:
@@ -160,6 +161,10 @@ class RecordingFile:
         monitor = self._new_monitor(self.sensors)
         for block in ahead(self._source.blocks(progress)):
             yield monitor.check(block)[0]
+
+    def close(self) -> None:
+        """Closes the file. What was read stays; `blocks` of a long recording can no longer be read."""
+        self._source.close()
 
     def load(self) -> Measurements:
         """All measurements at once."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,10 @@ class TableSource:
     @property
     def closing(self) -> dict[str, Any] | None:
         return self._file.closing
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._file.close()
 
     def blocks(self, progress: Progress | None) -> Iterator[Measurements]:
         """Measurements as they were recorded. Raises FileFormatError for values that no recording has."""
@@ -125,14 +130,26 @@ class TableSource:
         return float(rate) if isinstance(rate, int | float) and 0 < rate < _HIGHEST_RATE_HZ else None
 
 
+# Names of other programs for an axis of a sensor, such as ax, Acc_X, gyroX or wz.
+_AXIS_OF_OTHERS = re.compile(r"(a|acc|accel|g|gyr|gyro|w|omega|m|mag)[a-z]*?[ _.]?([xyz])", re.IGNORECASE)
+_SENSOR_BY_LETTER = {"a": columns.ACCEL, "g": columns.GYRO, "w": columns.GYRO, "o": columns.GYRO, "m": columns.MAG}
+
+
+def _nearest_column(name: str, known: Sequence[str]) -> str:
+    """The column that a name of another program is most likely to mean; "" if none is similar."""
+    if axis := _AXIS_OF_OTHERS.fullmatch(name):
+        return _SENSOR_BY_LETTER[axis[1][0].lower()]["xyz".index(axis[2].lower())]
+    return next(iter(difflib.get_close_matches(name, known, 1, 0.4)), "")
+
+
 def _check_columns(path: Path, names: list[str]) -> int:
     """Number of mouse ports; raises FileFormatError for a column that no recording has, or without time_s."""
     require(path, names, "time_s")
     known = columns.names(columns.ColumnLayout(MAX_MICE, imu2=True, mag=True))
     for name in names:
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1, 0.4)
-            hint = f"did you mean {near[0]}, with values in its unit?" if near else f"known are {', '.join(known)}"
+            near = _nearest_column(name, known)
+            hint = f"did you mean {near}, with values in its unit?" if near else f"known are {', '.join(known)}"
             raise FileFormatError(path, f"{path}: unknown column {name}; {hint}")
     ports = [p for p in range(1, MAX_MICE + 1) if columns.mouse_columns(p)[0] in names]
     for port in ports:
