@@ -154,7 +154,7 @@ def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path: Path) -> N
     shutil.rmtree(folder)
     with pytest.raises(FileChanged, match="it was removed"):
         file.write("1\n")
-    with pytest.raises(CannotWrite, match=r"a-2\.csv: No such file"):
+    with pytest.raises(CannotWrite, match=r"a-2\.csv: there is no folder"):
         file.continue_elsewhere()
     with pytest.raises(FileChanged, match="it was removed"):
         file.close({})

@@ -201,6 +201,7 @@ def test_the_date_that_is_set_meanwhile_changes_no_time(
     if words == "record":
         typed[-2:] = [str(out)]
     done = CliRunner().invoke(group, typed, catch_exceptions=False)
-    assert done.exit_code == 0 and "300 samples" in done.stderr and "0 lost" in done.stderr
+    assert done.exit_code == 0 and "0 lost" in done.stderr
     rows = np.genfromtxt(out, delimiter=",", comments="#", skip_header=3)
+    assert len(rows) in (300, 301)  # by the fitted clock, the last one is before or behind the end of the duration
     assert np.abs(np.diff(rows[:, 0]) - 0.01).max() < 1e-3
