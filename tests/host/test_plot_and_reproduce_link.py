@@ -13,8 +13,10 @@ from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
+from linkpose.experiments.variants import Variant
 from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
+from linkpose.localization.tables import PathScore
 from linkpose.plotting import lines
 from linkpose.plotting.canvas import COLOURS, label_time, legend_above
 from linkpose.recording.table import read_table
@@ -338,6 +340,18 @@ def test_reproduce_link_prints_every_method_on_every_test(linkpose, tmp_path):
 def test_reproduce_link_shows_the_papers_tables_beside(linkpose):
     shown = linkpose("reproduce", "link", "--seeds", 1).out
     assert "Table 1" in shown and "Table 2" in shown and "17.34" in shown and "joint A" in shown
+
+
+@pytest.mark.parametrize("errors_m", [(0.033, 0.048), (0.03, 0.09), (0.027, 79.2)])
+def test_the_errors_of_variants_are_labelled_with_plain_numbers(errors_m):
+    run = Variant("ekf", "fixed", 0.0, None, scores=[PathScore(error, error, None) for error in errors_m])
+    axis = plotting.variants("Indoor localization", [run], ["ekf, fixed R"]).axes[0].xaxis
+    low, high = axis.get_view_interval()
+    places = [place for place in axis.get_majorticklocs() if low <= place <= high]
+    assert 2 <= len(places) <= 15
+    labels = axis.get_major_formatter().format_ticks(places)
+    assert [float(label) for label in labels] == pytest.approx(places)
+    assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))
 
 
 def test_a_legend_reads_row_by_row_and_single_values_are_dots(tmp_path):

@@ -13,6 +13,7 @@ from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
     from linkpose.experiments.link import Traces
@@ -93,6 +94,7 @@ def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> 
         axes.plot([variant.position_rmse_m()], [row], "|", color=colour, markersize=11, markeredgewidth=2)
     axes.set_yticks(range(len(compared)), labels, fontsize=7)
     axes.set_xscale("log")
+    _label_plainly(axes.xaxis)
     axes.set_xlabel("position error, rms of a run (m); bars: mean over the seeds")
     axes.set_title(title, fontsize=10, pad=20)
     finish(axes, "")
@@ -100,3 +102,13 @@ def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> 
     axes.set_ylim(len(compared), -1)
     legend_above(axes)
     return figure
+
+
+def _label_plainly(axis: Axis) -> None:
+    """Labels a logarithmic axis with plain numbers: 0.05, not 5×10⁻². Within a decade, 1, 2, 5 may all lie outside."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
+
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(MaxNLocator(6) if high < 10 * low else LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
