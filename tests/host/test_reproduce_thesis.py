@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def scored(*errors_m: float) -> Variant:
 def test_a_claim_holds_only_where_the_sign_test_says_so(after: list[float], result: str) -> None:
     found = verdict("it is better", scored(*[1.0] * 6), scored(*after), "3.2")
     assert found.result == found.as_row()["result"] == result
-    assert found.text.startswith(f"Table 3.2: it is better: {result}; 1 m against")
+    assert found.text.startswith(f"Table 3.2: it is better: {result}; {fmean(after):.4g} m instead of 1 m")
 
 
 def test_too_few_seeds_are_named() -> None:

@@ -81,7 +81,7 @@ class ClaimVerdict:
         """The verdict as a line of text."""
         source = f"Table {self.table}: " if self.table else ""
         return (
-            f"{source}{self.claim}: {self.result}; {self.before_m:.4g} m against {self.after_m:.4g} m, "
+            f"{source}{self.claim}: {self.result}; {self.after_m:.4g} m instead of {self.before_m:.4g} m, "
             f"better on {self.wins} of {self.seeds} seeds (p = {self.p:.2g})"
         )
 
