@@ -131,7 +131,9 @@ def _errors(position: Axes, heading: Axes, path: ComparedPath, along: Floats, la
 
 def _position_error(axes: Axes, path: ComparedPath, along: Floats, largest: tuple[float, float]) -> None:
     style = line_style(path.filter) | {"linewidth": 0.9}
-    axes.fill_between(along, 0.0, 200 * path.std_m, label="2σ", color=style["color"], alpha=BAND_ALPHA, linewidth=0)
+    within = 100 * np.mean(path.error_m <= 2 * path.std_m)
+    label = f"2σ ({within:.0f} % of the errors within)"
+    axes.fill_between(along, 0.0, 200 * path.std_m, label=label, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
     axes.plot(along, 100 * path.error_m, label=path.filter, **style)
     axes.set_ylim(0.0, 100 * _HEADROOM * largest[0])
     finish(axes, "position error (cm)")
