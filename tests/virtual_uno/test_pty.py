@@ -282,7 +282,7 @@ def test_the_command_ends_well_on_a_signal(firmware_hex: Path, tmp_path: Path) -
         assert served.stdout
         served.send_signal(signal.SIGINT)
         assert json.loads(served.stdout.readline())["event"] == "end"
-    assert served.returncode == 0
+        assert served.wait() == 0
     assert not (tmp_path / "port").is_symlink()
 
 
