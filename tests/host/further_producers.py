@@ -654,7 +654,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… has none of the endings …": typed("convert a.csv -o b.xyz"),
         "--label … must consist of letters, digits and _": typed("convert a.csv -o b.trc --label ,"),
         "… is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)": typed("estimate a.csv --j2s 1,2"),
-        "--j2s takes its three numbers without spaces: type --j2s=…": typed("estimate a.csv --j2s -0.09 -0.04 1.65"),
+        "… takes its three numbers without spaces: type …=…": typed("localize a.csv --start 1 -2 0"),
         "… is longer than … m; J2S is in metres": typed("estimate a.csv --j2s 900,0,0"),
         "… is not a number of seconds above 0": typed("record --duration -1"),
         "… is not finite": typed("estimate a.csv --j2s 0,0,inf"),

@@ -216,3 +216,10 @@ def test_every_picture_format_is_in_the_help(linkpose) -> None:
     for name in ("plot", "evaluate", "reproduce link"):
         text = linkpose(*name.split(), "--help").out.lower()
         assert all(ending.removeprefix(".") in text for ending in FORMATS), name
+
+
+@pytest.mark.parametrize(("command", "option"), [("estimate", "--j2s"), ("localize", "--start")])
+def test_a_vector_typed_as_several_words_is_proposed_as_one(command: str, option: str, refused) -> None:
+    """click reads a negative number as an option: "No such option '-0'"."""
+    sentence = refused(command, "a.csv", option, "-0.09", "-0.04,", "1.65")
+    assert sentence.endswith(f"{option} takes its three numbers without spaces: type {option}=-0.09,-0.04,1.65")

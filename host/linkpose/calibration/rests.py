@@ -12,8 +12,8 @@ from linkpose.sensors.measurements import Floats, Measurements
 _WINDOW_S = 0.5
 _SHORTEST_S = 1.0
 # Largest standard deviations within a window at rest: a few times the noise of a poor part.
-GYRO_STD_RAD_S = 0.01
-ACCEL_STD_M_S2 = 0.15
+_GYRO_STD_RAD_S = 0.01
+_ACCEL_STD_M_S2 = 0.15
 
 
 class Stillness(NamedTuple):
@@ -27,7 +27,7 @@ class Stillness(NamedTuple):
 def find_rests(block: Measurements) -> list[slice]:
     """The rests of a second or more, without a window at either end, in which a hand may still touch the sensor."""
     step, width = _window(block)
-    if width < 5 or len(block) < 3 * width:
+    if not width:
         return []
     found = []
     for first, end in _still_windows(_scatter(block.gyro_rad_s, width), _scatter(block.accel_m_s2, width)):
@@ -41,10 +41,10 @@ def find_rests(block: Measurements) -> list[slice]:
 def stillness(block: Measurements) -> Stillness | None:
     """Of a recording without a rest; None where it is too short, or has no readings."""
     step, width = _window(block)
-    if width < 5 or len(block) < 3 * width:
+    if not width:
         return None
     gyro, accel = _scatter(block.gyro_rad_s, width), _scatter(block.accel_m_s2, width)
-    at = int(np.argmin(np.maximum(gyro / GYRO_STD_RAD_S, accel / ACCEL_STD_M_S2)))
+    at = int(np.argmin(np.maximum(gyro / _GYRO_STD_RAD_S, accel / _ACCEL_STD_M_S2)))
     if not np.isfinite(gyro[at] + accel[at]):
         return None
     longest = max((end - first + width - 1 for first, end in _still_windows(gyro, accel)), default=0)
@@ -52,14 +52,15 @@ def stillness(block: Measurements) -> Stillness | None:
 
 
 def _window(block: Measurements) -> tuple[float, int]:
-    """Time between samples (s), and the number of samples in a window; 0 where there is none."""
+    """Time between samples (s), and the number of samples in a window; 0 where the block is too short for three."""
     step = float(np.median(np.diff(block.time_s))) if len(block) > 1 else 0.0
-    return step, round(_WINDOW_S / step) if step > 0 else 0
+    width = round(_WINDOW_S / step) if step > 0 else 0
+    return step, 0 if width < 5 or len(block) < 3 * width else width
 
 
 def _still_windows(gyro: Floats, accel: Floats) -> list[tuple[int, int]]:
     """First and end of each run of windows at rest, by their scatter (N,)."""
-    still = (gyro < GYRO_STD_RAD_S) & (accel < ACCEL_STD_M_S2)
+    still = (gyro < _GYRO_STD_RAD_S) & (accel < _ACCEL_STD_M_S2)
     edges = np.diff(np.concatenate([[0], still.astype(np.int8), [0]]))
     return [(int(a), int(b)) for a, b in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)]
 

@@ -34,6 +34,7 @@ COMMANDS = {
 }
 
 
+_VECTORS = ("--j2s", "--start")  # options of three numbers, of which a negative one looks like an option by itself
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)")
 
 
@@ -58,8 +59,9 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """As click does, with the nearest name for one that is not known, and for a vector typed as several words."""
-        if vector := _spaced_vector(args):
-            ctx.fail(f"--j2s takes its three numbers without spaces: type --j2s={vector}")
+        for option in _VECTORS:
+            if vector := _spaced_vector(option, args):
+                ctx.fail(f"{option} takes its three numbers without spaces: type {option}={vector}")
         name = args[0] if args else ""
         if name and name not in self._table and not name.startswith("-"):
             near = difflib.get_close_matches(name, self._table, 1)
@@ -121,9 +123,9 @@ def _run() -> int:
     return status if isinstance(status, int) else 0
 
 
-def _spaced_vector(words: Sequence[str]) -> str:
-    """The vector of --j2s that was typed as several words, as one; "" if there is none."""
-    after = words[words.index("--j2s") + 1 :] if "--j2s" in words else []
+def _spaced_vector(option: str, words: Sequence[str]) -> str:
+    """The vector of an option that was typed as several words, as one; "" if there is none."""
+    after = words[words.index(option) + 1 :] if option in words else []
     numbers = [word.rstrip(",") for word in after[:3]]
     return ",".join(numbers) if len(numbers) == 3 and all(map(_NUMBER.fullmatch, numbers)) else ""
 

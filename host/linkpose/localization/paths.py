@@ -256,7 +256,7 @@ def _with_side(
     one = next(iter(settings.values()))
     if one.start is not None or first_pose(log) or len(places := places_from_ranges(log, beacons)) < 2:
         return settings, []
-    start = likelier_start(log, one, beacons, free)
+    start = likelier_start(log, one, beacons, free, places)
     if start is None:
         return settings, []
     other = next(place for place in places if place != start)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,15 +26,7 @@ from linkpose.localization.localizer import Localizer
 from linkpose.localization.settings import Pose, Settings
 from linkpose.localization.steps import Gaussian
 from linkpose.localization.tables import Beacons
-from linkpose.localization.vehicle import (
-    CONTROLS,
-    control_holds,
-    drifts_of,
-    kinds_of,
-    noise_root,
-    places_from_ranges,
-    vehicle_of,
-)
+from linkpose.localization.vehicle import CONTROLS, control_holds, drifts_of, kinds_of, noise_root, vehicle_of
 
 # Fewer measurements do not determine four noises, or drifts beside them; more than MOST add time, not accuracy. Of a
 # longer log of ranges, the first DENSE show how errors change from one to the next, and the rest, evenly spread, how
@@ -118,21 +111,21 @@ def tune(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) 
     return _with_slip(tuned, free)
 
 
-def likelier_start(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Pose | None:
-    """The start, of two on both sides of beacons near one line, that makes the log clearly more likely, or None."""
-    part = thinned(log, 0.0)
-    names = [name for name in free if name in _present(log) | {"range", "growth"}]
-    places = places_from_ranges(log, beacons)
-    costs = [_search(part, replace(settings, start=place), beacons, dict.fromkeys(names, 0.0))[1] for place in places]
+def likelier_start(
+    log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...], starts: Sequence[Pose]
+) -> Pose | None:
+    """The one of several starts that makes the log clearly more likely than each other one, or None."""
+    part, names = thinned(log, 0.0), _noises_of_ranges(log, free)
+    costs = [_search(part, replace(settings, start=start), beacons, dict.fromkeys(names, 0.0))[1] for start in starts]
     best = int(np.argmin(costs))
-    return places[best] if min(np.delete(costs, best), default=math.inf) > costs[best] + SIDE_LEAD else None
+    return starts[best] if min(np.delete(costs, best), default=math.inf) > costs[best] + SIDE_LEAD else None
 
 
 def _tune_ranges(log: Log, settings: Settings, beacons: Beacons, free: tuple[str, ...]) -> Settings:
     """As `tune`, for ranges whose errors may drift."""
     white = replace(settings, error_time_s=settings.error_time_s or 0.0)
     spread, is_diving = spread_out(_apart(log)), vehicle_of(kinds_of(log)) is SUBMERSIBLE
-    names = [name for name in free if name in _present(log) | {"range", "growth"}]
+    names = _noises_of_ranges(log, free)
     found, cost = _search(spread, white, beacons, dict.fromkeys(names, 0.0))
     if not math.isfinite(cost):
         return white
@@ -157,6 +150,11 @@ def _tune_ranges(log: Log, settings: Settings, beacons: Beacons, free: tuple[str
             usual = float(np.median([e.values[0] for e in log if isinstance(e, Event) and e.kind == "range"]))
             tuned = replace(tuned, drift_std_m=max(tuned.drift_std_m, LEAST_ACOUSTIC * usual))
     return _with_slip(_as_large_as_innovations(log, tuned, beacons, names)[0], free)
+
+
+def _noises_of_ranges(log: Log, free: tuple[str, ...]) -> list[str]:
+    """Those of `free` that a log with ranges has; those of the ranges in any case."""
+    return [name for name in free if name in _present(log) | {"range", "growth"}]
 
 
 def _with_water(settings: Settings, constant: str) -> Settings:

@@ -91,9 +91,16 @@ def _wander(rng: np.random.Generator, std_uT: float, correlation_s: float) -> Fi
 
 
 def _changes(rng: np.random.Generator, apart_s: tuple[float, float]) -> Floats:
-    """Times (M,) of changes that are so far apart (shortest, longest)."""
+    """Times (M,) of changes with distances between the shortest and the longest of `apart_s`."""
     between = rng.uniform(*apart_s, int(_LONGEST_S / apart_s[0]))
     return np.asarray(np.cumsum(between))
+
+
+def _ramps(at_s: Floats, levels: Floats, ramp_s: float) -> Field:
+    """Levels (M + 1, K), each followed by the next one from one of the times (M,) on, within `ramp_s`."""
+    times = np.column_stack([at_s, at_s + ramp_s]).ravel()
+    values = np.concatenate([levels[:1], np.repeat(levels[1:-1], 2, axis=0), levels[-1:]])
+    return lambda time_s: np.column_stack([np.interp(time_s, times, column) for column in values.T])
 
 
 def _desk(rng: np.random.Generator) -> Field:
@@ -102,11 +109,8 @@ def _desk(rng: np.random.Generator) -> Field:
 
 
 def _desks(rng: np.random.Generator) -> Field:
-    at = _changes(rng, _AT_DESK_S)
-    times = np.column_stack([at, at + _ROLLING_S]).ravel()
-    levels = _DESKS_UT * rng.standard_normal((len(at) + 1, 3))
-    values = np.concatenate([levels[:1], np.repeat(levels[1:-1], 2, axis=0), levels[-1:]])
-    return lambda time_s: np.column_stack([np.interp(time_s, times, values[:, i]) for i in range(3)])
+    at_s = _changes(rng, _AT_DESK_S)
+    return _ramps(at_s, _DESKS_UT * rng.standard_normal((len(at_s) + 1, 3)), _ROLLING_S)
 
 
 def _motor(rng: np.random.Generator) -> Field:
@@ -157,10 +161,9 @@ def _car(rng: np.random.Generator) -> Field:
     at_s = _changes(rng, _CAR_STRAIGHT_S)
     iron = _turned(rng, rng.uniform(*_CAR_UT) * np.array([0.9, 0.0, 0.4]))
     headings = np.cumsum(np.concatenate([[0.0], 0.5 * np.pi * rng.choice([-1, 1], len(at_s))]))
-    times = np.column_stack([at_s, at_s + _CAR_TURN_S]).ravel()
-    turned = np.concatenate([headings[:1], np.repeat(headings[1:-1], 2), headings[-1:]])
+    heading = _ramps(at_s, headings[:, None], _CAR_TURN_S)
     wander = _wander(rng, _CAR_WANDER_UT, _CAR_WANDER_S)
-    return lambda time_s: _about_z(iron, np.interp(time_s, times, turned)) + wander(time_s)
+    return lambda time_s: _about_z(iron, heading(time_s)[:, 0]) + wander(time_s)
 
 
 _FIELDS: dict[str, Callable[[np.random.Generator], Field]] = {

@@ -24,8 +24,8 @@ from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar.limit import LIMITED_SHARE, accept_limit, are_at_limit
 from linkpose.filters.planar.state import SLOTS
 
-# The last 0.7 s in slots of this length (s): so many of them are the reference, the window begins with the last one of
-# these. Doubled: an increase of speed that takes longer than the window is compared in part.
+# The last 0.7 s in slots of _SLOT_S (s). The first _REFERENCE of them are the reference; the window begins with the
+# last one of these. Doubled: an increase of speed that takes longer than the window is compared in part.
 _SLOT_S, _REFERENCE = 0.05, 6
 # In the reference the velocity changes by no more than this (m/s); from its start to the end of the window, the heading
 # by no more than this (rad). Doubled: more changes are compared, and the limit grows by the tilt.
@@ -68,7 +68,7 @@ def watch_acceleration(state: Record, m: Record, mice: Records, accel: complex) 
 
 @inner
 def forget(seen: Record) -> None:
-    """Begin anew: no slot is filled."""
+    """Restart: no slot is filled."""
     seen.filled = 0
     _empty(seen.slots[SLOTS - 1])
 
