@@ -26,8 +26,8 @@ DIVING = {"velocity", "depth", "attitude"}  # kinds that only an underwater vehi
 CONTROLS = {UNICYCLE.model: "odometry", HOLONOMIC.model: "twist", SUBMERSIBLE.model: "velocity"}  # the kind that drives
 FIRST_S = 5.0  # of ranges from which a tag's first place is fitted; a walk of a few metres at the most
 FIT_STEPS = 20
-# A place and its mirror image on the other side of beacons near one line are two where they are so far apart (m), and
-# the ranges fit the image up to so much worse (m): the usual error of a radio range. Twice it compares more starts.
+# Beacons near one line give two places if the mirror image is further away than MIRRORED_M (m) and the residual of each
+# range grows by less than MIRROR_MISFIT_M (m), the usual error of a radio range. Doubled, more starts are compared.
 MIRRORED_M, MIRROR_MISFIT_M = 1.0, 0.5
 # Standard deviations of speed and turn rate of a robot whose log has no odometry (m/s, rad/s): a walk. With twice them,
 # a scan may be fitted to the next door.

@@ -11,7 +11,7 @@ rig file states neither the offset of the accelerometer nor its place and angle 
 - The limit includes the noise of the accelerometer, a tilt of 2°, and a distance of 0.1 m from the robot's centre.
 
 Where the mice show too small an increase at their largest speed so far, this is their speed limit, as in `limit`.
-Other contradictions are unconfirmed changes of the velocity, as in `process`. Both widen the position.
+Other contradictions are unconfirmed changes of the velocity, as in `process`. Both increase σ of the position.
 """
 
 from __future__ import annotations
