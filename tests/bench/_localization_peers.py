@@ -18,7 +18,7 @@ from linkpose.localization.events import NAMED, Event, Log
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.settings import CONSTANTS, Settings
 from linkpose.localization.tables import Beacons
-from linkpose.localization.vehicle import first_pose, kinds_of, place_from_ranges
+from linkpose.localization.vehicle import first_pose, kinds_of, places_from_ranges
 
 if TYPE_CHECKING:
     import gtsam
@@ -136,7 +136,7 @@ def problem_of(log: Log, beacons: Beacons, settings: Settings) -> Problem:
         mean = sum(place[2] for place in beacons.values()) / len(beacons)
         beacons = {name: (x, y, z - mean) for name, (x, y, z) in beacons.items()}
     prior = first_pose(log)
-    pose = np.array(prior.values if prior else place_from_ranges(log, beacons))
+    pose = np.array(prior.values if prior else places_from_ranges(log, beacons)[0])
     far, turned = settings.start_std
     start, std = (pose, (far, far, turned)) if form == "odometry" else (pose[:2], (far, far))
     if form == "none":
