@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pty_board import PtyBoard, link_run
 from scripted_board import ScriptedBoard, install
 
 from linkpose.board import Board
@@ -294,3 +296,19 @@ def test_a_board_whose_samples_come_late_is_heard_to_the_end(
                 board.pauses_at = -1
     assert board.pauses_at == -1
     assert (samples, connected.health.lost) == (300, 0)
+
+
+def test_info_reports_the_load_of_the_processor_as_a_share_and_the_mice_in_words(
+    board: ScriptedBoard, linkpose: Callable, tmp_path: Path
+) -> None:
+    """STATUS carries the load in thousandths, and HELLO the state and the refusals of a mouse as numbers."""
+    board.hello = lambda hello: hello._replace(mice=(mouse(OK, MouseLacks.REMOTE_MODE), mouse(ABSENT)))
+    board.status = lambda status: status._replace(cpu_load=350, stack_free=512, loop_worst_us=900, vcc_mv=0)
+    with PtyBoard(tmp_path / "port", make=lambda: board.switch_on(link_run)):
+        counters = json.loads(linkpose("info", "--port", tmp_path / "port", "--json").out)["board"]
+        printed = linkpose("info", "--port", tmp_path / "port").out
+    assert counters["cpu_load_percent"] == 35.0 and counters["stack_free_bytes"] == 512
+    assert counters["loop_worst_us"] == 900 and counters["vcc_mv"] is None
+    shown = [" ".join(line.split()) for line in printed.splitlines()]
+    assert {"cpu load 35.0 %", "stack free 512 bytes", "loop worst 900 µs", "vcc not measured"} <= set(shown)
+    assert "mice port 1 (id 0x00): ok, 8 counts/mm, 200 reports/s, refused remote mode" in shown

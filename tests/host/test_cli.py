@@ -302,7 +302,7 @@ def test_info_json(linkpose):
     assert info["sample_rate_hz"] == 100 and info["mice"] == []
     assert info["samples_lost"] == info["frames_corrupt"] == 0
     assert {"protocol", "firmware", "clock_drift_ppm"} <= info.keys()
-    assert info["board"]["stack_free"] is info["board"]["vcc_mv"] is None, "a simulated board has no processor"
+    assert info["board"]["stack_free_bytes"] is info["board"]["vcc_mv"] is None, "a simulated board has no processor"
 
 
 UNO = PortInfo("/dev/ttyACM0", "Arduino Uno", 0x2341, 0x0043, "55", True, False)
@@ -348,6 +348,7 @@ def test_a_person_reads_one_device_a_line_with_units(linkpose):
     assert any(line.split() == ["sample", "rate", "100", "Hz"] for line in lines)
     assert any("MPU-6050 at 0x68 (id 0x68): ok" in line for line in lines)
     assert not any("0x69" in line for line in lines)
+    assert any(line.split() == ["source", "revision", "none", "(simulated", "board)"] for line in lines)
 
 
 def test_a_slower_bus_is_put_in_force(linkpose, tmp_path):

@@ -14,7 +14,7 @@ from linkpose.cli import options
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
     from linkpose.device.session import Health, Placement, Session
-    from linkpose.wire.messages import HelloDevice, Status
+    from linkpose.wire.messages import HelloDevice, HelloMouse, Status
 
 OBSERVED_S = 2.0  # of streaming: enough for the counts and a first figure of the drift
 
@@ -95,7 +95,7 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "port": session.port,
         "protocol": f"{hello.protocol_major}.{hello.protocol_minor}",
         "firmware": firmware_version(hello),
-        "source_revision": f"{hello.source_revision:08x}",
+        "source_revision": devices.source_revision(hello),
         "reset_cause": reset_causes(hello),
         "sample_rate_hz": hello.sample_rate_hz,
         "sensors": devices.names(hello),
@@ -104,7 +104,7 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
         "gyro_range_deg_s": hello.gyro_range_deg_s,
         "dlpf": hello.dlpf,
         "baro_oversampling": hello.baro_oversampling,
-        "mice": [{"port": at, **mouse._asdict()} for at, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF],
+        "mice": [_mouse(at, mouse) for at, mouse in enumerate(hello.mice, 1) if mouse.id != 0xFF],
         "samples": health.samples,
         "samples_lost": health.lost,
         "frames_corrupt": health.corrupt.total,
@@ -114,15 +114,21 @@ def _report(session: Session, health: Health) -> dict[str, Any]:
     }
 
 
-# Counters of the processor, which a simulated board does not have.
-_OF_PROCESSOR = ("loop_worst_us", "stack_free", "cpu_load", "vcc_mv")
-
-
 def _counters(status: Status, port: str) -> dict[str, Any]:
     """The board's own counters, except those of single devices; None for one that is not measured."""
-    counters = {name: value for name, value in status._asdict().items() if name not in ("t_us", "devices", "mice")}
-    missing = _OF_PROCESSOR if port.startswith("sim://") else ("vcc_mv",) * (status.vcc_mv == 0)
-    return counters | dict.fromkeys(missing)
+    from linkpose.wire.messages import SCALES
+
+    left_out = ("t_us", "devices", "mice", "loop_worst_us", "stack_free", "cpu_load", "vcc_mv")
+    counters = {name: value for name, value in status._asdict().items() if name not in left_out}
+    share = SCALES["STATUS.cpu_load"].scale
+    of_processor = {
+        "loop_worst_us": status.loop_worst_us,
+        "stack_free_bytes": status.stack_free,
+        "cpu_load_percent": round(100 * share * status.cpu_load, 1),
+        "vcc_mv": status.vcc_mv or None,
+    }
+    # A simulated board has no processor.
+    return counters | (dict.fromkeys(of_processor) if port.startswith("sim://") else of_processor)
 
 
 def _device(device: HelloDevice) -> dict[str, Any]:
@@ -136,6 +142,20 @@ def _device(device: HelloDevice) -> dict[str, Any]:
         "id": f"{device.id:#04x}",
         "state": described.state,
         "remark": described.remark,
+    }
+
+
+def _mouse(port: int, mouse: HelloMouse) -> dict[str, Any]:
+    """A mouse port: its state, the PS/2 id of the mouse, what it counts, and what it refused."""
+    from linkpose.sensors import devices
+
+    return {
+        "port": port,
+        "state": devices.mouse_state(mouse),
+        "id": f"{mouse.id:#04x}",
+        "counts_per_mm": mouse.counts_per_mm,
+        "report_rate_hz": mouse.report_rate_hz,
+        "refused": devices.refused_settings(mouse),
     }
 
 
@@ -174,8 +194,11 @@ def _rounded(value: float | None) -> float | None:
 # Units at the end of a report's keys, as a person reads them.
 _UNITS = {
     "_hz": "Hz", "_g": "g", "_rad_s": "rad/s", "_deg_s": "°/s", "_ppm": "ppm", "_percent": "%", "_us": "µs",
-    "_mv": "mV", "_m_s2": "m/s²", "_Pa": "Pa", "_s": "s", "_m": "m",
+    "_mv": "mV", "_bytes": "bytes", "_m_s2": "m/s²", "_Pa": "Pa", "_s": "s", "_m": "m",
 }  # fmt: skip
+
+
+_MISSING = {"source_revision": "none (simulated board)"}  # what else than "not known" the absence of a value means
 
 
 def _lines(report: dict[str, Any]) -> Iterator[str]:
@@ -185,6 +208,8 @@ def _lines(report: dict[str, Any]) -> Iterator[str]:
         if name == "devices":
             found = [device for device in value if device["state"] != "absent"]
             yield from _block("devices", [_device_line(device) for device in found] or ["none"])
+        elif name == "mice" and value and "report_rate_hz" in value[0]:
+            yield from _block("mice", [_mouse_line(mouse) for mouse in value])
         elif name == "health":
             shown = {sensor: of for sensor, of in value.items() if of["state"] != "absent"}
             yield from _block(
@@ -197,7 +222,8 @@ def _lines(report: dict[str, Any]) -> Iterator[str]:
         elif isinstance(value, list) and any(isinstance(item, dict) for item in value):
             yield from _block(label, [_text(item) for item in value])
         else:
-            yield f"{label:20} {_text(value)}" + (f" {unit}" if unit and value is not None else "")
+            missing = _MISSING.get(name, "not known")
+            yield f"{label:20} " + (missing if value is None else f"{_text(value)} {unit}".rstrip())
 
 
 def _block(label: str, lines: Sequence[str]) -> Iterator[str]:
@@ -215,12 +241,18 @@ def _label(name: str) -> tuple[str, str]:
 
 def _item(name: str, value: Any) -> tuple[str, str, str]:
     label, unit = _label(name)
-    return (label, "not measured", "") if value is None else (label, _text(value), unit)
+    return (label, _MISSING.get(name, "not measured"), "") if value is None else (label, _text(value), unit)
 
 
 def _device_line(device: dict[str, Any]) -> str:
     where = f"{device['chip']} at {device['address']} (id {device['id']}): {device['state']}"
     return f"{where}. {device['remark']}" if device["remark"] else where
+
+
+def _mouse_line(mouse: dict[str, Any]) -> str:
+    parts = [mouse["state"], f"{mouse['counts_per_mm']} counts/mm", f"{mouse['report_rate_hz']} reports/s"]
+    parts += [f"refused {', '.join(mouse['refused'])}"] if mouse["refused"] else []
+    return f"port {mouse['port']} (id {mouse['id']}): {', '.join(parts)}"
 
 
 def _health_line(sensor: str, of: dict[str, Any]) -> str:

@@ -28,7 +28,7 @@ def metadata(hello: Hello, settings: BoardSettings, device: str, rig: Rig, clock
         "device": device,
         "firmware": {
             "version": f"{hello.firmware_major}.{hello.firmware_minor}.{hello.firmware_patch}",
-            "source_revision": f"{hello.source_revision:08x}",
+            "source_revision": devices.source_revision(hello),
             "protocol": f"{hello.protocol_major}.{hello.protocol_minor}",
         },
         "settings": settings.as_dict(),

@@ -15,6 +15,7 @@ from linkpose.wire.messages import (
     DeviceState,
     Hello,
     HelloDevice,
+    HelloMouse,
     MouseLacks,
     SampleFlags,
 )
@@ -85,6 +86,11 @@ def names(hello: Hello) -> list[str]:
     return [sensor.name.lower() for sensor in Sensors if sensor & found(hello) and sensor.name]
 
 
+def source_revision(hello: Hello) -> str | None:
+    """The CRC-32 of the firmware's sources, as eight hexadecimal digits; None of a simulated board, which has none."""
+    return f"{hello.source_revision:08x}" if hello.source_revision else None
+
+
 class Description(NamedTuple):
     """One device in words."""
 
@@ -138,6 +144,16 @@ _LACKS = {
     MouseLacks.RESOLUTION: "does not take the requested resolution: it runs at {counts_per_mm} counts/mm",
     MouseLacks.STATUS: "does not report its settings: its resolution is assumed",
 }
+
+
+def mouse_state(mouse: HelloMouse) -> str:
+    """What the state of a mouse port means, in the words of `Description.state`."""
+    return _STATES[DeviceState(mouse.state)]
+
+
+def refused_settings(mouse: HelloMouse) -> list[str]:
+    """Names of the settings that a mouse refused during its set-up, such as "remote mode"."""
+    return [lack.name.lower().replace("_", " ") for lack in MouseLacks if mouse.lacks & lack and lack.name]
 
 
 def mouse_remarks(hello: Hello) -> Iterator[str]:
