@@ -1,16 +1,18 @@
-"""Damaged files for every reader: small valid files, and seeded mutations of them."""
+"""Every reader and every command with a small valid file, and what they may do with a damaged one."""
 
 from __future__ import annotations
 
-import gzip
-import random
+import re
 import struct
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from click.testing import CliRunner
+from mutated_formats import in_c3d, in_chunks, in_frames, in_parquet, in_records
+from mutations import Change
 from PIL import Image
 
 from linkpose.cli import group
@@ -32,142 +34,13 @@ from linkpose.simulation.link import LinkRun
 from linkpose.wire.frames import encode
 from linkpose.wire.messages import PROTOCOL_MAJOR, SCHEMA_CRC
 
-# What breaks parsers of numbers, of JSON, YAML and TOML, and what breaks programs that trust a number.
-TOKENS = [
-    b"nan", b"inf", b"-inf", b"-1", b"0", b"1e308", b"-1e308", b"1e400", b"1e-320", b"9" * 400, b"0x10",
-    b"1_000", b"1,5", b"", b'"', b"'", b"#", b";", b"\t", b"\n", b"\r", b"\0", b"\xff", b"\xfe\xff", b"\xef\xbb\xbf",
-    b"[" * 2000,
-    b"{" * 500, b"&a [*a,*a]", b"null", b"true", b"\x1b[31m", b"..", b"/dev/zero", b"%s", b"18446744073709551616",
-    b"NaN,", b"99999999999", b"1e9", b"[[[]]]", b"{}", b"[]", b"time_s", b"-0", b"\xed\xa0\x80", b"=1+1",
-]  # fmt: skip
-LONG = 100_000
-HOLDERS = (b",", b"\n", b" ", b":", b"=", b"\t", b"[", b"]")
-
-
-def mutate(data: bytes, rng: random.Random) -> bytes:
-    """One to four changes: bytes, pieces, lines or fields are replaced, removed, doubled, moved or cut."""
-    changed = bytearray(data)
-    for _ in range(rng.choice((1, 1, 1, 2, 4))):
-        rng.choice(_CHANGES)(changed, rng)
-    return bytes(changed)
-
-
-def _flip(data: bytearray, rng: random.Random) -> None:
-    for _ in range(rng.choice((1, 1, 8))):
-        if data:
-            data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-
-
-def _insert(data: bytearray, rng: random.Random) -> None:
-    at = rng.randint(0, len(data))
-    data[at:at] = rng.choice(TOKENS)
-
-
-def _replace_field(data: bytearray, rng: random.Random) -> None:
-    """A whole field, between two of the characters that hold fields."""
-    at = rng.randint(0, len(data))
-    start = max(data.rfind(holder, 0, at) for holder in HOLDERS) + 1
-    ends = [end for holder in HOLDERS if (end := data.find(holder, at)) >= 0]
-    data[start : min(ends, default=len(data))] = rng.choice(TOKENS)
-
-
-def _cut(data: bytearray, rng: random.Random) -> None:
-    del data[rng.randint(0, len(data)) :]
-
-
-def _remove(data: bytearray, rng: random.Random) -> None:
-    at = rng.randint(0, len(data))
-    del data[at : at + rng.choice((1, 2, 10, 100))]
-
-
-def _double(data: bytearray, rng: random.Random) -> None:
-    at = rng.randint(0, len(data))
-    data[at:at] = data[at : at + rng.choice((1, 10, 300))] * rng.choice((1, 3))
-
-
-def _line(data: bytearray, rng: random.Random) -> None:
-    """A line is removed, doubled, or exchanged with another."""
-    lines = bytes(data).split(b"\n")
-    a, b = rng.randrange(len(lines)), rng.randrange(len(lines))
-    kind = rng.randrange(3)
-    if kind == 0:
-        del lines[a]
-    elif kind == 1:
-        lines.insert(b, lines[a])
-    else:
-        lines[a], lines[b] = lines[b], lines[a]
-    data[:] = b"\n".join(lines)
-
-
-def _columns(data: bytearray, rng: random.Random) -> None:
-    """A column is exchanged with another, doubled, removed or made longer in all lines."""
-    separator = rng.choice([b",", b",", b" ", b":"])
-    a, b, kind = rng.randrange(12), rng.randrange(12), rng.randrange(4)
-    lines = bytes(data).split(b"\n")
-    for at, line in enumerate(lines):
-        cells = line.split(separator)
-        if max(a, b) >= len(cells):
-            continue
-        if kind == 0:
-            cells[a], cells[b] = cells[b], cells[a]
-        elif kind == 1:
-            cells.insert(a, cells[b])
-        elif kind == 2:
-            del cells[a]
-        else:
-            cells[a] += cells[b]
-        lines[at] = separator.join(cells)
-    data[:] = b"\n".join(lines)
-
-
-def _layout(data: bytearray, rng: random.Random) -> None:
-    """The whole file is kept in another form: other line ends, encodings or separators, twice, upside down, zipped."""
-    text = bytes(data)
-    data[:] = rng.choice(_LAYOUTS)(text, rng)
-
-
-def _mixed_line_ends(text: bytes, rng: random.Random) -> bytes:
-    return b"".join(line + rng.choice([b"\n", b"\r\n", b"\r", b"\n\n", b"\0\n"]) for line in text.split(b"\n"))
-
-
-def _head_again(text: bytes, rng: random.Random) -> bytes:
-    lines = text.split(b"\n")
-    at = rng.randint(0, len(lines))
-    return b"\n".join(lines[:at] + lines[: rng.choice((1, 3, 6))] + lines[at:])
-
-
-def _encoded(text: bytes, rng: random.Random) -> bytes:
-    codec = rng.choice(["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-8-sig", "utf-7", "cp500"])
-    return text.decode("latin-1").encode(codec)
-
-
-def _huge(text: bytes, rng: random.Random) -> bytes:
-    """A cell of 100 000 characters, or a line or a header of 100 000 cells."""
-    at = rng.randint(0, len(text))
-    return text[:at] + rng.choice([b"9", b"a", b",", b"1,", b"a,", b" ", b'"', b"[", b"- ", b"a:"]) * LONG + text[at:]
-
-
-_LAYOUTS: list[Callable[[bytes, random.Random], bytes]] = [
-    _mixed_line_ends, _head_again, _encoded, _huge,
-    lambda text, rng: text + text,
-    lambda text, rng: b"\n".join(reversed(text.split(b"\n"))),
-    lambda text, rng: text.replace(b",", rng.choice([b";", b"\t", b" ", b",,", b'","'])),
-    lambda text, rng: text.replace(b".", rng.choice([b",", b"", b"e"])),
-    lambda text, rng: text.replace(b"\n", rng.choice([b"\r", b"", b",\n", b"\n#"])),
-    lambda text, rng: gzip.compress(text, 1),
-    lambda text, rng: bytes(len(text)),
-]  # fmt: skip
-
-_CHANGES: list[Callable[[bytearray, random.Random], None]] = [
-    _flip, _insert, _replace_field, _replace_field, _cut, _remove, _double, _line, _columns, _layout,
-]  # fmt: skip
-
 
 class Target(NamedTuple):
     """A reader: a valid file, and what reads it. The reading may raise LinkposeError, and nothing else."""
 
     valid: Path
     read: Callable[[Path], object]
+    inside: Change | None = None  # as in `mutate`
 
 
 def targets(folder: Path) -> dict[str, Target]:
@@ -184,22 +57,22 @@ def targets(folder: Path) -> dict[str, Target]:
     reference = read_table(truth)
     return {
         "recording": Target(recording, _survey),
-        "raw": Target(files.raw(), _survey),
-        "parquet": Target(parquet, _survey),
+        "raw": Target(files.raw(), _survey, in_frames),
+        "parquet": Target(parquet, _survey, in_parquet),
         "estimate": Target(estimate, lambda path: evaluate(read_any(path), reference)),
         "truth": Target(truth, lambda path: evaluate(read_table(estimate), read_any(path))),
         "picture": Target(estimate, read_for_picture),
         "motive": Target(files.motive(), read_any),
-        "c3d": Target(c3d, read_any),
+        "c3d": Target(c3d, read_any, in_c3d),
         "trc": Target(trc, read_any),
         "rig": Target(files.text("rig.toml", _RIG), as_rig),
         "map": Target(files.map(), load_map),
-        "map-image": Target(files.map().with_suffix(".png"), lambda path: files.load_map_with(path)),
+        "map-image": Target(files.map().with_suffix(".png"), lambda path: files.load_map_with(path), in_chunks),
         "carmen": Target(files.text("scans.log", _CARMEN), read_log),
         "beacons": Target(files.text("beacons.csv", _BEACONS), read_beacons),
         "events": Target(files.text("events.csv", _EVENTS), read_log),
         "robot-truth": Target(files.text("robot.csv", _ROBOT), read_truth),
-        "hex": Target(files.hex(), read_image),
+        "hex": Target(files.hex(), read_image, in_records),
     }
 
 
@@ -238,19 +111,42 @@ def _command(*words: str) -> Callable[[Path], int]:
         result = CliRunner().invoke(group, [word.format(path) if word == "{}" else word for word in words])
         if result.exception is not None and not isinstance(result.exception, SystemExit):
             raise result.exception
+        check(result.exit_code, result.stderr)
         return result.exit_code
 
     return run
 
 
-def read_mutated(target: Target, data: bytes) -> None:
-    """Reads damaged bytes under the name of the valid file's kind. Raises whatever is not a LinkposeError."""
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_LONGEST = 4_000  # characters of all messages of a command
+
+
+def check(status: int, err: str) -> None:
+    """Asserts that a command ended in a result or in a sentence."""
+    assert status in (0, 1, 2) and "Traceback" not in err and "please report" not in err, err
+    assert not _CONTROL.search(err), repr(err)
+    assert len(err) < _LONGEST, err[:300]
+    if status:
+        assert err.strip(), f"status {status} without a sentence"
+
+
+READ = "read"
+
+
+def read_mutated(target: Target, data: bytes) -> str:
+    """Reads damaged bytes under the name of the valid file's kind. Raises whatever is not a LinkposeError.
+
+    Returns READ, or the line of linkpose that refused the file.
+    """
     damaged = target.valid.with_name("damaged" + target.valid.suffix)
     damaged.write_bytes(data)
     try:
-        target.read(damaged)
+        status = target.read(damaged)
     except LinkposeError as error:
         assert len(str(error)) <= LONGEST_TEXT + 3, str(error)[:300]
+        *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+        return f"{Path(frame.f_code.co_filename).name}:{line}"
+    return f"status {status}" if isinstance(status, int) and status else READ
 
 
 _RIG = """[joint]

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 import pytest
-from hostile import INPUTS, KINDS, OUTPUTS, PLACES, check, valid_files, words
+from fuzzing import check
+from hostile import INPUTS, KINDS, OUTPUTS, PLACES, valid_files, words
 from test_consistency import ALL
 
 from linkpose import inputs

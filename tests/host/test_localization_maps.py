@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -141,6 +143,19 @@ def test_images_of_other_depths_and_with_alpha(tmp_path):
     assert shown(tmp_path, row_of([[0, 0, 0, 255], [254, 254, 254, 255], [0, 0, 0, 9]])) == wall_free
     assert shown(tmp_path, Image.fromarray(np.array([[False, True]])).convert("1")) == [OCCUPIED, FREE]
     assert shown(tmp_path, row_of([0, 254, 205]).convert("P")) == wall_free
+
+
+def test_what_pillow_warns_of_is_not_shown(tmp_path, recwarn):
+    """A PNG whose chunk for animations is wrong is a picture all the same."""
+    row_of([0, 254, 205]).save(tmp_path / "map.png")
+    content = (tmp_path / "map.png").read_bytes()
+    at = content.index(b"IDAT") - 4
+    chunk = b"acTL" + bytes(8)
+    wrong = struct.pack(">I", 8) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    (tmp_path / "map.png").write_bytes(content[:at] + wrong + content[at:])
+    (tmp_path / "map.yaml").write_text(YAML.replace("map.pgm", "map.png"))
+    assert load_map(tmp_path / "map.yaml").blocked[0].tolist() == [OCCUPIED, FREE, UNKNOWN]
+    assert not recwarn.list
 
 
 def test_words_numbers_and_modes_of_a_map_file(tmp_path):

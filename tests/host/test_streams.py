@@ -11,7 +11,8 @@ from pathlib import Path
 
 import child
 import pytest
-from hostile import check, valid_files, words
+from fuzzing import check
+from hostile import valid_files, words
 
 from linkpose.recording.table import read_table
 

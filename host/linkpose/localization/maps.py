@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import stat
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -173,8 +174,10 @@ def _cells(path: Path, keys: _Keys) -> NDArray[np.uint8]:
     try:
         if not stat.S_ISREG(keys.image.stat().st_mode):
             raise LinkposeError(f"{keys.image}, named in {path}, is no regular file; name a PGM or PNG file")
-        with Image.open(keys.image, formats=IMAGE_FORMATS) as image:
-            return _convert(image, keys)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what Pillow passes over is of no use to whoever drives in the map
+            with Image.open(keys.image, formats=IMAGE_FORMATS) as image:
+                return _convert(image, keys)
     except UnidentifiedImageError as error:
         raise LinkposeError(f"{keys.image} is no image that can be read; {path} must name a PGM or PNG file") from error
     except (OSError, SyntaxError, ValueError, EOFError, OverflowError, MemoryError) as error:
