@@ -44,6 +44,7 @@ from linkpose.evaluation import markers  # noqa: E402
 LONGEST_S = 10  # of processor time: an answer to whether a reader hangs must not depend on what else runs
 LONGEST_WAIT_S = 60  # by the clock, for a reader that waits
 MOST_BYTES = 1 << 30
+PROGRESS = 10_000  # inputs between two lines that tell how far a run has come
 DRAWN = 10  # of so many pictures that a command makes, one is drawn: that takes 100 times as long as reading its file
 
 
@@ -147,6 +148,8 @@ def _run(name: str, target: Target, inputs: int, seed: int) -> int:
                 _keep(name, number, target.valid.suffix, data)
                 traceback.print_exception(error)
         slowest = max(slowest, time.process_time() - started)
+        if (number + 1) % PROGRESS == 0 and number + 1 < inputs:
+            print(f"{name}: {number + 1} of {inputs} inputs, {failures} failures", file=sys.stderr, flush=True)
     _limit_memory(unlimited=True)
     took = time.monotonic() - began
     read = ends.pop(READ, 0)
@@ -177,44 +180,55 @@ def _some_drawn(number: int) -> contextlib.AbstractContextManager[object]:
     return mock.patch.object(Figure, "savefig", lambda *_, **__: None)
 
 
-# Runs programs of the form `python -c PROGRAM WORDS`, which read a C3D file each, one after the other: a new process
-# for each file takes 0.4 s, and a fork 0.05 s.
-_WORKER = """
-import json, resource, signal, sys
-for line in sys.stdin:
-    program, words, timeout = json.loads(line)
-    signal.setitimer(signal.ITIMER_PROF, timeout)
-    sys.argv, answer = ["-c", *words], [0, ""]
-    try:
-        exec(program, {})
-    except BaseException as error:
-        answer = [1, f"{type(error).__name__}: {error}"]
-    signal.setitimer(signal.ITIMER_PROF, 0)
-    print(json.dumps(answer), flush=True)
+# Runs programs of the form `python -c PROGRAM WORDS`, which read a C3D file each, in a fork that has the libraries and
+# serves until one of them ends it: a new process for each file takes 0.4 s.
+_WORKERS = """
+import io, json, os, signal, sys
+import ezc3d, numpy
+numpy.savez(io.BytesIO(), a=0)  # imports what it needs
+
+def answer(*content):
+    os.write(1, json.dumps(content).encode() + b"\\n")
+
+def serve():
+    while request := os.read(0, 65536):  # a pipe gives it whole: it is short, and the next one waits for the answer
+        program, words, timeout = json.loads(request)
+        signal.setitimer(signal.ITIMER_PROF, timeout)
+        sys.argv = ["-c", *words]
+        try:
+            exec(program, {})
+        except BaseException as error:
+            answer(1, f"{type(error).__name__}: {error}")
+        else:
+            answer(0, "")
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    os._exit(0)
+
+code = None
+while code != 0:
+    pid = os.fork()
+    if pid == 0:
+        serve()
+    if code := os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]):
+        answer(code, "")
 """
 
 
 class _Workers:
-    """In place of `subprocess.run`: a process that ends by a signal is followed by another."""
+    """In place of `subprocess.run`."""
 
     def __init__(self) -> None:
-        self._process: subprocess.Popen[str] | None = None
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen([sys.executable, "-c", _WORKERS], **pipes)
 
     def run(self, command: list[str], timeout: float, **_: Any) -> subprocess.CompletedProcess[str]:
-        if self._process is None:
-            pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-            self._process = subprocess.Popen([sys.executable, "-c", _WORKER], **pipes)
-        process = self._process
-        assert process.stdin and process.stdout
-        process.stdin.write(json.dumps([command[2], command[3:], timeout]) + "\n")
-        process.stdin.flush()
-        if answer := process.stdout.readline():
-            code, errors = json.loads(answer)
-            return subprocess.CompletedProcess(command, code, "", errors)
-        self._process = None
-        if process.wait() == -signal.SIGPROF:
+        assert self._process.stdin and self._process.stdout
+        self._process.stdin.write(json.dumps([command[2], command[3:], timeout]))
+        self._process.stdin.flush()
+        code, errors = json.loads(self._process.stdout.readline())
+        if code == -signal.SIGPROF:
             raise subprocess.TimeoutExpired(command, timeout)
-        return subprocess.CompletedProcess(command, process.returncode, "", "")
+        return subprocess.CompletedProcess(command, code, "", errors)
 
 
 def _alarm(*_: object) -> None:
