@@ -217,7 +217,7 @@ def test_no_file_is_opened_twice_by_its_name(tmp_path: Path, monkeypatch: pytest
     for ending in ("sto", "trc", "tum", "c3d", "mot", "mcap", "parquet"):
         convert(source, tmp_path / f"a.{ending}")
     for ending in plotting.FORMATS:
-        plotting.save(plotting.new_figure(1, 1), tmp_path / f"a{ending}", False)
+        plotting.save(plotting.new_figure(1.0), tmp_path / f"a{ending}", False)
     save_map(tmp_path / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0))
     assert precious.read_text() == "precious"
 

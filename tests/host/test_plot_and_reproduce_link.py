@@ -18,7 +18,7 @@ from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
 from linkpose.localization.tables import PathScore
 from linkpose.plotting import lines
-from linkpose.plotting.canvas import COLOURS, label_time, legend_above
+from linkpose.plotting.canvas import COLOURS, WIDTH_INCHES, label_time, legend_above
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -43,6 +43,11 @@ def drawn(axes):
     return [text.get_text() for text in legend.get_texts()] if legend else []
 
 
+def y_labels(figure):
+    """Labels of the y axes, each in one line."""
+    return [" ".join(axes.get_ylabel().split()) for axes in figure.axes]
+
+
 def link_files(tmp_path, n=600, **more):
     """An estimate of three filters that err by known amounts, and its truth."""
     t = np.arange(n) / 100
@@ -58,12 +63,9 @@ def link_files(tmp_path, n=600, **more):
 
 def test_a_link_with_its_truth_shows_height_error_and_tilt(tmp_path):
     figure, remarks = plotting.plot_tables(link_files(tmp_path))
-    labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == [
-        "height over the joint\n(m)",
-        *["height error (cm)"] * 2,
-        "roll (°)",
-    ]  # no filter estimates the yaw
+    assert y_labels(figure) == [
+        "height over the joint (m)", "height error (cm) best filter", "height error (cm) all filters", "roll (°)"
+    ]  # no filter estimates the yaw  # fmt: skip
     height, best, error, _ = figure.axes
     assert [label.split()[0] for label in drawn(best)] == ["joint-inertial", "±2σ"]  # 0.1 cm beside 1 cm were a line
     assert best.get_ylim()[1] == pytest.approx(0.24) and error.get_ylim()[1] > 1.0
@@ -102,9 +104,8 @@ def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
 
 def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
-    labels = [axes.get_ylabel() for axes in figure.axes]
     # The best filter's ±2σ has a panel of its own, where the others differ so much that it would look like a line.
-    assert labels == ["height over the joint\n(m)", "±2σ (cm)", "from best (cm)", "roll (°)"]
+    assert y_labels(figure) == ["height over the joint (m)", "±2σ (cm)", "from best (cm)", "roll (°)"]
     assert drawn(figure.axes[1]) == ["joint-inertial", "±2σ joint-inertial"]
     assert drawn(figure.axes[2])[:2] == ["joint-inertial (best)", "joint 0.639 cm rms from it"]
 
@@ -113,7 +114,7 @@ def test_a_single_filter_without_a_truth_shows_its_deviation(tmp_path):
     t = np.arange(300) / 100
     path = write(tmp_path / "e.csv", {"time_s": t, "joint_height_m": np.sin(t), "joint_height_std_m": 0.01 + 0 * t})
     figure, _ = plotting.plot_tables([read_table(Path(path))])
-    assert [axes.get_ylabel() for axes in figure.axes] == ["height over the joint\n(m)", "±2σ (cm)"]
+    assert y_labels(figure) == ["height over the joint (m)", "±2σ (cm)"]
     assert drawn(figure.axes[1]) == ["joint", "±2σ joint"]
 
 
@@ -130,7 +131,7 @@ def test_the_truth_is_in_view_where_no_filter_has_a_value(tmp_path):
     ("length_s", "unit", "last"), [(65.0, "s", "60"), (3600.0, "min", "60"), (86400.0, "h", "20"), (700.0, "min", "10")]
 )
 def test_the_time_of_long_runs_is_in_minutes_or_hours(length_s, unit, last):
-    figure = plotting.new_figure(10.0, 3.0)
+    figure = plotting.new_figure(3.0)
     axes = figure.add_subplot()
     axes.plot([0.0, length_s], [0.0, 1.0])
     axes.margins(x=0.0)
@@ -255,9 +256,8 @@ def test_a_recording_has_a_panel_for_each_kind_of_reading(tmp_path):
     columns |= {f"{prefix}gyro_{axis}_rad_s": np.ones(200) for prefix in ("", "imu2_") for axis in "xyz"}
     columns |= {"pressure_Pa": np.full(200, 101325.0), "mouse1_dx_counts": t, "mouse1_dy_counts": t}
     figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "r.csv", columns)))])
-    labels = [axes.get_ylabel() for axes in figure.axes]
-    assert labels == [
-        "angular rate\n(°/s)", "angular rate of sensor 2\n(°/s)", "pressure\n(hPa)", "mouse counts\n(counts)"
+    assert y_labels(figure) == [
+        "angular rate (°/s)", "angular rate of sensor 2 (°/s)", "pressure (hPa)", "mouse counts (counts)"
     ]  # fmt: skip
     assert np.allclose(figure.axes[0].lines[0].get_ydata(), np.degrees(1))
 
@@ -274,9 +274,12 @@ def test_an_evaluation_shows_errors_their_distribution_and_the_table(tmp_path):
     found = evaluate(*link_files(tmp_path))
     figure = plotting.evaluation(found, "e.csv", "t.csv")
     best, _, errors, density, roll, table = figure.axes
-    assert drawn(best) == [drawn(errors)[0], "±2σ joint-inertial"] and "joint 0.7" in drawn(errors)[1]
+    assert drawn(best) == [drawn(errors)[0], "±2σ joint-inertial"] and any(
+        label.startswith("joint 0.7") for label in drawn(errors)
+    )
     assert errors.get_ylim()[0] < 0.0
-    assert errors.get_ylabel() == "height error (cm)" and roll.get_ylabel() == "roll error (°)"
+    assert y_labels(figure)[::2][:2] == ["height error (cm) best filter", "height error (cm) all filters"]
+    assert roll.get_ylabel() == "roll error (°)"
     share = found.scores[0].statistics()["height"].within_2sigma
     assert drawn(density)[0] == f"joint-inertial {100 * share:.0f} %"
     cells = {key: cell.get_text().get_text() for key, cell in table.tables[0].get_celld().items()}
@@ -355,14 +358,101 @@ def test_the_errors_of_variants_are_labelled_with_plain_numbers(errors_m):
 
 
 def test_a_legend_reads_row_by_row_and_single_values_are_dots(tmp_path):
-    axes = plotting.new_figure(4, 4).add_subplot()
-    for name in "abcdefg":
+    axes = plotting.new_figure(3.0).add_subplot()
+    names = [letter * 25 for letter in "abcdefg"]  # three fit side by side
+    for name in names:
         lines.draw(axes, np.arange(3.0), np.array([1.0, np.nan, 2.0]), label=name)
-    legend_above(axes, 3, list("abcdefg"))
+    legend_above(axes, names)
     shown = [text.get_text() for text in axes.get_legend().get_texts()]
     columns = np.array_split(shown, 3)  # as matplotlib fills them
-    assert [column[row] for row in range(3) for column in columns if row < len(column)] == list("abcdefg")
+    assert [column[row] for row in range(3) for column in columns if row < len(column)] == names
     assert axes.lines[1].get_xdata().tolist() == [0.0, 2.0] and axes.lines[1].get_marker() == "."
+
+
+LEAST_POINTS = 3.3  # of lettering in a column of a journal; a picture of 10 inches with notes of 7 points had 2.4
+COLUMN_INCHES = 3.46  # 88 mm
+
+
+def every_figure(tmp_path):
+    """A link, a robot and their evaluations, each with its truth."""
+    link = link_files(tmp_path)
+    t = np.arange(400) / 100
+    pose = {"x_m": np.sin(t), "y_m": 1 - np.cos(t), "heading_rad": (t + np.pi) % (2 * np.pi) - np.pi}
+    columns = {"time_s": t}
+    for name, error in (("planar_ekf", 0.001), ("planar_ukf", 0.01), ("mice", 0.02)):
+        columns |= {f"{name}_{of}": value + error * np.sin(7 * t) for of, value in pose.items()}
+        columns |= {f"{name}_{of}_std_m": np.full(400, error) for of in "xy"}
+    columns |= {"mice_excluded": np.where((t > 1) & (t < 2), 2.0, 0.0)}
+    paths = (write(tmp_path / "m.csv", columns), write(tmp_path / "mt.csv", {"time_s": t} | pose, "truth"))
+    robot = [read_table(Path(path)) for path in paths]
+    for files in (link, link[:1], robot, robot[:1]):
+        yield plotting.plot_tables(files)[0]
+    yield from (plotting.evaluation(evaluate(*files), "e.csv", "t.csv") for files in (link, robot))
+
+
+@pytest.mark.filterwarnings("error")
+def test_pictures_have_the_width_of_a_page_and_nothing_overlaps_or_is_cut(tmp_path):
+    """Panels, labels and legends do not touch each other, and all lettering is readable in a journal's column."""
+    from matplotlib.text import Text
+
+    for figure in every_figure(tmp_path):
+        assert figure.get_size_inches()[0] == WIDTH_INCHES
+        figure.draw_without_rendering()
+        renderer, whole = figure._get_renderer(), figure.bbox
+        shown = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+        assert min(text.get_fontsize() for text in shown) * COLUMN_INCHES / WIDTH_INCHES >= LEAST_POINTS
+        panels = [axes for axes in figure.axes if axes.axison]
+        for axes in panels:
+            parts = [axes.bbox, axes.yaxis.label.get_window_extent(renderer)]
+            parts += [legend.get_window_extent(renderer)] if (legend := axes.get_legend()) else []
+            others = [other.bbox for other in panels if other is not axes]
+            for part in parts:
+                assert whole.x0 - 1 <= part.x0 and part.x1 <= whole.x1 + 1 and part.y1 <= whole.y1 + 1, axes
+                assert not any(part.padded(-1).overlaps(other) for other in others), (axes.get_ylabel(), part)
+
+
+def test_panels_below_each_other_share_their_left_edge_and_a_square_path_their_top(tmp_path):
+    _, _, robot, _, *_ = figures = list(every_figure(tmp_path))
+    for figure in figures:
+        figure.draw_without_rendering()
+    for figure in (figures[0], figures[1]):
+        assert len({round(axes.get_position().x0, 3) for axes in figure.axes}) == 1
+    path, *over_time = robot.axes
+    assert len({round(axes.get_position().x0, 3) for axes in over_time}) == 1
+    assert path.get_position().y1 > over_time[-1].get_position().y1 and path.get_anchor() == "N"
+    mice = over_time[-1]
+    assert [label.get_text() for label in mice.get_yticklabels()] == ["mouse 1", "mouse 2"]
+
+
+def test_of_two_panels_of_errors_each_states_its_filters(tmp_path):
+    """A distance has 2σ above zero; that of a robot's position comes from its components also in `evaluate`."""
+    figures = list(every_figure(tmp_path))
+    assert y_labels(figures[2])[1:3] == ["position error (m) best filter", "position error (m) all filters"]
+    position = figures[5].axes[0]
+    assert "2σ planar-ekf" in drawn(position) and position.get_ylim()[0] == 0.0
+    band = position.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == pytest.approx(2 * np.hypot(0.001, 0.001))
+
+
+def test_a_pressure_is_not_drawn_as_an_offset_and_each_mouse_has_its_colour(tmp_path):
+    t = np.arange(200) / 100
+    columns = {"time_s": t, "seq": t, "flags": t, "pressure_Pa": 101540.0 + t}
+    columns |= {f"mouse{mouse}_d{axis}_counts": t for mouse in (1, 2, 3) for axis in "xy"}
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "r.csv", columns)))])
+    pressure, mice = figure.axes
+    figure.draw_without_rendering()
+    assert pressure.yaxis.get_offset_text().get_text() == ""
+    assert all(label.get_text().startswith("1015") for label in pressure.get_yticklabels())
+    styles = {(line.get_color(), line.get_linestyle()) for line in mice.lines}
+    assert len(styles) == 6 and len({colour for colour, _ in styles}) == 3
+
+
+def test_the_yaw_of_a_truth_alone_counts_from_its_start(tmp_path):
+    t = np.arange(200) / 100
+    path = write(tmp_path / "t.csv", {"time_s": t, "height_m": t, "roll_deg": t, "yaw_deg": t - 63.0}, "truth")
+    yaw = plotting.plot_tables([read_table(Path(path))])[0].axes[-1]
+    assert "yaw since the start" in " ".join(yaw.get_ylabel().split())
+    assert np.allclose(yaw.lines[0].get_ydata(), t)
 
 
 def test_a_long_name_is_shortened_and_an_empty_estimate_refused(tmp_path):

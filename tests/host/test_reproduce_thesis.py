@@ -122,7 +122,8 @@ def test_an_estimate_is_drawn_with_its_errors_along_the_way(floor, number: str, 
     assert np.allclose(lines(above)[name].get_ydata(), drawn.position_m[:, 1])
     assert np.allclose(lines(position)[name].get_ydata(), 100 * drawn.error_m)
     assert np.allclose(heading.lines[0].get_ydata(), drawn.error_m)
-    assert (position.get_ylabel(), heading.get_ylabel()) == ("position error (cm)", "heading error (°)")
+    labels = [" ".join(axes.get_ylabel().split()) for axes in (position, heading)]
+    assert labels == ["position error (cm)", "heading error (°)"]
     assert heading.get_xlabel() == "way (m)"
     band = position.collections[0].get_paths()[0].get_extents()
     assert band.y1 == pytest.approx(2 * 2.0)  # 2σ in cm
@@ -130,6 +131,24 @@ def test_an_estimate_is_drawn_with_its_errors_along_the_way(floor, number: str, 
     assert position.collections[0].get_label() == f"2σ ({within:.0f} % of the errors within)"
     assert position.get_ylim() == floor["3.2"].axes[1].get_ylim()  # comparable between the figures
     assert f"{100 * drawn.rms_m:.1f} cm rms" in floor[number].get_suptitle()
+
+
+def test_panels_of_a_figure_share_their_left_edge_and_no_text_lies_on_another(floor, sea) -> None:  # type: ignore[no-untyped-def]
+    """Also under a map that is not as wide as the panels below it."""
+    grid = GridMap(np.eye(80, 100, dtype=np.uint8), np.array([0.5, 0.0, 0.0, 0.0]))
+    paths = {"3.2": FIXED, "3.3": ADAPTIVE, "3.5": EKF, "3.6": ADAPTIVE}
+    high = plotting.indoor_figures(indoor.DrawnDrive(grid, FIXED.truth_m[:, :2], FIXED.truth_m[:, :2], paths))
+    for number in ("3.2", "3.3", "3.5", "3.6"):
+        for figure in (floor[number], high[number]):
+            figure.draw_without_rendering()
+            assert len({round(axes.get_position().x0, 3) for axes in figure.axes}) == 1, number
+    for figure in (floor["3.4"], sea["3.8"]):
+        figure.draw_without_rendering()
+        renderer = figure._get_renderer()
+        texts = [axes.get_legend().get_window_extent(renderer) for axes in figure.axes if axes.get_legend()]
+        texts += [axes._left_title.get_window_extent(renderer) for axes in figure.axes if axes._left_title.get_text()]
+        assert not any(one.padded(-1).overlaps(other) for one, other in itertools.combinations(texts, 2))
+        assert all(text.x1 <= figure.bbox.x1 + 1 for text in texts)
 
 
 def test_figure_3_4_shows_where_errors_are_large(floor) -> None:  # type: ignore[no-untyped-def]

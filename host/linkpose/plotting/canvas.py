@@ -6,6 +6,7 @@ import contextlib
 import datetime
 import io
 import logging
+import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS = (".png", ".svg", ".pdf")
-DPI = 130
+# Every picture is as wide as the two columns of a journal's page (183 mm), where its lettering is printed as it is. In
+# one column (88 mm), 9 and 8 points become 4.3 and 3.9; a picture of 10 inches had 3.5 and 2.8 there.
+WIDTH_INCHES = 7.2
+LETTERING, SMALL_LETTERING = 9.0, 8.0  # points: labels, ticks and title; legends and notes
+DPI = 180
 
 # Okabe and Ito's palette, whose colours colour-blind readers can distinguish: one colour per filter, in every plot.
 _BLUE, _PURPLE, _RED, _ORANGE, _GREEN, _SKY = "#0072B2", "#CC79A7", "#D55E00", "#E69F00", "#009E73", "#56B4E9"
@@ -31,7 +36,7 @@ COLOURS = {
 }  # fmt: skip
 AXES_COLOURS = {"x": _RED, "y": _GREEN, "z": _BLUE}
 OTHERS = (_SKY, _GREEN, _ORANGE, _RED)  # of series that are no filter: mice, beacons
-TRUTH: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 1.1, "zorder": 5}
+TRUTH: dict[str, Any] = {"color": "black", "linestyle": "--", "linewidth": 0.9, "zorder": 5}
 REFERENCES = ("truth", "reference")  # labels of what is drawn as TRUTH
 BAND_ALPHA = 0.18
 _BEST = ("joint-inertial", "planar-ekf", "chain")  # drawn thick
@@ -55,12 +60,26 @@ def _without_warnings_of_matplotlib() -> Iterator[None]:
         logger.setLevel(before)
 
 
-def new_figure(width_inches: float, height_inches: float) -> Figure:
-    """An empty figure."""
+def new_figure(height_inches: float, title: str = "") -> Figure:
+    """An empty figure of WIDTH_INCHES with a title at its left edge."""
     with _without_warnings_of_matplotlib():
         from matplotlib.figure import Figure
 
-    return Figure(figsize=(width_inches, height_inches), layout="constrained")
+    figure = Figure(figsize=(WIDTH_INCHES, height_inches), layout="constrained")
+    if title:
+        figure.suptitle(wrapped(title, WIDTH_INCHES, LETTERING), fontsize=LETTERING, x=0.01, ha="left")
+    return figure
+
+
+# Mean width of a character of matplotlib's font, as a share of its size, measured over labels of these plots.
+_CHARACTER = 0.5
+
+
+def wrapped(text: str, inches: float, size: float) -> str:
+    """The text in lines that are not longer than `inches` at a size in points, as far as its words allow."""
+    characters = max(8, int(72 * inches / (_CHARACTER * size)))
+    lines = text.split("\n")
+    return "\n".join(textwrap.fill(line, characters, break_long_words=False, break_on_hyphens=False) for line in lines)
 
 
 def line_style(name: str, file: int = 0) -> dict[str, Any]:
@@ -68,21 +87,29 @@ def line_style(name: str, file: int = 0) -> dict[str, Any]:
     colour = COLOURS.get(name) or OTHERS[sum(name.encode()) % len(OTHERS)]
     return {
         "color": colour,
-        "linewidth": 2.0 if name in _BEST else 1.0,
+        "linewidth": 1.6 if name in _BEST else 0.8,
         "linestyle": _BESIDES[min(file, len(_BESIDES) - 1)],
         "zorder": 3 if name in _BEST else 2,
     }
 
 
-_LONGEST_LABEL = 20  # characters beside a panel of the least height; the unit of a longer label is on a second line
+_MORE = 1.08  # of the size of axes when they are added: the layout, which comes last, leaves less about them free
 
 
 def finish(axes: Axes, label: str) -> None:
-    """Label of the y axis, grid, and no frame above and right."""
-    axes.set_ylabel(label.replace(" (", "\n(") if len(label) > _LONGEST_LABEL else label)
+    """Label of the y axis, no longer than the axis, grid, and no frame above and right."""
+    from matplotlib.ticker import ScalarFormatter
+
+    axes.set_ylabel(wrapped(label, _MORE * axes.get_window_extent().height / axes.figure.dpi, LETTERING))
+    axes.yaxis.label.set_fontsize(LETTERING)
+    axes.xaxis.label.set_fontsize(LETTERING)
+    axes.tick_params(labelsize=LETTERING)
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     axes.margins(x=0.0)
+    for axis in (axes.xaxis, axes.yaxis):
+        if isinstance(formatter := axis.get_major_formatter(), ScalarFormatter):
+            formatter.set_useOffset(False)  # 1015.4 hPa, not 0.4 + 1.015e3
 
 
 # Seconds in a unit of time, the unit, and the shortest axis (s) that has it: ten minutes, two hours.
@@ -109,7 +136,7 @@ def label_time(axes: Axes) -> None:
         )
 
 
-def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -> None:
+def legend_above(axes: Axes, best_first: Sequence[str] = ()) -> None:
     """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
     rank = {label: i for i, label in enumerate(best_first)}
 
@@ -119,11 +146,26 @@ def legend_above(axes: Axes, columns: int = 6, best_first: Sequence[str] = ()) -
     order = sorted(zip(*axes.get_legend_handles_labels(), strict=True), key=place)
     once = {label: handle for handle, label in order}
     if once:
+        columns = _columns_that_fit(list(once), _MORE * axes.get_window_extent().width / axes.figure.dpi)
         labels = _by_rows(list(once), columns)
         axes.legend(
             [once[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
-            frameon=False, fontsize=8, borderaxespad=0.2, handlelength=1.6, columnspacing=1.2,
+            frameon=False, fontsize=SMALL_LETTERING, borderaxespad=0.2, borderpad=0.2, handlelength=_HANDLE - 0.8,
+            columnspacing=1.0,
         )  # fmt: skip
+
+
+_HANDLE = 2.4  # of an entry of a legend, with its distance from the label: in sizes of the lettering
+
+
+def _columns_that_fit(labels: Sequence[str], inches: float) -> int:
+    """The most columns of a legend, filled row by row, that are together not wider than `inches`."""
+    for columns in range(len(labels), 1, -1):
+        longest = [max(map(len, labels[column::columns])) for column in range(columns)]
+        sizes = sum(_CHARACTER * length + _HANDLE for length in longest) + columns - 1
+        if sizes * SMALL_LETTERING / 72 <= inches:
+            return columns
+    return 1
 
 
 def _by_rows(labels: list[str], columns: int) -> list[str]:

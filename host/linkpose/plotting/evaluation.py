@@ -10,7 +10,7 @@ import numpy as np
 from linkpose.evaluation.statistics import normalised_errors
 from linkpose.plotting.canvas import finish, label_time, legend_above, line_style, new_figure, without_formulas
 from linkpose.plotting.lines import band, draw, shade
-from linkpose.plotting.panels import bound_view, others_hide_best
+from linkpose.plotting.panels import bound_view, is_signed, others_hide_best, which_filters
 from linkpose.plotting.sources import is_barometric, shortened
 from linkpose.presentation import same_digits, with_unit
 from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
     from linkpose.evaluation.scoring import Score
 
 _VECTOR_PARTS = {"position": ("x", "y", "z"), "velocity": ("vx", "vy")}
-_ROW_INCHES, _TABLE_ROW_INCHES = 2.1, 0.21
+_ROW_INCHES, _TABLE_ROW_INCHES = 1.6, 0.17
+_TABLE_LETTERING = 7.0  # points: nine columns
+_TABLE_WIDTHS = (0.14, 0.17, *[0.69 / 7] * 7)  # of its columns, as shares
+_MOST_DENSITY = 4.0  # times the normal density's peak, at the top of a histogram
 _BINS = np.linspace(-4, 4, 41)
 
 
@@ -37,27 +40,30 @@ def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
     """
     shown = _shown(found.scores)
     rows = [(name, shown) for name in _quantities(shown)]
-    if rows and _hides_best(shown, rows[0][0]):
+    best_is_apart = bool(rows) and _hides_best(shown, rows[0][0])
+    if best_is_apart:
         rows.insert(0, (rows[0][0], shown[:1]))
     has_sigma = any(_has_sigma(score, name) for name, scores in rows for score in scores)
     table_rows = sum(len(score.errors) for score in found.scores)
     table_inches = 0.5 + _TABLE_ROW_INCHES * (table_rows + 1)
-    figure = new_figure(11.0, 0.7 + _ROW_INCHES * len(rows) + table_inches)
     offset = found.scores[0].time_offset_s
     aligned = f"   ·   clocks aligned by {offset:+.4f} s" if offset else ""
-    figure.suptitle(f"{shortened(estimate)} against {shortened(reference)}{aligned}", fontsize=10, x=0.01, ha="left")
+    title = f"{shortened(estimate)} against {shortened(reference)}{aligned}"
+    figure = new_figure(0.6 + _ROW_INCHES * len(rows) + table_inches, title)
     heights = [_ROW_INCHES] * len(rows) + [table_inches]
-    grid = figure.add_gridspec(len(rows) + 1, 2, width_ratios=[2.6, 1], height_ratios=heights)
+    grid = figure.add_gridspec(len(rows) + 1, 2, width_ratios=[2.2, 1], height_ratios=heights)
+    last = next((name for name, scores in reversed(rows) if any(_has_sigma(score, name) for score in scores)), "")
     first: Axes | None = None
     for row, (name, scores) in enumerate(rows):
         axes = figure.add_subplot(grid[row, 0] if has_sigma else grid[row, :], sharex=first)
         first = first or axes
-        _errors(axes, scores, name)
+        which = which_filters(row == 0, best_is_apart and row < 2)
+        _errors(axes, scores, name, which)
         axes.tick_params(labelbottom=row == len(rows) - 1)
         if row == len(rows) - 1:
             label_time(axes)
         if any(_has_sigma(score, name) for score in scores):
-            _histogram(figure.add_subplot(grid[row, 1]), scores, name)
+            _histogram(figure.add_subplot(grid[row, 1]), scores, name, name == last)
     figure.align_ylabels()
     _table(figure.add_subplot(grid[-1, :]), found.scores)
     return without_formulas(figure)
@@ -94,7 +100,16 @@ def _quantities(scores: Sequence[Score]) -> list[str]:
     return names
 
 
-def _errors(axes: Axes, scores: Sequence[Score], name: str) -> None:
+def _std(score: Score, name: str) -> Floats | None:
+    """σ of a quantity; of a vector, the square root of the sum of its components' variances."""
+    std = score.errors[name].std
+    parts = [score.errors[part].std for part in _VECTOR_PARTS.get(name, ()) if part in score.errors]
+    known = [part for part in parts if part is not None]
+    return np.asarray(np.sqrt(np.sum(np.square(known), axis=0))) if std is None and parts and known == parts else std
+
+
+def _errors(axes: Axes, scores: Sequence[Score], name: str, which: str) -> None:
+    """Errors of the filters over time, with 2σ of the best; `which` says which filters, where that needs saying."""
     unit, drawn, stds, order = "", list[Floats](), list[Floats](), list[str]()
     for score in scores:
         of = score.errors.get(name)
@@ -105,19 +120,20 @@ def _errors(axes: Axes, scores: Sequence[Score], name: str) -> None:
         order.append(label)
         draw(axes, of.time_s, of.error, label=label, **line_style(score.filter))
         drawn.append(of.error)
-        if of.std is not None and not stds:
-            stds.append(np.where(np.isfinite(of.error), of.std, np.nan))
+        if not stds and (std := _std(score, name)) is not None:
+            stds.append(np.where(np.isfinite(of.error), std, np.nan))
             colour = str(line_style(score.filter)["color"])
-            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"±2σ {score.filter}")
+            sign = "±" if is_signed(of.error) else ""
+            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"{sign}2σ {score.filter}")
     first = next(score.errors[name] for score in scores if name in score.errors)
     shade(axes, first.time_s, ~np.isfinite(first.error))
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
-    finish(axes, f"{words(name)} error ({unit})")
-    legend_above(axes, 4, order)
+    finish(axes, f"{words(name)} error ({unit}){which}")
+    legend_above(axes, order)
 
 
-def _histogram(axes: Axes, scores: Sequence[Score], name: str) -> None:
+def _histogram(axes: Axes, scores: Sequence[Score], name: str, is_last: bool) -> None:
     """Density of error/σ of each filter beside the normal one."""
     for score in scores:
         of = score.errors.get(name)
@@ -137,11 +153,16 @@ def _histogram(axes: Axes, scores: Sequence[Score], name: str) -> None:
             label=f"{score.filter} {100 * share:.0f} %",
         )
     at = np.linspace(_BINS[0], _BINS[-1], 200)
-    axes.plot(at, np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi), color="black", linestyle="--", linewidth=1.0)
+    normal = np.exp(-0.5 * at**2) / np.sqrt(2 * np.pi)
+    if all(is_signed(score.errors[name].error) for score in scores if name in score.errors):
+        axes.plot(at, normal, color="black", linestyle="--", linewidth=0.9)
     axes.axvspan(-2, 2, color="black", alpha=0.06, linewidth=0)
+    # Errors far smaller than σ make a peak, under which those of the other filters would be flat lines.
+    axes.set_ylim(0.0, min(axes.get_ylim()[1], _MOST_DENSITY * normal.max()))
     finish(axes, "density")
-    axes.set_xlabel("error / σ; legend: share within ±2σ (95 % expected)", fontsize=7)
-    legend_above(axes, 2)
+    if is_last:
+        axes.set_xlabel("error / σ; legend: share\nwithin ±2σ (95 % expected)", fontsize=_TABLE_LETTERING)
+    legend_above(axes)
 
 
 def _normalised(of: Errors) -> Floats:
@@ -162,9 +183,9 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
             colours.append(str(line_style(score.filter)["color"]))
     head = ["filter", "quantity", "RMSE", "mean", "worst", "95 %", "NEES", "within ±2σ", "rows"]
     axes.axis("off")
-    table = axes.table(rows, colLabels=head, loc="upper center", cellLoc="right", edges="open")
+    table = axes.table(rows, colLabels=head, colWidths=_TABLE_WIDTHS, loc="upper center", cellLoc="right", edges="open")
     table.auto_set_font_size(False)
-    table.set_fontsize(8)
+    table.set_fontsize(_TABLE_LETTERING)
     for row, colour in enumerate(colours, 1):
         table[row, 0].get_text().set_color(colour)
     for (row, column), cell in table.get_celld().items():

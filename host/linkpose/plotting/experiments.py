@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import OTHERS, TRUTH, finish, legend_above, line_style, new_figure
+from linkpose.plotting.canvas import LETTERING, OTHERS, TRUTH, finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import draw
 from linkpose.sensors.measurements import Floats
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
 _WHOLE = 3  # Figure 2 shows the whole run of this Test
 _MICE_SHOWN_S = 4.0
+_VARIANT_LETTERING = 7.0  # points: names of variants beside their errors
 
 
 def paper_figure_2(runs: Sequence[Traces]) -> Figure:
@@ -32,8 +33,7 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
     """
     from linkpose.experiments.link import title
 
-    figure = new_figure(10.0, 9.5)
-    figure.suptitle("Height of the sensor over the joint ([Link], Figure 2), simulated, seed 0", fontsize=10)
+    figure = new_figure(7.0, "Height of the sensor over the joint ([Link], Figure 2), simulated, seed 0")
     for axes, run in zip(figure.subplots(len(runs), 1), runs, strict=True):
         best_first = ["joint-inertial", "joint", "tilt", "imu-baro", "baro"]
         for name in reversed(best_first):
@@ -47,7 +47,7 @@ def paper_figure_2(runs: Sequence[Traces]) -> Figure:
             inside = (run.time_s >= _SHOWN_S[0]) & (run.time_s <= _SHOWN_S[1])
         _scale_to(axes, 100 * np.concatenate([run.truth_m[inside], run.height_m["tilt"][inside]]))
         if run is runs[0]:
-            legend_above(axes, best_first=[title(name) for name in best_first])
+            legend_above(axes, [title(name) for name in best_first])
     figure.axes[-1].set_xlabel("time (s)")
     return figure
 
@@ -60,7 +60,7 @@ def _scale_to(axes: Axes, values: Floats) -> None:
 
 def redundant_mice(run: PaperRun) -> Figure:
     """Velocity of each mouse and of all together, as Figures 2 and 3 of [Mice]."""
-    figure = new_figure(11.0, 7.0)
+    figure = new_figure(5.6)
     axes = figure.subplots(3, 2, sharex=True, sharey="row")
     labels = ("$v_x$ (cm/s)", "$v_y$ (cm/s)", "ω (rad/s)")
     fused_style = line_style("planar-ekf")
@@ -75,7 +75,7 @@ def redundant_mice(run: PaperRun) -> Figure:
             finish(place, "")
         axes[j, 0].set_ylabel(label)
     for place, title in zip(axes[0], ("Each mouse alone (Figure 2)", "Least squares (Figure 3)"), strict=True):
-        place.set_title(title, fontsize=10, pad=20)
+        place.set_title(title, fontsize=LETTERING, loc="left", pad=18)
         legend_above(place)
     for place in axes[-1]:
         place.set_xlabel("time (s)")
@@ -85,18 +85,17 @@ def redundant_mice(run: PaperRun) -> Figure:
 
 def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> Figure:
     """Position error of each variant: a dot for each seed, a bar for the mean."""
-    figure = new_figure(10.0, 1.3 + 0.2 * len(compared))
+    figure = new_figure(1.2 + 0.17 * len(compared), title)
     axes = figure.add_subplot()
     for row, variant in enumerate(compared):
         errors = [score.position_rmse_m for score in variant.scores]
         colour = line_style(variant.filter)["color"]
         axes.plot(errors, [row] * len(errors), "o", color=colour, alpha=0.5, markersize=4, label=variant.filter)
         axes.plot([variant.position_rmse_m()], [row], "|", color=colour, markersize=11, markeredgewidth=2)
-    axes.set_yticks(range(len(compared)), labels, fontsize=7)
+    axes.set_yticks(range(len(compared)), labels, fontsize=_VARIANT_LETTERING)
     axes.set_xscale("log")
     _label_plainly(axes.xaxis)
     axes.set_xlabel("position error, rms of a run (m); bars: mean over the seeds")
-    axes.set_title(title, fontsize=10, pad=20)
     finish(axes, "")
     axes.margins(x=0.05)
     axes.set_ylim(len(compared), -1)

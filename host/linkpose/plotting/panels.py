@@ -47,14 +47,14 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
     if sources.reference is not None and sources.reference.has(quantity):
         track = sources.reference
         value = track.values[quantity]
-        if quantity is YAW and drawn:
-            value = _from_start_of(drawn[0][0], track)
+        if quantity is YAW:
+            value = _from_start_of(drawn[0][0], track) if drawn else _from_start(value)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
     view_values(axes, [value for _, value in drawn] + _reference_beside(sources, quantity, drawn))
     shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
     finish(axes, quantity.axis_label)
     if legend:
-        legend_above(axes, best_first=[track.label for track, _ in drawn])
+        legend_above(axes, [track.label for track, _ in drawn])
 
 
 def _reference_beside(sources: Sources, quantity: Quantity, drawn: Sequence[tuple[DrawnTrack, Floats]]) -> list[Floats]:
@@ -64,6 +64,12 @@ def _reference_beside(sources: Sources, quantity: Quantity, drawn: Sequence[tupl
         return []
     first, last = drawn[0][0].time_s[[0, -1]]
     return [track.values[quantity][(track.time_s >= first) & (track.time_s <= last)]]
+
+
+def _from_start(yaw: Floats) -> Floats:
+    """Yaw (°) since its first value."""
+    known = yaw[np.isfinite(yaw)]
+    return np.asarray((yaw - known[0] + 180.0) % 360.0 - 180.0) if len(known) else yaw
 
 
 def _from_start_of(estimate: DrawnTrack, reference: DrawnTrack) -> Floats:
@@ -88,7 +94,10 @@ def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
 
 
 def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> None:
-    """Errors of a scored quantity with ±2σ about zero; the legend gives each filter's RMSE."""
+    """Errors of a scored quantity with ±2σ about zero; the legend gives each filter's RMSE.
+
+    A distance, which is never negative, has 2σ above zero.
+    """
     unit, order = "", list[str]()
     drawn: list[Floats] = []
     stds: list[Floats] = []
@@ -101,13 +110,24 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
         if of.std is not None and not order:
             stds.append(np.where(np.isfinite(of.error), of.std, np.nan))
             colour = str(line_style(track.name)["color"])
-            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"±2σ {track.label}")
+            sign = "±" if is_signed(of.error) else ""
+            band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"{sign}2σ {track.label}")
         order.append(text)
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
     shade_unknown(axes, sources.tracks)
-    finish(axes, f"{words(name)} error ({unit})")
-    legend_above(axes, best_first=order)
+    finish(axes, f"{words(name)} error ({unit}){which_filters(best_only, hides_best(sources, name))}")
+    legend_above(axes, order)
+
+
+def which_filters(best_only: bool, best_is_apart: bool) -> str:
+    """Second line of the label of each of two panels of one quantity, of which one shows the best filter enlarged."""
+    return ("\nbest filter" if best_only else "\nall filters") if best_is_apart else ""
+
+
+def is_signed(error: Floats) -> bool:
+    """Whether errors lie on both sides of zero: those of a rotation or of a position are distances."""
+    return bool((error < 0.0).any())
 
 
 def _scored(sources: Sources, name: str) -> list[tuple[DrawnTrack, Errors]]:
@@ -157,15 +177,15 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool 
     bound_view(axes, differences, stds)
     shade_unknown(axes, sources.tracks)
     finish(axes, f"±2σ ({unit})" if is_alone else f"from best ({unit})")
-    legend_above(axes, best_first=order)
+    legend_above(axes, order)
 
 
 def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> None:
     """Limits the y axis to `error_limit` on both sides of zero, or above it for errors that are distances."""
     limit = error_limit(errors, stds)
     if limit > 0:
-        is_signed = bool(stds) or any(bool((value < 0).any()) for value in errors)
-        axes.set_ylim(-limit if is_signed else 0.0, limit)
+        are_signed = any(map(is_signed, errors)) if errors else bool(stds)
+        axes.set_ylim(-limit if are_signed else 0.0, limit)
 
 
 def error_limit(errors: Sequence[Floats], stds: Sequence[Floats]) -> float:

@@ -36,13 +36,16 @@ def _panel(table: Table, name: str, columns: list[tuple[str, Column]]) -> Callab
 def _draw(axes: Axes, table: Table, name: str, columns: list[tuple[str, Column]]) -> None:
     time_s = table.columns["time_s"]
     unknown = np.ones(len(time_s), np.bool_)
+    mice = list(dict.fromkeys(part.prefix for _, part in columns))
     for i, (column, part) in enumerate(columns):
-        label = part.quantity.label if part.prefix in _SENSORS else f"{part.prefix} {part.quantity.label}"
-        colour = AXES_COLOURS.get(part.quantity.label, OTHERS[i % len(OTHERS)])
+        label, colour, dashes = part.quantity.label, AXES_COLOURS.get(part.quantity.label, OTHERS[i % len(OTHERS)]), "-"
+        if part.prefix not in _SENSORS:  # a mouse, whose two directions have its colour
+            label, colour = f"{part.prefix} {label}", OTHERS[mice.index(part.prefix) % len(OTHERS)]
+            dashes = "-" if columns[i - 1][1].prefix != part.prefix or i == 0 else ":"
         value = table.columns[column] * part.quantity.value.scale
         unknown &= ~np.isfinite(value)
-        draw(axes, time_s, value, label=label, color=colour, linewidth=0.9)
+        draw(axes, time_s, value, label=label, color=colour, linewidth=0.8, linestyle=dashes)
     shade(axes, time_s, unknown)
-    finish(axes, f"{name}\n({columns[0][1].quantity.value.unit})")
+    finish(axes, f"{name} ({columns[0][1].quantity.value.unit})")
     if len(columns) > 1:
-        legend_above(axes, 8)
+        legend_above(axes)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from linkpose.localization.surroundings import Surroundings
-from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, TRUTH, finish, legend_above, line_style
+from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, SMALL_LETTERING, TRUTH, finish, legend_above, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import errors, hides_best, shade_unknown, view_values
 from linkpose.plotting.sources import DrawnTrack, Sources
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from linkpose.localization.grid import GridMap
 
+_MARGIN = 0.1  # of a path's extents: heading ticks at its edge are in view
 _MARKS = 12  # heading ticks and ellipses along a path
 _MOST_CELLS = 3000  # of a map, along a side
 _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the whole width
@@ -59,10 +60,9 @@ def time_panels(sources: Sources, wide: bool) -> list[TimePanel]:
     found: list[TimePanel] = []
     shown = sources.tracks or sources.all
     if any("position" in score.errors for score in sources.scores.values()) and _with_path(sources):
-        columns = 6 if wide else 2
         if hides_best(sources, "position"):
-            found.append((1.4, lambda axes: _position_errors(axes, sources, columns, best_only=True)))
-        found.append((1.8, lambda axes: _position_errors(axes, sources, columns)))
+            found.append((1.4, lambda axes: _position_errors(axes, sources, best_only=True)))
+        found.append((1.8, lambda axes: _position_errors(axes, sources)))
     if any(track.has(VX) for track in shown):
         found.append((1.8, lambda axes: _over_time(axes, sources, _speed, "speed (m/s)")))
     if any(track.has(HEADING) for track in shown):
@@ -86,8 +86,9 @@ def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: b
         axes.set_box_aspect(1.0)
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
-    axes.margins(0.05)
-    legend_above(axes, 6 if wide else 3, [track.label for track in tracks])
+    axes.set_anchor("N")  # its top is that of the panels beside it
+    axes.margins(_MARGIN)
+    legend_above(axes, [f"{band}{track.label}" for band in ("", "±2σ ") for track in tracks])
 
 
 def _draw_scene(axes: Axes, scene: Surroundings) -> None:
@@ -97,7 +98,7 @@ def _draw_scene(axes: Axes, scene: Surroundings) -> None:
         places = np.array([list(place)[:2] for place in scene.beacons.values()])
         axes.plot(*places.T, "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
         for name, place in zip(scene.beacons, places, strict=True):
-            axes.annotate(name, place, xytext=(4, 4), textcoords="offset points", fontsize=7)
+            axes.annotate(name, place, xytext=(4, 4), textcoords="offset points", fontsize=SMALL_LETTERING)
     if scene.rejected_xy_m is not None and len(scene.rejected_xy_m):
         axes.plot(*scene.rejected_xy_m.T, "x", color=OTHERS[3], markersize=4, label="measurement rejected", zorder=4)
 
@@ -144,9 +145,9 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
             color=colour,
             angles="xy",
             units="inches",
-            width=0.04,
+            width=0.025,
             scale_units="inches",
-            scale=3.0,
+            scale=4.5,
             zorder=4,
         )
     if X in track.std and Y in track.std:
@@ -159,7 +160,7 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
         axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
 
 
-def _position_errors(axes: Axes, sources: Sources, columns: int, best_only: bool = False) -> None:
+def _position_errors(axes: Axes, sources: Sources, best_only: bool = False) -> None:
     """Distances from the true position, and the best filter's 2σ of x and y together."""
     errors(axes, sources, "position", best_only)
     best = next((track for track in sources.tracks if X in track.std and Y in track.std), None)
@@ -170,7 +171,7 @@ def _position_errors(axes: Axes, sources: Sources, columns: int, best_only: bool
         known = std[np.isfinite(std)]
         top = axes.get_ylim()[1]
         axes.set_ylim(0.0, max(top, 2.2 * float(np.quantile(known, 0.9))) if len(known) else top)
-    legend_above(axes, columns)
+    legend_above(axes)
 
 
 def _speed(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:
@@ -223,9 +224,9 @@ def _mice(axes: Axes, track: DrawnTrack) -> None:
         last = len(out) - 1
         bars = [(track.time_s[a], track.time_s[min(b, last)] - track.time_s[a]) for a, b in edges.tolist()]
         axes.broken_barh(bars, (mouse + 0.6, 0.8), color=line_style(track.name)["color"])
-    axes.set_yticks(range(1, shown + 1))
+    axes.set_yticks(range(1, shown + 1), [f"mouse {mouse}" for mouse in range(1, shown + 1)])
     axes.set_ylim(0.4, shown + 0.6)
-    finish(axes, f"left out by\n{track.label}")
+    finish(axes, f"left out by {track.label}")
 
 
 def rotation(axes: Axes, sources: Sources) -> None:

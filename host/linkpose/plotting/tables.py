@@ -11,7 +11,14 @@ import numpy as np
 from linkpose.errors import LinkposeError
 from linkpose.localization.surroundings import Surroundings
 from linkpose.plotting import panels, readings, robots
-from linkpose.plotting.canvas import label_time, new_figure, without_formulas
+from linkpose.plotting.canvas import (
+    SMALL_LETTERING,
+    WIDTH_INCHES,
+    label_time,
+    new_figure,
+    without_formulas,
+    wrapped,
+)
 from linkpose.plotting.sources import Sources, gather, is_recording, title
 from linkpose.quantities import (
     ANGLE,
@@ -33,8 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-_WIDTH_INCHES = 10.0
-_INCHES = 1.05  # per unit of height
+_INCHES = 0.8  # per unit of height
 _WIDE_PATH = 3.6  # height of a path above the panels
 
 
@@ -80,41 +86,45 @@ def plot_tables(
         if any(split(column) for column in tables[0].columns):
             raise LinkposeError(f"{tables[0].path} holds nothing to draw: its quantities are empty in all rows")
         raise LinkposeError(f"{tables[0].path} holds nothing to draw: it has {', '.join(tables[0].columns)[:300]}")
-    figure = new_figure(_WIDTH_INCHES, 0.8 + _INCHES * sum(section.height for section in sections))
-    figure.suptitle(title(tables), fontsize=10, x=0.01, ha="left")
+    figure = new_figure(0.7 + _INCHES * sum(section.height for section in sections), title(tables))
     parts = figure.subfigures(len(sections), 1, squeeze=False, height_ratios=[s.height for s in sections])
     for part, section in zip(parts[:, 0], sections, strict=True):
         _lay_out(part, section)
     note = panels.note_hidden(sources)
     if note:
-        figure.supxlabel(note, fontsize=8, x=0.01, ha="left", color="#555555")
+        lines = wrapped(note, WIDTH_INCHES, SMALL_LETTERING)
+        figure.supxlabel(lines, fontsize=SMALL_LETTERING, x=0.01, ha="left", color="#555555")
     return without_formulas(figure), [*sources.remarks, *([note] if note else [])]
 
 
 def _lay_out(part: SubFigure, section: Section) -> None:
     """Panels below each other with one time axis; a path to the left of them or above."""
     rows = len(section.panels)
+    grid: Any
+    below_each_other: list[Axes] = []
     shares = [panel.share for panel in section.panels]
     above = int(section.is_wide)
     if section.path is not None and above:
         grid = part.add_gridspec(rows + 1, 1, height_ratios=[_WIDE_PATH, *shares])
-        section.path(part.add_subplot(grid[0, 0]))
+        below_each_other.append(part.add_subplot(grid[0, 0]))
+        section.path(below_each_other[0])
     elif section.path is not None:
-        grid = part.add_gridspec(
-            max(rows, 1), 2 if rows else 1, height_ratios=shares or [1.0], width_ratios=[1.35, 1.0][: 2 if rows else 1]
-        )
-        section.path(part.add_subplot(grid[:, 0]))
+        beside = part.add_gridspec(1, 2, width_ratios=[1.2, 1.0]) if rows else part.add_gridspec(1, 1)
+        section.path(part.add_subplot(beside[0, 0]))
+        # A grid of its own: in a common one, all panels would be as far apart as the legends of one of them need.
+        grid = beside[0, -1].subgridspec(max(rows, 1), 1, height_ratios=shares or [1.0])
     else:
         grid = part.add_gridspec(rows, 1, height_ratios=shares)
     first: Any = None
     for row, panel in enumerate(section.panels):
-        axes = part.add_subplot(grid[row + above, -1], sharex=first)
+        axes = part.add_subplot(grid[row + above, 0], sharex=first)
         first = first or axes
+        below_each_other.append(axes)
         panel.draw(axes)
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
         label_time(axes)
-        part.align_ylabels()
+        part.align_ylabels(below_each_other)
 
 
 def _link(sources: Sources) -> Section | None:

@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import BAND_ALPHA, OTHERS, TRUTH, finish, legend_above, line_style, new_figure
+from linkpose.plotting.canvas import (
+    BAND_ALPHA,
+    LETTERING,
+    OTHERS,
+    SMALL_LETTERING,
+    TRUTH,
+    WIDTH_INCHES,
+    finish,
+    legend_above,
+    line_style,
+    new_figure,
+    wrapped,
+)
 from linkpose.plotting.lines import MOST_POINTS
 from linkpose.plotting.robots import draw_map
 from linkpose.sensors.measurements import Floats
@@ -29,6 +41,7 @@ INDOOR_FIGURES = ("3.1", "3.2", "3.3", "3.4", "3.5", "3.6")
 UNDERWATER_FIGURES = ("3.7", "3.8", "3.9", "3.10")
 _SECTIONS = 3  # of Figure 3.4
 _SECTION_M = 10.0  # length of each
+_BESIDE = 0.4  # of the width of a figure: panels over time beside a path
 _HEADROOM = 1.5  # of an axis over the error that 99 % do not exceed
 _UNDER_TRUTH = {"linewidth": 2.6}  # of an estimated path, which the dashed truth covers
 
@@ -56,8 +69,8 @@ def underwater_figures(dive: Dive, beacons: Beacons) -> dict[str, Figure]:
     return figures
 
 
-def _titled(figure: Figure, number: str, words: str) -> None:
-    figure.suptitle(f"Figure {number}  {words}", fontsize=10, x=0.01, ha="left")
+def _titled(height_inches: float, number: str, words: str) -> Figure:
+    return new_figure(height_inches, f"Figure {number}  {words}")
 
 
 def _summary(path: ComparedPath) -> str:
@@ -75,9 +88,9 @@ def _start(axes: Axes, point: Floats) -> None:
 
 
 def _from_above(axes: Axes) -> None:
-    """x and y in the same scale, with their names; the panels beside it begin at the same height."""
+    """x and y in the same scale, with their names; it begins where panels below or beside it begin."""
     axes.set_aspect("equal", "box")
-    axes.set_anchor("N")
+    axes.set_anchor("NW")
     axes.set_xlabel("x (m)")
     finish(axes, "y (m)")
     axes.margins(0.05)
@@ -85,8 +98,7 @@ def _from_above(axes: Axes) -> None:
 
 def _map_and_path(drive: DrawnDrive) -> Figure:
     """Figure 3.1."""
-    figure = new_figure(10.0, 4.8)
-    _titled(figure, "3.1", "Map and path of the robot (simulated)")
+    figure = _titled(3.6, "3.1", "Map and path of the robot (simulated)")
     axes = figure.add_subplot()
     draw_map(axes, drive.grid)
     _plot(axes, drive.odometry_m, color=OTHERS[0], linewidth=1.2, label="odometry alone")
@@ -99,8 +111,7 @@ def _map_and_path(drive: DrawnDrive) -> Figure:
 
 def _estimate(number: str, path: ComparedPath, grid: GridMap, largest: tuple[float, float]) -> Figure:
     """Figures 3.2, 3.3, 3.5, 3.6: the path on the map over its errors along the way."""
-    figure = new_figure(10.0, 8.6)
-    _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
+    figure = _titled(6.4, number, f"{path.label}, simulated: {_summary(path)}")
     above, position, heading = figure.subplots(3, 1, height_ratios=[3.2, 1.5, 1.5])
     draw_map(above, grid)
     _plot(above, path.position_m, label=path.filter, **line_style(path.filter) | _UNDER_TRUTH)
@@ -145,8 +156,7 @@ def _large_errors(drive: DrawnDrive) -> Figure:
 
     fixed, adaptive = drive.paths["3.2"], drive.paths["3.3"]
     sections = worst_sections(fixed, _SECTIONS, _SECTION_M)
-    figure = new_figure(10.0, 8.4)
-    _titled(figure, "3.4", f"Where the position error with the {fixed.label}, is largest (simulated)")
+    figure = _titled(6.4, "3.4", f"Where the position error with the {fixed.label}, is largest (simulated)")
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=[1.25, 1.0])[:, 0]
     axes = upper.add_subplot()
     draw_map(axes, drive.grid)
@@ -155,14 +165,15 @@ def _large_errors(drive: DrawnDrive) -> Figure:
         inside = (fixed.way_m >= section.start_m) & (fixed.way_m <= section.end_m)
         _plot(axes, fixed.truth_m[inside], color=OTHERS[3], linewidth=7.0, alpha=0.6, label="large errors")
         place = _middle(fixed, section)
-        axes.annotate(str(i), place, xytext=(0, 8), textcoords="offset points", fontsize=11, fontweight="bold")
+        axes.annotate(str(i), place, xytext=(0, 8), textcoords="offset points", fontsize=LETTERING, fontweight="bold")
     _from_above(axes)
     legend_above(axes)
     details = np.atleast_1d(lower.subplots(1, len(sections), sharey=True))
     for i, (place, section) in enumerate(zip(details, sections, strict=True), 1):
         _detail(place, i, section, (fixed, adaptive))
-    details[0].set_ylabel("position error (cm)")
-    legend_above(details[0])
+    finish(details[0], "position error (cm)")
+    lines, labels = details[0].get_legend_handles_labels()
+    lower.legend(lines, labels, loc="outside upper left", ncols=2, frameon=False, fontsize=SMALL_LETTERING)
     return figure
 
 
@@ -180,19 +191,24 @@ def _detail(axes: Axes, number: int, section: WaySection, paths: Sequence[Compar
         style = line_style(path.filter, len(paths) - 1 - i) | {"linewidth": 1.5}
         axes.plot(path.way_m[inside], 100 * path.error_m[inside], label=path.label, **style)
     errors = " and ".join(f"{100 * rms_within(path, section):.1f}" for path in paths)
-    axes.set_title(f"{number}: fixed and adaptive R {errors} cm rms", fontsize=9, pad=18)
+    axes.set_title(f"{number}: {errors} cm rms", fontsize=SMALL_LETTERING, loc="left")
     axes.set_xlabel("way (m)")
     finish(axes, "")
+
+
+def _beside(figure: Figure, count: int) -> tuple[Axes, list[Axes]]:
+    """Axes for a path on the left, and as many over time to the right of it."""
+    halves = figure.add_gridspec(1, 2, width_ratios=[1.0, 1.15])
+    over_time = halves[0, 1].subgridspec(count, 1)
+    return figure.add_subplot(halves[0, 0]), [figure.add_subplot(over_time[i, 0]) for i in range(count)]
 
 
 def _command_and_motion(dive: Dive, beacons: Beacons) -> Figure:
     """Figure 3.7: the path that the command describes, and the one that the vehicle takes."""
     apart = np.linalg.norm(dive.truth_m - dive.command_m, axis=1)
-    figure = new_figure(10.0, 6.2)
-    _titled(figure, "3.7", f"Commanded and true path, {apart[-1]:.2f} m apart at the end (simulated)")
-    grid = figure.add_gridspec(2, 2, width_ratios=[1.1, 1.0])
-    above, depth = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
-    distance = figure.add_subplot(grid[1, 1], sharex=depth)
+    figure = _titled(4.6, "3.7", f"Commanded and true path, {apart[-1]:.2f} m apart at the end (simulated)")
+    above, (depth, distance) = _beside(figure, 2)
+    distance.sharex(depth)
     _plot(above, dive.command_m, color=OTHERS[2], linewidth=1.4, label="command")
     _plot(above, dive.truth_m, label="truth", **TRUTH)
     _start(above, dive.truth_m[0])
@@ -207,7 +223,7 @@ def _command_and_motion(dive: Dive, beacons: Beacons) -> Figure:
     depth.tick_params(labelbottom=False)
     figure.align_ylabels([depth, distance])
     _from_above(above)
-    legend_above(above, 4)
+    legend_above(above)
     return figure
 
 
@@ -215,24 +231,25 @@ def _draw_beacons(axes: Axes, beacons: Beacons) -> None:
     places = np.array(list(beacons.values()))
     axes.plot(places[:, 0], places[:, 1], "^", color="black", markersize=6, label="beacons", linestyle="none", zorder=4)
     for name, place in zip(beacons, places, strict=True):
-        axes.annotate(name, place[:2], xytext=(5, 3), textcoords="offset points", fontsize=8)
+        axes.annotate(name, place[:2], xytext=(5, 3), textcoords="offset points", fontsize=SMALL_LETTERING)
 
 
 def _sets_of_measurements(paths: Sequence[ComparedPath], beacons: Beacons, largest: tuple[float, float]) -> Figure:
     """Figure 3.8: the path from the complete set, and the errors with each set."""
-    figure = new_figure(10.0, 6.6)
-    _titled(figure, "3.8", f"{paths[0].filter.upper()} on sets of simulated measurements, all with Gaussian noise")
-    grid = figure.add_gridspec(len(paths), 2, width_ratios=[1.0, 1.15])
-    _from_above_among_beacons(figure.add_subplot(grid[:, 0]), paths[-1], beacons)
-    first: Axes | None = None
-    for i, path in enumerate(paths):
-        axes = figure.add_subplot(grid[i, 1], sharex=first)
-        first = first or axes
+    figure = _titled(
+        5.6, "3.8", f"{paths[0].filter.upper()} on sets of simulated measurements, all with Gaussian noise"
+    )
+    above, errors = _beside(figure, len(paths))
+    _from_above_among_beacons(above, paths[-1], beacons)
+    for axes, path in zip(errors, paths, strict=True):
+        if axes is not errors[0]:
+            axes.sharex(errors[0])
         _position_error(axes, path, path.time_s, largest)
-        axes.set_title(f"{path.label}: {_summary(path)}", fontsize=9, loc="left", pad=18 if i == 0 else 6)
+        heading = wrapped(f"{path.label}: {_summary(path)}", _BESIDE * WIDTH_INCHES, SMALL_LETTERING)
+        axes.set_title(heading, fontsize=SMALL_LETTERING, loc="left", pad=16 if axes is errors[0] else 4)
         axes.tick_params(labelbottom=path is paths[-1])
-    legend_above(figure.axes[1])
-    axes.set_xlabel("time (s)")
+    legend_above(errors[0])
+    errors[-1].set_xlabel("time (s)")
     return figure
 
 
@@ -242,16 +259,14 @@ def _from_above_among_beacons(axes: Axes, path: ComparedPath, beacons: Beacons) 
     _start(axes, path.truth_m[0])
     _draw_beacons(axes, beacons)
     _from_above(axes)
-    legend_above(axes, 4)
+    legend_above(axes)
 
 
 def _dive_estimate(number: str, path: ComparedPath, beacons: Beacons, largest: tuple[float, float]) -> Figure:
     """Figures 3.9 and 3.10: the path from above, the depth, and the errors over time."""
-    figure = new_figure(10.0, 6.6)
-    _titled(figure, number, f"{path.label}, simulated: {_summary(path)}")
-    grid = figure.add_gridspec(3, 2, width_ratios=[1.0, 1.15])
-    _from_above_among_beacons(figure.add_subplot(grid[:, 0]), path, beacons)
-    depth, position, heading = (figure.add_subplot(grid[i, 1]) for i in range(3))
+    figure = _titled(5.2, number, f"{path.label}, simulated: {_summary(path)}")
+    above, (depth, position, heading) = _beside(figure, 3)
+    _from_above_among_beacons(above, path, beacons)
     depth.plot(path.time_s, -path.position_m[:, 2], **line_style(path.filter) | _UNDER_TRUTH)
     depth.plot(path.time_s, -path.truth_m[:, 2], **TRUTH)
     finish(depth, "depth (m)")
