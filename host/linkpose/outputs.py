@@ -53,8 +53,10 @@ def create(path: Path, force: bool) -> int:
             return create(path, force)
         raise FileExists(path) from None
     except FileNotFoundError as error:
-        folder = path.absolute().parent
-        raise CannotWrite(path, error.strerror if folder.exists() else f"there is no folder {folder}") from error
+        is_there = path.parent.exists()  # not by its absolute name: the current folder may have been removed
+        raise CannotWrite(
+            path, error.strerror if is_there else f"there is no folder {path.absolute().parent}"
+        ) from error
     except OSError as error:
         raise CannotWrite(path, error.strerror) from error
 

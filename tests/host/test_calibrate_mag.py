@@ -110,7 +110,7 @@ def test_spikes_are_left_out_with_their_count(tmp_path):
     found = json.loads(done.stdout)
     assert found["outliers"] == 2 and found["readings"] == len(block) - 2 and found["is_clean"]
     assert found["hard_iron_uT"] == pytest.approx(HARD_IRON, abs=0.2)
-    assert "2 readings are left out" in done.stderr
+    assert "2 readings are left out: the magnitude is far from the median" in done.stderr
 
 
 def test_hard_iron_stronger_than_the_field_makes_no_outliers():

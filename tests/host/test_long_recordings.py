@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import tracemalloc
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -186,7 +186,10 @@ def test_a_picture_of_a_long_table_keeps_spikes_and_gaps(tmp_path, monkeypatch):
     figure, remarks = plotting.plot_tables([table])
     title = figure.get_suptitle()
     assert "100 Hz" in title and "500 samples lost in 1 gap" in title
-    assert any("has 19500 rows" in remark for remark in remarks)
+    assert any("has 19500 rows: the picture shows the extremes" in remark for remark in remarks)
+    truth = replace(table, kind="truth", columns={"time_s": table.columns["time_s"], "height_m": kept})
+    remarks = plotting.plot_tables([table, truth])[1]
+    assert any("no errors are drawn of files of this length: type linkpose" in remark for remark in remarks)
 
 
 number = st.floats(-1e6, 1e6).map(lambda value: f"{value:.6f}") | st.from_regex(

@@ -218,6 +218,7 @@ PRODUCERS: list[Producer] = [
     table("time_s;a;a\n0;1;2\n"),
     parquet(["a", "a"]),
     recording(b"PK\x03\x04\n1\n"),
+    lambda folder, _: read_table(written(folder / "a.bin", capture(HELLO, 5))),
     table("[joint]\nj2s_m = [1, 2, 3]\n"),
     table("time_s;a\n0;1\n1;2;3\n"),
     table("time_s,a\n0,5,1,5\n"),
@@ -392,6 +393,7 @@ PROMISES = {
     "the computer's date and time are set": ["test_time.py::test_the_date_that_is_set_meanwhile_changes_no_time"],
     "the recording is removed, replaced, emptied or written by another program": [
         "test_device.py::test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file",
+        "test_outputs.py::test_a_file_whose_folder_is_removed_goes_on_among_the_temporary_files",
         "test_device.py::test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence",
     ],
     "the terminal or a pipe behind standard error goes away": [

@@ -113,6 +113,9 @@ FAST = [
     (scale(0.5, "gyro_y"), "multiply it by 2"),
     (scale(0.001, "accel_y"), "accel_y is 0.001 times what the motion in the other columns shows"),
     (scale(0.001, "gyro_z"), "gyro_z is 0.001 times what the motion in the other columns shows"),
+    (scale(1 / 9.80665, "accel_x"), "accel_x is 0.101972 times what the motion in the other columns shows"),
+    (scale(10.0, "gyro_y"), "gyro_y is 10 times what the motion in the other columns shows"),
+    (scale(0.1, "gyro_x"), "gyro_x is 0.1 times what the motion in the other columns shows"),
     (scale(180 / np.pi, "accel_y"), "more than the sensor reads: check the unit of each axis"),
     (
         lambda table: table.update({f"accel_{a}_m_s2": 0 * table["time_s"] + 3 for a in "xyz"}),
@@ -128,7 +131,8 @@ FAST = [
         "right", "°/s", "°/s slowly", "rad/s twice", "twice", "half", "backwards", "one axis", "time x 10",
         "milliseconds", "accel exchanged", "gyro exchanged", "one axis of the gyro", "one axis backwards",
         "one axis twice", "one axis half", "one axis of the gyro twice", "one axis of the gyro half",
-        "one axis in km/s²", "one axis of the gyro in krad/s", "one axis in degrees", "no accel",
+        "one axis in km/s²", "one axis of the gyro in krad/s", "one axis in g",
+        "one axis of the gyro ten times", "one axis of the gyro a tenth", "one axis in degrees", "no accel",
     ],
 )  # fmt: skip
 def test_a_fast_swing_shows_whether_gyro_and_accelerometer_agree(change, sentence: str | None) -> None:
@@ -242,6 +246,36 @@ def test_one_impossible_pressure_is_left_out(tmp_path: Path, pressure: float) ->
     assert recording.health["baro"]["invalid"] == {"out of range": 1}
 
 
+def repeating(rows: int) -> Callable[[dict[str, np.ndarray]], None]:
+    """Each reading stands in so many rows, all of them marked as new."""
+
+    def change(table: dict[str, np.ndarray]) -> None:
+        table["pressure_Pa"] = np.repeat(table["pressure_Pa"][::rows], rows)[:N]
+
+    return change
+
+
+def coarse(table: dict[str, np.ndarray]) -> None:
+    """As in a file in hPa with one decimal: a new reading seldom differs from the one before."""
+    table["pressure_Pa"] = np.round(table["pressure_Pa"] / 10) * 10
+
+
+@pytest.mark.parametrize(
+    ("change", "is_named"),
+    [(repeating(1), False), (repeating(2), True), (repeating(4), True), (coarse, False)],
+    ids=["all new", "twice", "four times", "coarse"],
+)
+def test_readings_that_are_repeated_and_marked_as_new_are_named(tmp_path: Path, change, is_named: bool) -> None:
+    assert ("baro_fresh is 1 in 600 rows, and pressure_Pa changes in" in remarks(tmp_path, change)) == is_named
+
+
+@pytest.mark.parametrize(("every", "is_named"), [(2, True), (5, True), (20, False)])
+def test_many_single_missing_readings_are_named(tmp_path: Path, every: int, is_named: bool) -> None:
+    """No state of the sensor lasts long enough to be reported."""
+    found = remarks(tmp_path, put("gyro_y_rad_s", slice(None, None, every), np.nan))
+    assert (f"the IMU has no valid reading in {N // every} of 600 rows" in found) == is_named
+
+
 @pytest.mark.parametrize("rows", [1, 2, 49, 150, 1200])
 @pytest.mark.parametrize("factor", [1.0, 1e12])
 def test_few_rows_and_huge_values_are_no_contradiction(rows: int, factor: float) -> None:
@@ -255,6 +289,7 @@ def test_each_remark_of_the_documentation_is_produced(tmp_path: Path) -> None:
     shown = re.findall(r"^\| `([^`]+)` \|", page.split("\n## Remarks on recordings")[1].split("\n## ")[0], re.MULTILINE)
     found = "\n".join(remarks(tmp_path, change) for change, _ in [*WRONG, (scale(1000.0, "time"), "")])
     found += "\n".join(fast_remarks(change) for change, _ in FAST)
+    found += "\n" + remarks(tmp_path, repeating(4))
     found += "\n" + remarks(tmp_path, lambda table: with_second_sensor(table, np.full(N, 2 * BOTH_VALID)))
     assert len(shown) > 10
     for remark in shown:

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -147,17 +148,42 @@ def test_a_folder_that_does_not_exist_is_named(tmp_path: Path) -> None:
         create(tmp_path / "none" / "a.csv", force=False)
 
 
-def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path: Path) -> None:
-    """The file has no folder to go on in. The closing line failed with "Bad file descriptor" before."""
+def test_a_folder_that_is_removed_meanwhile_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file has no folder to go on in, nor one for temporary files. The closing line failed with "Bad file
+    descriptor" before.
+    """
     (folder := tmp_path / "run").mkdir()
     file = CsvFile(folder / "a.csv", "recording", {}, ["time_s"], force=False)
     shutil.rmtree(folder)
     with pytest.raises(FileChanged, match="it was removed"):
         file.write("1\n")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
     with pytest.raises(CannotWrite, match=r"a-2\.csv: there is no folder"):
         file.continue_elsewhere()
     with pytest.raises(FileChanged, match="it was removed"):
         file.close({})
+
+
+@pytest.mark.parametrize("is_current", [False, True], ids=["named", "current"])
+def test_a_file_whose_folder_is_removed_goes_on_among_the_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_current: bool
+) -> None:
+    """With the rows so far, which were lost before. A removed current folder gave a sentence without the file."""
+    (folder := tmp_path / "run").mkdir()
+    (other := tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(other))
+    monkeypatch.chdir(folder if is_current else tmp_path)
+    file = CsvFile(Path("a.csv") if is_current else folder / "a.csv", "recording", {}, ["time_s"], force=False)
+    file.write("1\n")
+    shutil.rmtree(folder)
+    with pytest.raises(FileChanged, match="it was removed"):
+        file.write("2\n")
+    file.continue_elsewhere()
+    file.write("2\n")
+    file.close({})
+    assert file.path == other / "a-2.csv"
+    assert file.path.read_text().splitlines()[2:] == ["time_s", "1", "2", "# {}"]
+    monkeypatch.chdir(tmp_path)
 
 
 def test_a_check_that_fails_does_not_end_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,6 +24,8 @@ _FORMATS = (
     (rb"[\x02-\x0f]P[\0-\xff]{4}", "a C3D file, which only `evaluate` and `plot` read, as a reference"),
     (rb"\s*\{\s*\"", "JSON"),
 )
+_FIRST_FRAME_BYTES = 512  # longer than any frame of a raw capture, which a zero byte ends
+_BINARY = "binary data; a raw capture has a name in .bin, and `info`, `estimate` and `calibrate` read it"
 
 
 class Chunk(NamedTuple):
@@ -66,6 +68,8 @@ def _refuse_other_formats(path: Path, data: bytes) -> None:
     for beginning, what in _FORMATS:
         if re.match(beginning, data):
             raise FileFormatError(path, f"{path} is no table but {what}")
+    if b"\0" in data[:_FIRST_FRAME_BYTES] and codec_of(data) == "utf-8-sig":
+        raise FileFormatError(path, f"{path} is no table but {_BINARY}")
 
 
 def _converter(start: bytes) -> Callable[[bytes, bool], bytes]:

@@ -15,6 +15,7 @@ import itertools
 import numpy as np
 
 from linkpose.sensors.measurements import Floats, Measurements
+from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
 _WINDOW = 50  # samples: half a second at 100 Hz, in which a gyro's offset turns the tilt little; doubled, twice as far
 _PERIOD_S = 0.01  # samples closer than this are averaged; a wrong unit of time must not average more than
@@ -32,13 +33,13 @@ _DEGREES = 180 / np.pi
 _FACTORS = (1 / _DEGREES, 0.5, 2.0, 0.1, 10.0, 0.25, 4.0, 0.01, 100.0, 0.001, 1000.0, _DEGREES, -1.0)
 _AXES = "xyz"
 # Scales of one axis: another range or unit in one column. In right data of public recordings, the best of 0.5 and 2
-# left 0.91 and more of what is left without it, and none of the others was reported. A tenth would leave out an axis,
-# which fits a motion without a joint too well; a column that is too large exceeds the range of the sensor instead.
+# left 0.91 and more of what is left without it, and each of the others as much. A gyro's axis that is ten times too
+# large stays within the range of the sensor where the motion is slow; an accelerometer's does not, because of gravity.
 _SCALES = {
     f"{sensor}_{_AXES[axis]} times {factor:g}": np.where(np.arange(3) == axis, factor, 1.0)
-    for sensor in ("accel", "gyro")
+    for sensor, more in (("accel", (STANDARD_GRAVITY,)), ("gyro", (0.1, 10.0)))
     for axis in range(3)
-    for factor in (0.5, 2.0, _DEGREES, 1000.0)
+    for factor in (0.5, 2.0, _DEGREES, 1000.0, *more)
 }
 
 

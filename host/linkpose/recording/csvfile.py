@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -72,15 +73,18 @@ class CsvFile:
         """Goes on in a new file after FileChanged: run-2.csv for run.csv, or the next number that is free.
 
         The new file begins with the rows so far if the old one was removed, and with the head alone if another program
-        changed its content. Raises CannotWrite and FileError.
+        changed its content. Where the folder takes no new file, the system's folder for temporary files does: the rows
+        of a removed file are lost once it is closed. Raises CannotWrite and FileError.
         """
         has_all_rows = not is_changed(self._fd)
         before = self._fd  # stays in use where no new file can be created
-        for path in numbered(self._asked):
-            self.path = path
-            with contextlib.suppress(FileExists):
-                self._open(force=False)
-                break
+        try:
+            self._open_numbered(self._asked)
+        except CannotWrite:
+            with contextlib.suppress(FileNotFoundError):  # no such folder is there either
+                self._open_numbered(Path(tempfile.gettempdir(), self._asked.name))
+            if self._fd == before:
+                raise
         with os.fdopen(before, "rb") as old:
             if has_all_rows:
                 old.seek(0)
@@ -108,6 +112,14 @@ class CsvFile:
     def __exit__(self, *_: object) -> None:
         if self._fd >= 0:
             self._release()
+
+    def _open_numbered(self, path: Path) -> None:
+        """Creates the file, under the first of the further names for `path` that is free."""
+        for name in numbered(path):
+            self.path = name
+            with contextlib.suppress(FileExists):
+                self._open(force=False)
+                return
 
     def _open(self, force: bool) -> None:
         """Creates the file, and the one of the metadata beside it."""

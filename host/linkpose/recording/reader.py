@@ -29,6 +29,7 @@ from linkpose.wire.messages import DeviceFamily
 if TYPE_CHECKING:
     from linkpose.sensors.health import Change, HealthMonitor
 
+_INTERMITTENT = 0.1  # share of rows without a reading from which on an estimate is clearly worse
 MOST_CHANGES = 10  # of sensors' states, in the remarks
 # Rows that stay in memory: 83 min at 100 Hz, 70 MB without a second sensor. Doubling it doubles that memory, and files
 # of that length are read once instead of twice.
@@ -222,4 +223,17 @@ class RecordingFile:
         changes = sorted((c for c in self._changes if c.sensor in sensors), key=lambda change: change.time_s)
         remarks = [f"{self.path}: {change}" for change in changes[:MOST_CHANGES]]
         more = sum(count for sensor, count in self._change_counts.items() if sensor in sensors) - len(remarks)
-        return [*remarks, f"{self.path}: {more} more such changes"] if more else remarks
+        if more:
+            remarks.append(f"{self.path}: {more} more such changes")
+        return [*remarks, *(f"{self.path}: {sentence}" for sentence in self._intermittent(sensors))]
+
+    def _intermittent(self, sensors: set[str]) -> Iterator[str]:
+        """On inertial sensors without a reading in many rows, never in so many in succession that it is a change."""
+        for sensor, name in (("imu", "the IMU"), ("imu2", "the second IMU")):
+            health = self.health.get(sensor, {}) if sensor in sensors and not self._change_counts.get(sensor) else {}
+            invalid, rows = sum(health.get("invalid", {}).values()), health.get("samples", 0)
+            if invalid > _INTERMITTENT * rows:
+                yield (
+                    f"{name} has no valid reading in {invalid} of {rows} rows. Check its wiring and its supply; if "
+                    "another program put sensors of different rates into one table, delete the rows without a reading"
+                )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.recording.consistency import contradiction
 from linkpose.sensors.measurements import Floats, Measurements
@@ -36,6 +37,9 @@ _STRONGEST_M_S2 = 160.0  # the MPU-6050 reads up to 16 g, 156.9 m/s²
 _SPIKES = 0.001  # share of readings beyond these that are no wrong unit
 _TILTS_RAD_S = 0.1  # rms rate about horizontal axes at which gravity turns through the accelerometer's axes
 _LONGEST_STEP_S = 0.5
+# Of a sensor whose every reading is new, n changes in N rows have about n²/N in the row after another change. None at
+# all, where so many are expected, means that readings are repeated: chance gives e⁻¹⁰.
+_FEWEST_SUCCESSIVE = 10.0
 
 
 def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list[str]:
@@ -53,6 +57,8 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
         _rate(measurements.gyro_rad_s) or ("" if time or force else contradiction(measurements)),
         time,
         _pressure(_median(measurements.pressure_Pa)),
+        _repeated("baro_fresh", "pressure_Pa", measurements.baro_fresh, measurements.pressure_Pa[:, None]),
+        _repeated("mag_fresh", "mag_*", measurements.mag_fresh, measurements.mag_uT),
         _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
         _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
     ]
@@ -148,6 +154,19 @@ def _pressure(median_pa: float) -> str:
     if 0.5 * _AIR_PA < median_pa < _THIN_AIR_PA:
         return f"pressure_Pa is {median_pa:.0f} (median), as above 5100 m of altitude: check its unit and the sensor"
     return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS)
+
+
+def _repeated(flag: str, column: str, fresh: NDArray[np.bool_], values: Floats) -> str:
+    """A remark if readings are marked as new that repeat the row before: filters would count each of them again."""
+    known = fresh[1:] & fresh[:-1] & np.isfinite(values[1:] + values[:-1]).all(axis=1)
+    changes = (np.diff(values, axis=0) != 0).any(axis=1) & known
+    rows, count = np.count_nonzero(known), np.count_nonzero(changes)
+    if count**2 <= _FEWEST_SUCCESSIVE * rows or (changes[1:] & changes[:-1]).any():
+        return ""
+    return (
+        f"{flag} is 1 in {np.count_nonzero(fresh)} rows, and {column} changes in {count} of them: the others repeat a "
+        f"reading. Delete the column {flag}; each change then counts as a reading"
+    )
 
 
 def _temperature(name: str, median_deg_c: float) -> str:
