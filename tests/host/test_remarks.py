@@ -486,7 +486,7 @@ WITHOUT_ROW = (
     ", … corrupt", ", … invalid", ", … dropped by the board", "…: … applied, … rejected", "position error",
     "; heading … rad", "; … % of the errors", "at the end …", "(first at … s)", "median NIS", "; outliers raise",
     "Magnetic north is at", "it contradicted the other sensors", "Add a rest with", "Add rests in", "a ball joint",
-    "unknown inertial sensor", "x and y: they are 0", "the height: it is 0", "yaw: it is 0", "a constant current",
+    "unknown inertial sensor", "the second IMU", "x and y: they are 0", "the height: it is 0", "yaw: it is 0", "a constant current",
     "the speed of sound", "drift … m", "errors persist for", "a value too long to quote", "A sign test needs",
 )  # fmt: skip
 
@@ -500,10 +500,13 @@ def test_each_remark_of_the_program_is_on_the_page() -> None:
     missing = {
         of: where
         for of, where in found.items()
-        if not any(re.search(pattern(of), row) or re.fullmatch(pattern(row), of) for row in rows)
-        and not of.startswith(WITHOUT_ROW)
+        if not of.startswith(WITHOUT_ROW) and not any(has_all_parts(row, of) for row in rows)
     }
     assert not missing, f"host/docs/messages.md has no row for {missing}"
+
+
+def has_all_parts(row: str, of: str) -> bool:
+    return all(part.strip(" :;,.") in row for part in of.split("…"))
 
 
 STRINGS = {"str", "str | None", "list[str]", "Iterator[str]", "tuple[str, ...]"}
