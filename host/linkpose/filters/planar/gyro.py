@@ -42,8 +42,10 @@ _CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
 # Blocks after which hypotheses that both fit badly are dropped (10 s): neither a jump nor a slip.
 _PATIENCE_BLOCKS = 50
 # Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
-# both 1σ. Doubled: no visible change, as long as both are possible.
-_LOST_STD, _VEERING_STD = 0.25, 0.1
+# both 1σ. Of two mice 0.2 m apart, one that is turned by 10° shows 0.9 rad/m, one that is turned by 90° 5 rad/m. With
+# 0.1 rad/m, mice that were turned, or whose scale drifted, passed for jumps of the gyro, and the heading was lost.
+# Doubled: no change; a jump is found once the speed or the turn has changed.
+_LOST_STD, _VEERING_STD = 0.25, 5.0
 # Mice whose resolution has changed show the same share of the gyro's turn in two turns in a row: each of at least so
 # much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
 # (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
