@@ -16,9 +16,9 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
+import itertools
 import json
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -34,6 +34,7 @@ from unittest import mock
 
 sys.path[:0] = [str(Path(__file__).parent / "host"), str(Path(__file__).parents[1] / "host")]
 
+import child  # noqa: E402
 from fuzzing import READ, Target, check, commands, read_mutated, targets  # noqa: E402
 from hostile import INPUTS, KINDS, OUTPUTS, PLACES, valid_files, words  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
@@ -42,8 +43,9 @@ from mutations import mutate  # noqa: E402
 from linkpose.evaluation import markers  # noqa: E402
 
 LONGEST_S = 10  # of processor time: an answer to whether a reader hangs must not depend on what else runs
-LONGEST_WAIT_S = 60  # by the clock, for a reader that waits
+LONGEST_WAIT_S = 60  # for a reader that waits; a second in which this process was suspended for longer counts as one
 MOST_BYTES = 1 << 30
+PAIRS_PROGRESS = 100
 PROGRESS = 10_000  # inputs between two lines that tell how far a run has come
 DRAWN = 10  # of so many pictures that a command makes, one is drawn: that takes 100 times as long as reading its file
 
@@ -58,8 +60,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("names", nargs="*")
     chosen = parser.parse_args()
-    signal.signal(signal.SIGALRM, _alarm)
-    signal.signal(signal.SIGPROF, _alarm)
+    signal.signal(signal.SIGPROF, _too_long)
     failures = 0
     workers = SimpleNamespace(run=_Workers().run, TimeoutExpired=subprocess.TimeoutExpired)  # all that markers uses
     with tempfile.TemporaryDirectory() as folder, mock.patch.object(markers, "subprocess", workers):
@@ -78,54 +79,40 @@ def main() -> int:
 def _arguments(folder: Path) -> int:
     """All nasty inputs and outputs of hostile.py, each in a process of its own, as a user runs it."""
     (valid := folder / "valid").mkdir()
-    files, failures, slowest = valid_files(valid), 0, 0.0
+    files, failures = valid_files(valid), 0
     pairs = [(command, kind, make) for command in INPUTS.values() for kind, make in KINDS.items()]
     pairs += [(command, kind, make) for command in OUTPUTS.values() for kind, make in PLACES.items()]
-    for number, (command, kind, make) in enumerate(pairs):
+    ends: collections.Counter[int] = collections.Counter()
+    for number, (command, kind, make) in enumerate(pairs, 1):
         (own := folder / f"arguments-{number}").mkdir()
         make(at := own / "a.csv")
-        bad, shown = False, ""
+        done = _bounded(own, words(command, files, at))
+        ends[done.status] += 1
         try:
-            done, took = _bounded(words(command, files, at))
-            check(done.returncode, done.stderr)
-            bad, shown = took > LONGEST_S, f"{took:.1f} s of processor time"
-            slowest = max(slowest, took)
+            check(done.status, done.err)
         except AssertionError:
-            bad, shown = True, f"status {done.returncode}: {done.stderr[-300:]!r}"
-        except subprocess.TimeoutExpired:
-            bad, shown = True, "no end"
-        if bad:
             failures += 1
-            print(f"arguments: {command} with {kind}: {shown}", flush=True)
-    print(f"{'arguments':22} {len(pairs)} inputs, {failures} failures, slowest {slowest:.2f} s", flush=True)
+            print(f"arguments: {command} with {kind}: status {done.status}: {done.err[-300:]!r}", flush=True)
+        if number % PAIRS_PROGRESS == 0:
+            print(f"arguments: {number} of {len(pairs)}, {failures} failures", file=sys.stderr, flush=True)
+    print(f"{'arguments':24} {len(pairs)} inputs, {failures} failures, by status {dict(ends)}", flush=True)
     return failures
 
 
-def _bounded(arguments: list[str]) -> tuple[subprocess.CompletedProcess[str], float]:
-    """As _timed; once more where it took too long, as the first run compiles what is missing."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        done, took = _timed(arguments, LONGEST_WAIT_S)
-        if took <= LONGEST_S:
-            return done, took
-    return _timed(arguments, 5 * LONGEST_WAIT_S)
-
-
-def _timed(arguments: list[str], longest_s: float) -> tuple[subprocess.CompletedProcess[str], float]:
-    """A command in a process of its own, and the processor time that it took (s)."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(
-        [sys.executable, "-m", "linkpose", *arguments],
-        capture_output=True, text=True, timeout=longest_s, errors="replace", stdin=subprocess.DEVNULL,
-    )  # fmt: skip
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return done, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+def _bounded(folder: Path, arguments: list[str]) -> child.Ended:
+    """A command within the bounds; once more where it took too long, as the first run compiles what is missing."""
+    done = child.run(folder, arguments, longest_s=LONGEST_S, most_bytes=MOST_BYTES)
+    if done.status != -signal.SIGPROF:
+        return done
+    child.run(folder, arguments)
+    return child.run(folder, arguments, longest_s=LONGEST_S, most_bytes=MOST_BYTES)
 
 
 def _run(name: str, target: Target, inputs: int, seed: int) -> int:
     rng = random.Random(f"{name} {seed}")
     valid = target.valid.read_bytes()
     read_mutated(target, valid)  # compiles and imports
-    _limit_memory()
+    child.limit_memory(MOST_BYTES)
     failures, began, slowest = 0, time.monotonic(), 0.0
     kinds: collections.Counter[str] = collections.Counter()
     ends: collections.Counter[str] = collections.Counter()
@@ -150,7 +137,7 @@ def _run(name: str, target: Target, inputs: int, seed: int) -> int:
         slowest = max(slowest, time.process_time() - started)
         if (number + 1) % PROGRESS == 0 and number + 1 < inputs:
             print(f"{name}: {number + 1} of {inputs} inputs, {failures} failures", file=sys.stderr, flush=True)
-    _limit_memory(unlimited=True)
+    child.limit_memory(None)
     took = time.monotonic() - began
     read = ends.pop(READ, 0)
     most = "; ".join(f"{place} {count / inputs:.0%}" for place, count in ends.most_common(3))
@@ -165,8 +152,10 @@ def _run(name: str, target: Target, inputs: int, seed: int) -> int:
 @contextlib.contextmanager
 def _timers() -> Iterator[None]:
     """Raises TooLong when the body takes too long."""
+    seconds = itertools.count(1)
+    signal.signal(signal.SIGALRM, lambda *_: _too_long() if next(seconds) >= LONGEST_WAIT_S else None)
     signal.setitimer(signal.ITIMER_PROF, LONGEST_S)
-    signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S)
+    signal.setitimer(signal.ITIMER_REAL, 1, 1)
     try:
         yield
     finally:
@@ -218,6 +207,9 @@ class _Workers:
     """In place of `subprocess.run`."""
 
     def __init__(self) -> None:
+        self._start()
+
+    def _start(self) -> None:
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         self._process = subprocess.Popen([sys.executable, "-c", _WORKERS], **pipes)
 
@@ -225,21 +217,19 @@ class _Workers:
         assert self._process.stdin and self._process.stdout
         self._process.stdin.write(json.dumps([command[2], command[3:], timeout]))
         self._process.stdin.flush()
-        code, errors = json.loads(self._process.stdout.readline())
+        try:
+            code, errors = json.loads(self._process.stdout.readline())
+        except BaseException:  # the next answer would be that to this request
+            self._process.kill()
+            self._start()
+            raise
         if code == -signal.SIGPROF:
             raise subprocess.TimeoutExpired(command, timeout)
         return subprocess.CompletedProcess(command, code, "", errors)
 
 
-def _alarm(*_: object) -> None:
+def _too_long(*_: object) -> None:
     raise TooLong
-
-
-def _limit_memory(unlimited: bool = False) -> None:
-    """Address space: what is mapped now, and MOST_BYTES."""
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (hard if unlimited else used + MOST_BYTES, hard))
 
 
 def _keep(name: str, number: int, suffix: str, data: bytes) -> None:

@@ -22,9 +22,10 @@ PRELOADED = [
     "matplotlib.backends.backend_agg", "linkpose.plotting.tables", "linkpose.localization.localizer",
     "linkpose.localization.tuning", "linkpose.calibration.joint", "linkpose.filters.tilt", "scipy.optimize",
 ]  # fmt: skip
-# For a command that hangs: just below the limit of pytest, because the first command that uses a filter also waits for
-# its compiler, which takes more than a minute on a loaded machine.
-LONGEST_S = 240
+# Processor time of a command: whether it hangs must not depend on what else runs. The first command that uses a filter
+# also compiles it.
+LONGEST_S = 120.0
+LONGEST_WAIT_S = 600  # by the clock, above pytest's limit for a test: a command that waits for ever does not outlive it
 
 
 class Ended(NamedTuple):
@@ -47,13 +48,16 @@ def run(
     words: Sequence[object],
     streams: dict[int, str] | None = None,
     signalled: tuple[str, int] | None = None,
+    longest_s: float = LONGEST_S,
+    most_bytes: int | None = None,
 ) -> Ended:
     """Runs `linkpose WORDS` in a folder.
 
     `streams` maps numbers of standard streams to "closed", "full" or "gone" (a pipe whose reader has ended).
-    `signalled` names a function of the program, as MODULE.NAME, at whose first call this signal arrives.
+    `signalled` names a function of the program, as MODULE.NAME, at whose first call this signal arrives. SIGPROF
+    ends a command that takes longer (processor time). `most_bytes` bounds its memory beside what is imported.
     """
-    arguments = (str(folder), [str(word) for word in words], streams or {}, signalled)
+    arguments = (str(folder), [str(word) for word in words], streams or {}, signalled, longest_s, most_bytes)
     process = _context().Process(target=_main, args=arguments)
     process.start()
     process.join()
@@ -61,9 +65,19 @@ def run(
     return Ended(process.exitcode, out, err)
 
 
-def _main(folder: str, words: list[str], streams: dict[int, str], signalled: tuple[str, int] | None) -> None:
+def _main(
+    folder: str,
+    words: list[str],
+    streams: dict[int, str],
+    signalled: tuple[str, int] | None,
+    longest_s: float,
+    most_bytes: int | None,
+) -> None:
     """In the child: the process becomes the command."""
-    signal.alarm(LONGEST_S)
+    signal.setitimer(signal.ITIMER_PROF, longest_s)
+    signal.alarm(LONGEST_WAIT_S)
+    if most_bytes is not None:
+        limit_memory(most_bytes)
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         signal.signal(getattr(signal, name), signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL)
     os.chdir(folder)
@@ -76,6 +90,15 @@ def _main(folder: str, words: list[str], streams: dict[int, str], signalled: tup
     if signalled:
         _signal_at(*signalled)
     os._exit(_status())
+
+
+def limit_memory(most_bytes: int | None) -> None:
+    """Bounds the address space of this process to what is mapped now, and so much more; None lifts the bound."""
+    import resource  # Windows has none
+
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (hard if most_bytes is None else used + most_bytes, hard))
 
 
 def _redirect(number: int, name: str, kind: str) -> None:

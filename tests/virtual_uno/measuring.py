@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pty_server import PtyServer
 from wire_link import WireLink, us
 
 from linkpose.wire.messages import Configure, Sample, SampleFlags, Start
@@ -16,6 +17,13 @@ MOUSE_VALID = (SampleFlags.MOUSE1_VALID, SampleFlags.MOUSE2_VALID, SampleFlags.M
 DEFAULTS = Configure(100, 8, 1000, 3, 1, 8, 400)
 UP_MS = 1500.0  # from power-on until usual mice stream
 PATIENCE_S = 600.0  # a bound for a command that hangs, on a loaded machine, never a wait
+
+
+def lateness(server: PtyServer, budget_s: float) -> str:
+    """What a test against the clock says when it fails: how late the board was, and how late it may be."""
+    late_s = server.statistics.max_late_s
+    verdict = "missed its budget" if late_s > budget_s else "kept within its budget"
+    return f"the board was up to {late_s:.2f} s behind the clock: the test {verdict} of {budget_s} s"
 
 
 def path(seconds: float, seed: int, top_speed_mm_s: float = 1000.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -24,6 +24,26 @@ _FLAT_OUT_SLICE_S = 0.01
 _LONGEST_RUN_S = 0.05  # so that commands and bytes from the host get through when the emulation lags
 
 
+_LONGEST_STEP_S = 0.01
+
+
+class PatientClock:
+    """The wall clock without the time that the machine kept from this process: a step at most from look to look.
+
+    A machine that is suspended, or busy with something else, makes the board slow with it. By the wall clock, the board
+    would send all at once afterwards, faster than a host can read. For hosts that go by the board's time.
+    """
+
+    def __init__(self) -> None:
+        self._time_s, self._looked_s = 0.0, time.monotonic()
+
+    def __call__(self) -> float:
+        now_s = time.monotonic()
+        self._time_s += min(now_s - self._looked_s, _LONGEST_STEP_S)
+        self._looked_s = now_s
+        return self._time_s
+
+
 @dataclass
 class PtyStatistics:
     """How the serving went."""

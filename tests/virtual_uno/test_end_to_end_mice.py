@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from measuring import MICE
-from pty_server import PtyServer
+from pty_server import PatientClock, PtyServer
 from rig_signals import RigFeed
 from test_end_to_end import linkpose, rms
 from wire_link import WireLink
@@ -27,8 +27,9 @@ def test_live_velocities_from_three_mice(board: Callable[..., WireLink], tmp_pat
     uno = board(mice=MICE[:3]).uno
     uno.run_ms(1000)  # the mice have had their power for a while when a host opens the port
     feed = RigFeed(uno, run)
-    with PtyServer(uno, tmp_path / "port", on_slice=feed.supply, on_open=feed.restart) as server:
-        source = ["--live", "--port", server.link, "--duration", 5]
+    port = tmp_path / "port"
+    with PtyServer(uno, port, on_slice=feed.supply, on_open=feed.restart, clock=PatientClock()):
+        source = ["--live", "--port", port, "--duration", 5]
         done = linkpose("estimate", *source, "--filter", "mice", "--rig", rig, "-o", out)
     assert done.returncode == 0, done.stderr
     columns = read_table(out, "estimate").columns
