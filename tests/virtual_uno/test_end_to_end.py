@@ -48,7 +48,9 @@ def served(board: Callable[..., WireLink], tmp_path: Path) -> Iterator[PtyServer
 
 
 def serve(uno: VirtualUno, feed: RigFeed, folder: Path) -> PtyServer:
-    return PtyServer(uno, folder / "port", on_slice=feed.supply, on_open=feed.restart, clock=PatientClock())
+    server = PtyServer(uno, folder / "port", on_slice=feed.supply, on_open=feed.restart, clock=PatientClock())
+    server.waits_for_host = True
+    return server
 
 
 def rows_of(path: Path) -> list[str]:
@@ -56,7 +58,10 @@ def rows_of(path: Path) -> list[str]:
 
 
 def test_live_estimates_from_the_real_firmware(served: PtyServer, tmp_path: Path) -> None:
-    """Nothing lost, heights near the truth, and the replay gives the same digits."""
+    """Nothing lost, heights near the truth, and the replay gives the same digits.
+
+    The rig is in motion when the stream starts, and how fast the host is decides at which place.
+    """
     live, recording, raw, replay = (tmp_path / name for name in ("live.csv", "rec.csv", "raw.bin", "replay.csv"))
     source = ["--live", "--port", served.link, "--duration", 8, "--record", recording, "--raw", raw]
     done = linkpose("estimate", *source, "-o", live, *J2S, *LINK_FILTERS, "--json")
@@ -67,17 +72,25 @@ def test_live_estimates_from_the_real_firmware(served: PtyServer, tmp_path: Path
     assert linkpose("estimate", recording, "-o", replay, *J2S, *LINK_FILTERS).returncode == 0
     assert rows_of(replay) == rows_of(live)
     estimate = read_table(live, "estimate")
-    assert rms(height_error(estimate.columns["time_s"], estimate.columns["joint_height_m"])) < 0.011
+    start_s, error = height_error(estimate.columns["time_s"], estimate.columns["joint_height_m"])
+    assert rms(error) < 0.011, f"the stream began {start_s:.1f} s after the reset; the budget is {START_BUDGET_S} s"
     assert linkpose("estimate", raw, *J2S, *LINK_FILTERS).stdout.count("\n") > 790
 
 
-def height_error(time_s: np.ndarray, height_m: np.ndarray) -> np.ndarray:
-    """Error (m) against the rig's truth, at the shift in time that fits best: the rig moved since the board's reset."""
+START_BUDGET_S = 2.5  # a later start meets the rig in faster motion, which the filter needs seconds to get over
+LONGEST_START_S = 20.0  # from the board's reset to the stream, with a slow host
+
+
+def height_error(time_s: np.ndarray, height_m: np.ndarray) -> tuple[float, np.ndarray]:
+    """Start of the stream after the rig's (s), as it fits the truth best, and the errors (m) there.
+
+    The rig moves since the board's reset.
+    """
     run = LinkRun(test=1, seed=0, duration_s=None)
-    shifts = np.arange(0.0, 3.0, 0.002)
+    shifts = np.arange(0.0, LONGEST_START_S, 0.002)
     errors = [height_m[::10] - run.at(time_s[::10] + shift).height_m for shift in shifts]
     best = shifts[int(np.argmin([rms(error) for error in errors]))]
-    return np.asarray(height_m - run.at(time_s + best).height_m)
+    return float(best), np.asarray(height_m - run.at(time_s + best).height_m)
 
 
 def rms(values: np.ndarray) -> float:
@@ -91,7 +104,7 @@ def test_info_tells_what_the_board_is(served: PtyServer) -> None:
     assert info["sensors"] == ["mpu6050", "bmp180"]
     assert (info["protocol"], info["sample_rate_hz"], info["mice"]) == ("2.0", 100, [])
     assert (info["samples_lost"], info["frames_corrupt"], info["self_test"]) == (0, 0, "passed")
-    assert info["board"]["stack_free"] >= 400
+    assert info["board"]["stack_free_bytes"] >= 400
 
 
 BUDGET_S = 0.05  # the drift is that of the board as long as the machine runs it in time
@@ -184,7 +197,7 @@ def test_the_angle_of_a_chain_from_two_sensors_on_one_board(board: Callable[...,
     found = read_table(estimate, "estimate").columns
     late = found["time_s"] > 7
     time_s, angle, std = (found[name][late] for name in ("time_s", "chain_angle_deg", "chain_angle_std_deg"))
-    shifts = np.arange(0.0, 3.0, 0.01)  # the rig moved since the board's reset
+    shifts = np.arange(0.0, LONGEST_START_S, 0.01)  # the rig moved since the board's reset
     errors = [angle - run.truth_columns(time_s + shift)["angle_deg"] for shift in shifts]
     error = min((e - e.mean() for e in errors), key=rms)  # counted from the first sample, which may be in motion
     assert rms(error) < 1.0 < 5.0 < np.ptp(angle) and (std < 5.0).all()

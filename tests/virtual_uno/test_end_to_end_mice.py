@@ -36,7 +36,7 @@ def test_live_velocities_from_three_mice(board: Callable[..., WireLink], tmp_pat
     time_s, vx = columns["time_s"], columns["mice_vx_m_s"]
     settled = time_s > 1.5  # the mice are set up by then
     assert np.isfinite(vx[settled]).all()
-    shifts = np.arange(0.0, 4.0, 0.005)
+    shifts = np.arange(0.0, 20.0, 0.005)  # from the board's reset to the stream, with a slow host
     errors = [rms(vx[settled] - run.at(time_s[settled] + shift).vx_m_s) for shift in shifts]
     assert min(errors) < 0.02
     assert rms(vx[settled]) > 5 * min(errors)
