@@ -151,6 +151,7 @@ def test_a_mistyped_port_is_answered_with_the_nearest(
     [
         ("simulate link", ("-o", "--truth")),
         ("simulate mice", ("-o", "--truth")),
+        ("simulate chain", ("-o", "--truth", "--rig")),
         ("simulate indoor", ("-o", "--truth", "--map")),
         ("simulate underwater", ("-o", "--truth", "--beacons")),
     ],
