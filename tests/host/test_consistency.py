@@ -166,6 +166,33 @@ def test_all_outputs_are_checked_before_one_is_written(
     assert list(tmp_path.iterdir()) == [last] and last.read_text() == "kept"
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "estimate {recording} -o {output}",
+        "estimate --live --port sim://link -o {output}",
+        "estimate --live --port sim://link --record {output}",
+        "localize {recording} --beacons {recording} -o {output}",
+    ],
+)
+@pytest.mark.parametrize(("output", "why"), [("kept.csv", "exists already"), ("none/e.csv", "there is no folder")])
+def test_an_output_is_checked_before_the_work(
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, output: str, why: str
+) -> None:
+    """Filters were compiled, and a log was localized, before the sentence came."""
+
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("the work began")
+
+    for name in ("linkpose.recording.reader.RecordingFile", "linkpose.localization.paths.prepare"):
+        monkeypatch.setattr(name, work)
+    monkeypatch.setattr("linkpose.board.open_session", work)
+    (tmp_path / "kept.csv").write_text("kept")
+    named = {"recording": tmp_path / "r.csv", "output": tmp_path / output}
+    assert why in refused(*(word.format(**named) for word in command.split()))
+    assert (tmp_path / "kept.csv").read_text() == "kept"
+
+
 def test_a_table_is_not_cut_where_it_is_piped(capsys: pytest.CaptureFixture[str]) -> None:
     table = Table("filter", *(f"error {at}" for at in range(9)))
     table.add_row("planar-ekf", *["-0.000275"] * 9)
