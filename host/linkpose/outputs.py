@@ -15,11 +15,11 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from linkpose.errors import CannotWrite, FileChanged, FileError, FileExists
+from linkpose.errors import CannotWrite, FileChanged, FileError, FileExists, NamedTwice
 
 STDOUT = Path("-")  # as an output: the standard output
 _BINARY = getattr(os, "O_BINARY", 0)
@@ -29,6 +29,25 @@ _NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP, errno.EROFS)  # what fsync gives for
 def numbered(path: Path) -> Iterator[Path]:
     """Further names for a file: run-2.csv, run-3.csv and so on for run.csv."""
     return (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+
+
+def check_outputs(paths: Iterable[Path], force: bool) -> None:
+    """Raises FileError where two of the files are one, one exists and `force` is not set, or has no folder.
+
+    Called before the work whose results the files take: nobody waits for minutes to learn that a file exists.
+    """
+    named = [path if path == STDOUT else path.absolute() for path in paths]
+    for path in named:
+        if named.count(path) > 1:
+            raise NamedTwice(path)
+        if path == STDOUT:
+            continue
+        if path.is_dir():
+            raise CannotWrite(path, "it is a folder")
+        if path.is_file() and not force:
+            raise FileExists(path)
+        if not path.parent.is_dir():
+            raise CannotWrite(path, f"there is no folder {path.parent}")
 
 
 def create(path: Path, force: bool) -> int:

@@ -151,6 +151,7 @@ def test_a_mistyped_port_is_answered_with_the_nearest(
     [
         ("simulate link", ("-o", "--truth")),
         ("simulate mice", ("-o", "--truth")),
+        ("simulate chain", ("-o", "--truth", "--rig")),
         ("simulate indoor", ("-o", "--truth", "--map")),
         ("simulate underwater", ("-o", "--truth", "--beacons")),
     ],
@@ -163,6 +164,33 @@ def test_all_outputs_are_checked_before_one_is_written(
     typed = [word for at, option in enumerate(outputs) for word in (option, tmp_path / f"{at + 3 - len(outputs)}.csv")]
     assert "2.csv exists already" in refused(*command.split(), *typed)
     assert list(tmp_path.iterdir()) == [last] and last.read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "estimate {recording} -o {output}",
+        "estimate --live --port sim://link -o {output}",
+        "estimate --live --port sim://link --record {output}",
+        "localize {recording} --beacons {recording} -o {output}",
+    ],
+)
+@pytest.mark.parametrize(("output", "why"), [("kept.csv", "exists already"), ("none/e.csv", "there is no folder")])
+def test_an_output_is_checked_before_the_work(
+    refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, output: str, why: str
+) -> None:
+    """Filters were compiled, and a log was localized, before the sentence came."""
+
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("the work began")
+
+    for name in ("linkpose.recording.reader.RecordingFile", "linkpose.localization.paths.prepare"):
+        monkeypatch.setattr(name, work)
+    monkeypatch.setattr("linkpose.board.open_session", work)
+    (tmp_path / "kept.csv").write_text("kept")
+    named = {"recording": tmp_path / "r.csv", "output": tmp_path / output}
+    assert why in refused(*(word.format(**named) for word in command.split()))
+    assert (tmp_path / "kept.csv").read_text() == "kept"
 
 
 def test_a_table_is_not_cut_where_it_is_piped(capsys: pytest.CaptureFixture[str]) -> None:
@@ -202,14 +230,14 @@ def test_a_dash_is_the_standard_output(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("encoding", ["cp1252", "cp437"])
+@pytest.mark.parametrize("encoding", ["cp1252", "cp437", "cp949", "ascii"])
 def test_a_terminal_without_greek_letters_gets_a_replacement(encoding: str) -> None:
     done = run("evaluate", "--help", PYTHONIOENCODING=encoding)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
     assert b"has a standard deviation s," in b" ".join(done.stdout.split()) or "σ".encode(encoding, "replace") != b"?"
-    assert b"?" not in done.stdout
+    assert b"?" not in done.stdout and done.stdout.decode(encoding)
     refused = run("estimate", "σ.csv", "--j2s", "σ", PYTHONIOENCODING=encoding)
-    assert refused.returncode == 2 and b"Traceback" not in refused.stderr
+    assert refused.returncode == 2 and b"Traceback" not in refused.stderr and refused.stderr.decode(encoding)
 
 
 def test_every_picture_format_is_in_the_help(linkpose) -> None:

@@ -13,6 +13,7 @@ from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
+from linkpose.experiments.mice import PaperRun
 from linkpose.experiments.variants import Variant
 from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
@@ -374,7 +375,7 @@ COLUMN_INCHES = 3.46  # 88 mm
 
 
 def every_figure(tmp_path):
-    """A link, a robot and their evaluations, each with its truth."""
+    """A link, a robot and their evaluations, each with its truth; the mice of the paper."""
     link = link_files(tmp_path)
     t = np.arange(400) / 100
     pose = {"x_m": np.sin(t), "y_m": 1 - np.cos(t), "heading_rad": (t + np.pi) % (2 * np.pi) - np.pi}
@@ -388,6 +389,8 @@ def every_figure(tmp_path):
     for files in (link, link[:1], robot, robot[:1]):
         yield plotting.plot_tables(files)[0]
     yield from (plotting.evaluation(evaluate(*files), "e.csv", "t.csv") for files in (link, robot))
+    run = PaperRun(t, np.ones((400, 3, 3)) + np.sin(t)[:, None, None], np.ones((400, 3)), np.array([0.01, 0.01, 0.0]))
+    yield plotting.redundant_mice(run)
 
 
 @pytest.mark.filterwarnings("error")
@@ -406,6 +409,7 @@ def test_pictures_have_the_width_of_a_page_and_nothing_overlaps_or_is_cut(tmp_pa
             parts = [axes.bbox, axes.yaxis.label.get_window_extent(renderer)]
             parts += [legend.get_window_extent(renderer)] if (legend := axes.get_legend()) else []
             others = [other.bbox for other in panels if other is not axes]
+            assert axes.get_legend() is None or (not axes.get_title() and not axes.get_title(loc="left"))
             for part in parts:
                 assert whole.x0 - 1 <= part.x0 and part.x1 <= whole.x1 + 1 and part.y1 <= whole.y1 + 1, axes
                 assert not any(part.padded(-1).overlaps(other) for other in others), (axes.get_ylabel(), part)

@@ -6,8 +6,12 @@ Each is replaced by one like it: a minus sign stays a minus sign, and tables kee
 from __future__ import annotations
 
 import codecs
+import io
 
 ERRORS = "linkpose"  # name of the error handler, for `errors=` of a stream
+# ASCII under a name of our own. click writes UTF-8 to the file under a stream of a known ASCII encoding, past the
+# replacements of this module and past the failures that `streams` handles.
+ASCII = "linkpose_ascii"
 _ALIKE = str.maketrans("−–—─└├┤│▸·…σχλωαβκηπΔµ²³×√‖≤≥≈→«»“”’", "----`|||>-.sxlwabknpDu23xV|<>~><>\"\"'") | {
     ord("±"): "+/-", ord("°"): " deg",
 }  # fmt: skip
@@ -40,6 +44,23 @@ def _handle(error: UnicodeError) -> tuple[str | bytes, int]:
     return replacement(error.object[error.start : error.end]), error.end
 
 
+def _find_codec(name: str) -> codecs.CodecInfo | None:
+    if name != ASCII:
+        return None
+    plain = codecs.lookup("ascii")
+    return codecs.CodecInfo(
+        plain.encode, plain.decode, plain.streamreader, plain.streamwriter, plain.incrementalencoder,
+        plain.incrementaldecoder, name=ASCII,
+    )  # fmt: skip
+
+
+def prepare(stream: io.TextIOWrapper) -> None:
+    """Lets the stream replace the characters that its encoding lacks."""
+    is_ascii = codecs.lookup(stream.encoding).name == "ascii"
+    stream.reconfigure(encoding=ASCII if is_ascii else None, errors=ERRORS)
+
+
 def register() -> None:
-    """Makes ERRORS known to Python."""
+    """Makes ERRORS and ASCII known to Python."""
     codecs.register_error(ERRORS, _handle)
+    codecs.register(_find_codec)

@@ -126,6 +126,7 @@ def command(
     """
     from linkpose.cli.estimate_live import estimate_live
     from linkpose.cli.live import Console, refuse_same_file
+    from linkpose.outputs import check_outputs
 
     if is_live == (recording is not None):
         both = f"--live estimates from the board: leave out {recording}, or leave out --live"
@@ -144,6 +145,7 @@ def command(
     page.check()
     refuse_same_file(output, record, raw, source=recording)
     options.refuse_mixed_output(output, json_lines)
+    check_outputs([path for path in (output, record, raw) if path is not None], force)
     joint = options.joint_from(joint, j2s_std)
     request = Request(
         output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page, chain_joint, mag

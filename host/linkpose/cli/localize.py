@@ -312,6 +312,7 @@ def command(
     from linkpose.localization.paths import prepare
     from linkpose.localization.surroundings import Surroundings
     from linkpose.localization.tables import read_truth
+    from linkpose.outputs import check_outputs
 
     truth = read_truth(truth_path) if truth_path else None
     if picture is not None:
@@ -320,6 +321,7 @@ def command(
 
         check_output(picture, force, FORMATS)
     options.refuse_mixed_output(output, json_lines)
+    check_outputs([output] if output is not None else [], force)
     prepared = prepare(log, map_path, beacons_path, odometry_path, methods, chosen)
     for remark in prepared.remarks:
         console.report(remark)

@@ -49,8 +49,9 @@ def command(
     The first link hangs from a joint, like a thigh from the hip. The recording states the kind of the joint
     between the links, not how the sensors are mounted; --rig writes the mounting into a rig file.
     """
+    from linkpose.outputs import check_outputs
     from linkpose.simulation.chain import ChainRun
-    from linkpose.simulation.export import check_length, check_outputs, write_chain
+    from linkpose.simulation.export import check_length, write_chain
 
     check_outputs((output, truth, *([rig_file] if rig_file else [])), force)
     check_length(duration, rate)

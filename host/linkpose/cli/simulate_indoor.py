@@ -44,7 +44,8 @@ def command(
     quiet: bool,
 ) -> None:
     """Simulate a log of a robot with odometry and a laser scanner on a floor of 100 x 40 m, its map and its truth."""
-    from linkpose.simulation.export import check_outputs, write_indoor
+    from linkpose.outputs import check_outputs
+    from linkpose.simulation.export import write_indoor
     from linkpose.simulation.indoor import IndoorErrors, simulate_indoor
 
     map_file = map_file or output.with_suffix(".yaml")

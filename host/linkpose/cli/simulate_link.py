@@ -56,7 +56,8 @@ def command(
     quiet: bool,
 ) -> None:
     """Simulate a recording of the link paper's rig, and its truth."""
-    from linkpose.simulation.export import check_length, check_outputs, write_link
+    from linkpose.outputs import check_outputs
+    from linkpose.simulation.export import check_length, write_link
     from linkpose.simulation.link import LinkRun
 
     if rests and still:

@@ -64,7 +64,8 @@ def command(
     quiet: bool,
 ) -> None:
     """Simulate a recording of a robot with optical mice under it, and its truth."""
-    from linkpose.simulation.export import check_length, check_outputs, write_mice
+    from linkpose.outputs import check_outputs
+    from linkpose.simulation.export import check_length, write_mice
     from linkpose.simulation.mice import Fault, MiceRun, ring
 
     check_outputs((output, truth), force)

@@ -64,7 +64,8 @@ def command(
 
     Prints the statistics of the noise as set and as computed from the log.
     """
-    from linkpose.simulation.export import check_outputs, write_underwater
+    from linkpose.outputs import check_outputs
+    from linkpose.simulation.export import write_underwater
     from linkpose.simulation.underwater import UnderwaterErrors, self_check, simulate_underwater
 
     beacons = beacons or output.with_name(f"{output.stem}_beacons.csv")

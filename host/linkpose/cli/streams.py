@@ -117,7 +117,7 @@ def safe_streams() -> Iterator[None]:
     characters.register()
     for stream in before:  # a code page without σ or −, as on Windows: a character is replaced, nothing fails
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors=characters.ERRORS)
+            characters.prepare(stream)
     nowhere = open(os.devnull, "w", encoding="utf-8") if sys.stderr is None else None  # noqa: SIM115, PTH123
     sys.stdout = cast(TextIO, _Closed() if sys.stdout is None else _Results(sys.stdout))
     sys.stderr = cast(TextIO, _Messages(nowhere or before[1]))

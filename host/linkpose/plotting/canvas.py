@@ -136,8 +136,11 @@ def label_time(axes: Axes) -> None:
         )
 
 
-def legend_above(axes: Axes, best_first: Sequence[str] = ()) -> None:
-    """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest."""
+def legend_above(axes: Axes, best_first: Sequence[str] = (), title: str = "") -> None:
+    """A legend above the axes, where it hides nothing: the reference, the filters from the best on, then the rest.
+
+    `title` is above the legend.
+    """
     rank = {label: i for i, label in enumerate(best_first)}
 
     def place(item: tuple[object, str]) -> int:
@@ -151,7 +154,7 @@ def legend_above(axes: Axes, best_first: Sequence[str] = ()) -> None:
         axes.legend(
             [once[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
             frameon=False, fontsize=SMALL_LETTERING, borderaxespad=0.2, borderpad=0.2, handlelength=_HANDLE - 0.8,
-            columnspacing=1.0,
+            columnspacing=1.0, title=title or None, title_fontsize=LETTERING, alignment="left",
         )  # fmt: skip
 
 

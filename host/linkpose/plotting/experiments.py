@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import LETTERING, OTHERS, TRUTH, finish, legend_above, line_style, new_figure
+from linkpose.plotting.canvas import OTHERS, TRUTH, finish, legend_above, line_style, new_figure
 from linkpose.plotting.lines import draw
 from linkpose.sensors.measurements import Floats
 
@@ -75,8 +75,7 @@ def redundant_mice(run: PaperRun) -> Figure:
             finish(place, "")
         axes[j, 0].set_ylabel(label)
     for place, title in zip(axes[0], ("Each mouse alone (Figure 2)", "Least squares (Figure 3)"), strict=True):
-        place.set_title(title, fontsize=LETTERING, loc="left", pad=18)
-        legend_above(place)
+        legend_above(place, title=title)
     for place in axes[-1]:
         place.set_xlabel("time (s)")
         place.set_xlim(0, _MICE_SHOWN_S)

@@ -5,17 +5,17 @@ Each function checks all of its files before it writes the first.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from linkpose.errors import CannotWrite, FileExists, LinkposeError, NamedTwice
+from linkpose.errors import LinkposeError
 from linkpose.localization.carmen import format_reading
 from linkpose.localization.events import HEADER, Event, format_event, write_lines
 from linkpose.localization.maps import save_map
-from linkpose.outputs import STDOUT
+from linkpose.outputs import check_outputs
 from linkpose.recording.truth import write_truth, write_truth_blocks
 from linkpose.recording.writer import write_recording
 from linkpose.sensors.measurements import Floats
@@ -29,22 +29,6 @@ from linkpose.wire.messages import Configure
 
 MOST_SAMPLES = 10_000_000  # of a simulated run: 27 h at 100 Hz, some 2 GB of CSV
 _BLOCK = 50_000  # samples of the truth in memory at once
-
-
-def check_outputs(paths: Iterable[Path], force: bool) -> None:
-    """Raises FileError where two of the files are one, one exists and `force` is not set, or has no folder."""
-    named = [path if path == STDOUT else path.absolute() for path in paths]
-    for path in named:
-        if named.count(path) > 1:
-            raise NamedTwice(path)
-        if path == STDOUT:
-            continue
-        if path.is_dir():
-            raise CannotWrite(path, "it is a folder")
-        if path.is_file() and not force:
-            raise FileExists(path)
-        if not path.parent.is_dir():
-            raise CannotWrite(path, f"there is no folder {path.parent}")
 
 
 def check_length(duration_s: float, rate_hz: float) -> None:
