@@ -245,6 +245,23 @@ def test_a_negative_sigma_is_refused():
 DRIVE = {"vx_m_s": 0.3 + 0.2 * np.sin(T), "wz_rad_s": np.cos(0.8 * T), "heading_rad": np.sin(0.8 * T) / 0.8 + 2 * T}
 
 
+@pytest.mark.parametrize("part", [None, "qw", "qx", "qy", "qz"])
+@pytest.mark.parametrize("factor", [0.0, 2.0, 10.0])
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_a_quaternion_that_is_no_rotation_is_named(part, factor, is_ours):
+    """The error angle was that of its direction, in silence."""
+    half = np.column_stack([0.4 * np.sin(T), 0.3 * np.cos(0.8 * T), 0.3 * np.sin(0.7 * T)])
+    right = dict(zip(("qw", "qx", "qy", "qz"), [np.sqrt(1 - (half**2).sum(axis=1)), *half.T], strict=True))
+    wrong = right | ({} if part is None else {part: factor * right[part]})
+    ours, theirs = (wrong, right) if is_ours else (right, wrong)
+    found = evaluate(
+        table(**{f"chain_{name}": value for name, value in ours.items()}), table("truth", **theirs)
+    ).remarks
+    named = [remark for remark in found if "are no rotation, whose length is 1: check these columns" in remark]
+    assert len(named) == (part is not None)
+    assert all(("chain_qw to chain_qz" in remark) == is_ours for remark in named)
+
+
 @pytest.mark.parametrize("seconds", [1, 2])
 def test_odometry_and_a_truth_with_other_times_are_named(seconds):
     """The truth states twice the time."""

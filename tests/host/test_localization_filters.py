@@ -481,3 +481,10 @@ def test_smoothing_lowers_the_error_in_a_silence_of_the_beacons():
         errors.append(np.sqrt(np.mean(np.sum(error**2, axis=1))))
         assert np.mean(np.abs(error) < 2 * track.std[rows, :2]) > 0.9
     assert errors[1] < 0.85 * errors[0]
+
+
+@pytest.mark.parametrize("probability", [1e-300, 5e-324])
+@pytest.mark.parametrize("degrees", [1, 2, 5])
+def test_the_quantile_of_a_vanishing_probability_is_a_vanishing_number(probability: float, degrees: int) -> None:
+    """`--gate 1e-300` ended with "math domain error"."""
+    assert 0.0 < chi_square_quantile(probability, degrees) < 1e-100

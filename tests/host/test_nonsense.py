@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -210,6 +211,16 @@ def test_an_impossible_value_is_refused_with_its_line(
     with pytest.raises(FileFormatError) as caught:
         remarks(tmp_path, change)
     assert sentence in str(caught.value)
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "1e200", "NaN", '"100"', "9" * 400, "[]", "100"])
+def test_an_impossible_rate_in_the_metadata_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: str
+) -> None:
+    """It was passed over in silence."""
+    monkeypatch.setattr(sys.modules[__name__], "HEAD", HEAD.replace("100", rate))
+    found = remarks(tmp_path, lambda table: None)
+    assert ("sample_rate_hz in the metadata is" in found) == (rate != "100")
 
 
 IMU2 = {f"imu2_{name}": name for name in NAMES[1:7]}

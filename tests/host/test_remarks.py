@@ -315,6 +315,9 @@ REMARKS: dict[str, str | Producer] = {
     "…, line …: a spreadsheet damaged the metadata; the settings and the rig in it are not used": loaded(
         f"# linkpose recording 1\n# {{,,,,,,\n{PLAIN}{ROWS}"
     ),
+    "…: sample_rate_hz in the metadata is …, which no sampling rate is; the rate is taken from time_s": loaded(
+        f'# linkpose recording 1\n# {{"settings": {{"sample_rate_hz": 0}}}}\n{PLAIN}{ROWS}'
+    ),
     "…: times are the board's own, because a raw capture holds no other clock": loaded(capture(str), "r.bin"),
     "…: … corrupt frames left out": loaded(capture(damage), "r.bin"),
     "…: … samples lost in … gaps": loaded(capture(leave_out), "r.bin"),
@@ -418,6 +421,7 @@ REMARKS: dict[str, str | Producer] = {
     "…: … is the same wherever the estimates move: check the column and the times": compared(
         moving("time_s,tilt_height_m"), moving("time_s,height_m", 0.0)
     ),
+    "…: … are no rotation, whose length is 1: check these columns": "test_evaluation_sigma.py::test_a_quaternion_that_is_no_rotation_is_named",
     "…: markers left out as unlabeled: …": "test_evaluation.py::test_an_unlabeled_marker_is_left_out_and_said",
     "…: markers left out: …": take(four_markers(), "a.trc"),
     "…: the markers are …": take(four_markers(), "a.trc"),
@@ -486,7 +490,7 @@ WITHOUT_ROW = (
     ", … corrupt", ", … invalid", ", … dropped by the board", "…: … applied, … rejected", "position error",
     "; heading … rad", "; … % of the errors", "at the end …", "(first at … s)", "median NIS", "; outliers raise",
     "Magnetic north is at", "it contradicted the other sensors", "Add a rest with", "Add rests in", "a ball joint",
-    "unknown inertial sensor", "the second IMU", "x and y: they are 0", "the height: it is 0", "yaw: it is 0", "a constant current",
+    "unknown inertial sensor", "the second IMU", "…_qw to …_qz", "x and y: they are 0", "the height: it is 0", "yaw: it is 0", "a constant current",
     "the speed of sound", "drift … m", "errors persist for", "a value too long to quote", "A sign test needs",
 )  # fmt: skip
 

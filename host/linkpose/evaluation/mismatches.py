@@ -21,6 +21,7 @@ _MIRRORED = 0.8  # correlation, negated
 _ALIKE = 0.98
 _NEAR = 0.05
 _UNITS = (0.5, 2.0, np.pi / 180, 180 / np.pi, 0.001, 1000.0, 0.01, 100.0, -1.0)
+_LENGTH, _FEW_OUTSIDE = 0.01, 0.9  # of a quaternion: files with 3 decimals are off by 0.001; share of rows within
 _STILL = 1e-3  # share of the estimate's motion; errors of a still reference are far below it
 _FEWEST = 20  # instants; fewer correlate by chance
 _MOVES_RAD, _MOVES_M = 0.1, 0.05  # standard deviations (rad; m, m/s or rad/s) of estimates that are no error alone
@@ -34,7 +35,11 @@ def mismatches(
     `compared` has the filters by name; `offset_s` and `residual` are those of `common_offset`.
     """
     found = _of_frames(estimate, reference, compared.values(), residual, offset_s)
-    return [*found, *_of_units(estimate, reference, compared, offset_s)]
+    return [
+        *found,
+        *_of_quaternions(estimate, reference, compared),
+        *_of_units(estimate, reference, compared, offset_s),
+    ]
 
 
 def _of_frames(
@@ -96,6 +101,19 @@ def _of_units(estimate: Table, reference: Table, compared: Mapping[str, Compared
                 f"{reference.path}: {quantity.column} is the same wherever the estimates move: check the column and "
                 "the times"
             )
+
+
+def _of_quaternions(estimate: Table, reference: Table, compared: Mapping[str, Compared]) -> Iterator[str]:
+    """One sentence for each file whose quaternions are no rotations: the error angle would be of their direction."""
+    for number, table in enumerate((estimate, reference)):
+        for name, both in compared.items():
+            parts = [both.pairs[q][number].value for q in CHAIN_ROTATION if q in both.pairs]
+            lengths = np.sqrt(np.sum(np.square(parts), axis=0)) if len(parts) == len(CHAIN_ROTATION) else np.empty(0)
+            known = lengths[np.isfinite(lengths)]
+            if len(known) and np.quantile(np.abs(known - 1), _FEW_OUTSIDE) > _LENGTH:
+                columns = f"{name}_qw to {name}_qz" if number == 0 else "qw to qz"
+                yield f"{table.path}: {columns} are no rotation, whose length is 1: check these columns"
+                break
 
 
 def _ratio(quantity: Quantity, both: Compared, offset_s: float) -> float | None:

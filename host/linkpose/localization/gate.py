@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ def chi_square_quantile(probability: float, degrees: int) -> float:
     low, high = 0.0, 1.0
     while _chi_square_cdf(high, degrees) < probability:
         high *= 2.0
-    while high - low > 1e-12 * high:
+    while high - low > max(1e-12 * high, sys.float_info.min):  # the quantile of 1e-300 is no number that a float can be
         middle = 0.5 * (low + high)
         low, high = (middle, high) if _chi_square_cdf(middle, degrees) < probability else (low, middle)
     return high

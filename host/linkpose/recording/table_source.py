@@ -82,6 +82,12 @@ class TableSource:
             )
         elif not self._file.closing:
             found.append(f"{self._path} has no closing line: it was cut; its {self._rows} whole rows are used")
+        rate = self._object("settings").get("sample_rate_hz")
+        if rate is not None and self.stated_rate_hz is None:
+            found.append(
+                f"{self._path}: sample_rate_hz in the metadata is {json.dumps(rate)[:40]}, which no sampling rate is; "
+                "the rate is taken from time_s"
+            )
         found += [
             f"{self._path}: flags marks {sensor} as invalid in {counted(rows, 'row')} with a reading, which is left "
             "out. If the column was changed, delete it: every reading then counts as valid"
