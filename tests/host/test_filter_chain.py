@@ -121,6 +121,18 @@ def test_the_std_holds_for_calibrated_and_for_data_sheet_sensors(joint: str, err
     assert np.sqrt(np.mean(std**2)) < most_deg
 
 
+@pytest.mark.parametrize(("joint", "most_deg"), [("ball", 1.2), ("hinge", 0.4)])
+def test_the_std_of_calibrated_sensors_is_small_after_some_seconds_of_motion(joint: str, most_deg: float) -> None:
+    run = ChainRun(joint, 3, 30.0)
+    measured = run.measurements()
+    truth, late = run.truth_columns(measured.time_s), measured.time_s > 20
+    estimates = lp.estimate(measured, filters=["chain"], joint=joint)  # type: ignore[arg-type]
+    error = _error_deg(estimates, _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz"))))[late]
+    std = estimates["chain_rotation_std_deg"][late]
+    assert np.mean(error < 2 * std) > 0.9
+    assert np.sqrt(np.mean(std**2)) < most_deg
+
+
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     measured, _, angle = _chain("hinge")
     estimates = lp.estimate(measured, filters=["chain"], joint="hinge")

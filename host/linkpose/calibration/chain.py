@@ -72,6 +72,7 @@ _REST_STD_RAD_S, _MOST_REST_RAD_S = 0.003, 0.1
 _ACCEL_SCALES = np.concatenate([first + ACCEL_MATRIX + np.arange(0, 9, 4) for first in (0, UNKNOWNS)])
 _LEVERS = [*range(J2S, GYRO_BIAS), *range(UNKNOWNS + J2S, UNKNOWNS + GYRO_BIAS)]
 _TURN_STD_RAD = 1.0  # of a piece's rotation about a direction that its forces do not show
+_UNKNOWN_HEADING_RAD = float(np.pi / np.sqrt(3.0))  # σ of a heading that is uniform all around
 _MOVING_RAD_S, _LEAST_MOTION_S = 0.2, 5.0
 # Residuals: real chains leave 0.01 to 0.1 m/s², a shaft with a vibrating motor 0.6; two unrelated sensors leave more
 # than 3. Doubled, sensors on links that slide against each other are accepted.
@@ -226,6 +227,7 @@ def calibrate_chain(recordings: Sequence[Recording], rig: Rig, joint: Kind | Non
             "each sensor firmly on its own link, on either side of one joint"
         )
     motion = _with_common_errors(_relative_motion(chosen, fit), fit, turning)
+    motion = _with_unknown_heading(motion, chosen, fit, turning)
     motion = motion._replace(drift_deg=_drift_deg(chosen, fit, known))
     kind = joint or _kind(motion)
     levers = fit.unknowns[_LEVERS].reshape(2, 3)
@@ -289,7 +291,11 @@ class _Prior(NamedTuple):
 
 
 def _prior(parts: Iterable[tuple[Stretch, Stretch]]) -> _Prior:
-    """The data sheet's, and a gyro bias where its sensor rests."""
+    """The data sheet's, and a gyro bias where its sensor rests, or hardly turns throughout.
+
+    The latter is a sensor on a stand that a motor shakes. Without its mean rate, a bias of some °/s about the vertical
+    passes for a motion of the links where no force shows the heading.
+    """
     mean, information = np.zeros(2 * UNKNOWNS), np.empty(UNKNOWNS)
     for first, std in _PRIOR_STD.items():
         information[first:] = 1 / std**2
@@ -297,10 +303,22 @@ def _prior(parts: Iterable[tuple[Stretch, Stretch]]) -> _Prior:
     for k, stretches_of in enumerate(zip(*parts, strict=True)):
         rates = [s.rate[rest] for s in stretches_of for rest in find_rests(Measurements.from_imu(*s))]
         rates = [rate for rate in rates if np.linalg.norm(rate.mean(axis=0)) < _MOST_REST_RAD_S]
-        if rates:
+        std = _REST_STD_RAD_S
+        if not rates:
+            rates, std = [s.rate for s in stretches_of], _std_of_mean_rate(stretches_of)
+        if std < _PRIOR_STD[GYRO_BIAS]:
             at = slice(k * UNKNOWNS + GYRO_BIAS, k * UNKNOWNS + ACCEL_BIAS)
-            mean[at], information[at] = np.concatenate(rates).mean(axis=0), 1 / _REST_STD_RAD_S**2
+            mean[at], information[at] = np.concatenate(rates).mean(axis=0), 1 / std**2
     return _Prior(mean, information)
+
+
+def _std_of_mean_rate(stretches_of: Sequence[Stretch]) -> float:
+    """σ (rad/s) with which the mean rate is the gyro bias: a link turns less than half a turn; inf if it moves."""
+    every = np.concatenate([s.rate for s in stretches_of])
+    if np.sqrt(np.mean(np.sum((every - every.mean(axis=0)) ** 2, axis=1))) > _STILL_RAD_S:
+        return np.inf
+    seconds = sum(float(s.time_s[-1] - s.time_s[0]) for s in stretches_of)
+    return max(float(np.pi) / max(seconds, 1e-9), _REST_STD_RAD_S)
 
 
 def _turned(piece: _Piece, unknowns: Floats, scale: float) -> _Turned:
@@ -423,12 +441,40 @@ def _with_common_errors(motion: HingeMotion, fit: _Fit, turning_rad_s: tuple[flo
     """
     of_bias = (slice(at, at + 3) for at in (ACCEL_BIAS, UNKNOWNS + ACCEL_BIAS))
     tilt_square = sum(float(np.linalg.eigvalsh(fit.covariance[at, at])[-1]) for at in of_bias) / STANDARD_GRAVITY**2
-    covariance, (one, two) = motion.covariance.copy(), turning_rad_s
-    relies = [max(1 - (own / (_TURNS_ITSELF * other + 1e-12)) ** 2, 0.0) for own, other in ((one, two), (two, one))]
+    covariance, relies = motion.covariance.copy(), _reliance(turning_rad_s)
     for k in range(2):
         at, axis = slice(3 * k, 3 * k + 3), motion.axes[k]
         square = np.radians(motion.play_deg) ** 2 + relies[k] * tilt_square
         covariance[at, at] += square * (np.eye(3) - np.outer(axis, axis))
+    return motion._replace(covariance=covariance)
+
+
+def _reliance(turning_rad_s: tuple[float, float]) -> tuple[float, float]:
+    """How far the axis in either sensor's axes comes from the other sensor's rate: 1 where a sensor does not turn."""
+    one, two = turning_rad_s
+    first, second = (max(1 - (a / (_TURNS_ITSELF * b + 1e-12)) ** 2, 0.0) for a, b in ((one, two), (two, one)))
+    return first, second
+
+
+def _with_unknown_heading(
+    motion: HingeMotion, chosen: Sequence[_Piece], fit: _Fit, turning_rad_s: tuple[float, float]
+) -> HingeMotion:
+    """The motion with the error that an unknown relative heading causes.
+
+    The axis of a sensor that does not turn is that of the other one, taken over by R. Where no forces show the heading
+    of R either, it may have any direction about the vertical, as far as it is not vertical itself. That is the same for
+    all pieces, so their number does not reduce it.
+    """
+    shown = max(
+        float(np.linalg.eigvalsh(_turned(piece, fit.unknowns, fit.scale_m_s2).information)[0]) for piece in chosen
+    )
+    covariance, relies = motion.covariance.copy(), _reliance(turning_rad_s)
+    for k in range(2):
+        force = np.concatenate([piece[k].force for piece in chosen]).mean(axis=0)
+        moved = np.cross(force / np.linalg.norm(force), motion.axes[k])
+        square = relies[k] * _UNKNOWN_HEADING_RAD**2 / (shown * _TURN_STD_RAD**2)
+        at = slice(3 * k, 3 * k + 3)
+        covariance[at, at] += square * np.outer(moved, moved)
     return motion._replace(covariance=covariance)
 
 

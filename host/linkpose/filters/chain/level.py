@@ -6,7 +6,8 @@ play average out. The mean z̄ of innovations over σ, in an exponential window 
 
     E z̄² = h / 2T
 
-for white noise. The level grows while z̄² exceeds its value for a right σ, and falls otherwise. Source: R. K. Mehra,
+for white noise. The level grows while z̄² exceeds its value for a right σ, and falls otherwise, faster the smaller it
+is: calibrated sensors are a hundredth of the data sheet's variance, and seconds of motion show it. Source: R. K. Mehra,
 "On the identification of variances and adaptive Kalman filtering", IEEE Trans. Automatic Control 15(2), 1970: adapt
 the noise until innovations are as large and as white as their covariance states.
 """
@@ -20,6 +21,9 @@ from linkpose.filters.chain.state import Record
 
 _LEAST_TURN_M_S3 = 1.0  # rate of the force in a sensor's axes, below which it rests: a turn of 6 °/s
 _MOST_SQUARE = 25.0  # of one moving mean, as the average counts it: knocks
+# Least mean square over its value for a right σ, as the fall of the level counts it: with a `level_rate` of 0.25/s, the
+# level falls by e in 1.3 s at the fastest. Chosen without data.
+_LEAST_RATIO = 0.05
 
 
 @inner
@@ -29,7 +33,7 @@ def begin_level(s: Record, q: Record) -> None:
     for part in range(2):
         for i in range(3):
             s.moving_mean[part, i] = 0.0
-    s.moving_square[0], s.moving_square[1] = q.level_square, 0.0
+    s.moving_square[0], s.moving_square[1], s.level_span = q.level_square, 0.0, 0.0
 
 
 @inner
@@ -56,7 +60,8 @@ def follow_innovation(s: Record, part: int, row: int, innovation: float, varianc
     s.moving_mean[part, row] = mean
     if _turns(s) and s.rotation_std < q.level_std_rad:
         square = min(mean * mean * 2 * q.moving_mean_s / h, _MOST_SQUARE)
-        s.moving_square[part] += min(h / q.level_s, 1.0) / 3 * (square - s.moving_square[part])
+        span = min(q.level_first_s + s.level_span, q.level_s)
+        s.moving_square[part] += min(h / span, 1.0) / 3 * (square - s.moving_square[part])
 
 
 @inner
@@ -77,4 +82,6 @@ def follow_level(s: Record, h: float, q: Record) -> None:
     ratio = min(max(s.moving_square[0] / q.level_square, axis), q.level_most_ratio)
     if s.rotation_std < q.level_std_rad:
         most = q.most_level if axis > 1.0 else max(s.level, 1.0)
-        s.level = min(max(s.level * math.exp(h * q.level_rate * (ratio - 1.0)), q.least_level), most)
+        s.level_span += h
+        pace = ratio - 1.0 if ratio > 1.0 else math.log(max(ratio, _LEAST_RATIO))
+        s.level = min(max(s.level * math.exp(h * q.level_rate * pace), q.least_level), most)

@@ -72,8 +72,11 @@ class ChainParameters(NamedTuple):
     # its error.
     level_square: float = 0.25
     level_s: float = 10.0  # over which the square is averaged (s). At 4 s, short bad stretches of [D] set the level.
-    # Rate (1/s) at which the level grows e-fold for each multiple of `level_square` beyond the first, and falls below;
-    # doubled, calibrated sensors have their σ 5 s earlier, and the ball joint of [D] loses a quarter of its accuracy.
+    # Until then the average is over the motion so far; seconds of motion for which its first value, that of the data
+    # sheet's errors, counts. Chosen without data.
+    level_first_s: float = 2.0
+    # Rate (1/s) at which the level grows e-fold for each multiple of `level_square` beyond the first; below it, the
+    # level falls e-fold for each factor of e.
     level_rate: float = 0.25
     level_most_ratio: float = 8.0
     least_level: float = 0.01  # scale error of 0.2 %: twelve-position calibration
@@ -186,6 +189,7 @@ STATE = np.dtype(
         ("innovation_ratio", "f8"),  # mean square innovation over its expectation
         ("widening", "f8"),
         ("play_square", "f8"),
+        ("level_span", "f8"),  # over which innovations have been averaged for it (s)
         ("level", "f8"),  # of the model's errors
         ("moving_mean", "f8", (2, 3)),  # of innovations over σ: of the joint, of a hinge's axis,
         ("moving_square", "f8", 2),  # and the mean of its square, 1 for white noise
