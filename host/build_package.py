@@ -50,7 +50,7 @@ LIMIT_S = 900.0  # for a compiler that hangs; 15 times the usual time
 def get_requires_for_build_wheel(config_settings: dict[str, object] | None = None) -> list[str]:
     """The wheel's machine code requires numba and what the compiled modules import; an sdist requires neither."""
     others: list[str] = build_meta.get_requires_for_build_wheel(config_settings)
-    return others + (["numba>=0.60", "cobs>=1.2"] if any(_groups()) else [])
+    return others + (["numba>=0.62", "cobs>=1.2"] if any(_groups()) else [])
 
 
 class BuildPackage(build_py):  # type: ignore[misc]  # setuptools' class, seen as Any

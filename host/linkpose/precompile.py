@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import cast
+from typing import Any, cast
 
 from linkpose import compiling, filters
 from linkpose.sensors.devices import Sensors
@@ -25,6 +25,11 @@ NOISES = "noises"
 # The name of the parsers of long CSV files and of raw captures.
 FILES = "files"
 POLL_S = 0.05  # between two looks at what the other processes have compiled
+
+# Ctrl-C reaches all processes of a terminal's group. Those that compile would each end with a traceback.
+_APART: dict[str, Any] = {"start_new_session": True}
+if sys.platform == "win32":
+    _APART = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
 
 
 class Precompilation:
@@ -51,7 +56,7 @@ class Precompilation:
                 continue
             command = [sys.executable, "-m", "linkpose.precompile", *group]
             with contextlib.suppress(OSError):  # no other process: each filter is compiled here when it is first used
-                process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+                process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, **_APART)
                 self._processes |= dict.fromkeys(group, process)
 
     def is_ready(self, name: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -250,6 +251,29 @@ lines = []
 prepare(["tilt", "baro"], lines.append)
 print(lines)
 """
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups of POSIX")
+def test_ctrl_c_leaves_what_compiles_to_the_run_that_started_it(tmp_path):
+    code = (
+        "from linkpose import compiling\n"
+        "from linkpose.precompile import Precompilation\n"
+        "with Precompilation([]) as compilation:\n"
+        "    try:\n"
+        "        compilation.wait(lambda line: print(line, flush=True))\n"
+        "    except KeyboardInterrupt:\n"
+        "        compilation.wait(print)\n"
+        "print(compiling.is_compiled('text'))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(HOST), "NUMBA_CACHE_DIR": str(tmp_path)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        start_new_session=True,
+    ) as run_of_filters:  # fmt: skip
+        assert run_of_filters.stdout.readline().startswith("Compiling filters")
+        os.killpg(run_of_filters.pid, signal.SIGINT)
+        output, errors = run_of_filters.communicate()
+    assert (output.splitlines()[-1], errors) == ("True", "")
 
 
 def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
