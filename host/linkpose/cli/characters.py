@@ -6,6 +6,7 @@ Each is replaced by one like it: a minus sign stays a minus sign, and tables kee
 from __future__ import annotations
 
 import codecs
+import functools
 import io
 
 ERRORS = "linkpose"  # name of the error handler, for `errors=` of a stream
@@ -60,6 +61,7 @@ def prepare(stream: io.TextIOWrapper) -> None:
     stream.reconfigure(encoding=ASCII if is_ascii else None, errors=ERRORS)
 
 
+@functools.cache  # Python keeps each function that searches codecs for good
 def register() -> None:
     """Makes ERRORS and ASCII known to Python."""
     codecs.register_error(ERRORS, _handle)
