@@ -139,10 +139,11 @@ class _RawCapture(io.FileIO):
 def raw_capture(path: Path | None, force: bool = False) -> Iterator[BinaryIO | None]:
     """A new unbuffered file for every received byte, or None without a path.
 
-    Raises FileExists (unless `force`) and CannotWrite.
+    Raises FileExists (unless `force`) and CannotWrite, at the end as well: no write follows the last bytes.
     """
     if path is None:
         yield None
         return
     with _RawCapture(create(path, force), path) as file:
         yield file
+        check_unchanged(file.fileno(), path)

@@ -572,9 +572,16 @@ def test_a_recording_that_another_program_takes_away_goes_on_in_a_new_file(tmp_p
 def test_a_raw_capture_that_another_program_takes_away_ends_with_a_sentence(tmp_path):
     raw = tmp_path / "r.bin"
     refusal = pytest.raises(CannotWrite, match="it was removed while it was being written")
-    with raw_capture(raw) as file, Session("sim://link?speed=0", print, file) as session, refusal:
+    with refusal, raw_capture(raw) as file, Session("sim://link?speed=0", print, file) as session:
         for _ in session.stream(2):
             raw.unlink(missing_ok=True)
+
+
+def test_a_raw_capture_that_is_taken_away_after_its_last_bytes_ends_with_a_sentence(tmp_path):
+    raw = tmp_path / "r.bin"
+    with pytest.raises(CannotWrite, match="it was removed while it was being written"), raw_capture(raw) as file:
+        file.write(b"\0")
+        raw.unlink()
 
 
 def test_a_raw_capture_on_a_full_disk_ends_with_a_sentence():
