@@ -66,12 +66,12 @@ class RowReader:
             name: {quantity: rows[:, value] for quantity, value, _ in found} for name, found in self._of_filter.items()
         }
 
-    def read(self, estimates: Sequence[float]) -> Row:
-        """One row of estimates (columns,)."""
+    def read(self, estimates: Sequence[float], names: Iterable[str] | None = None) -> Row:
+        """One row of estimates (columns,), of all filters or of these."""
         known = [*estimates, math.nan]
         return {
-            name: {quantity: (known[value], known[std]) for quantity, value, std in found}
-            for name, found in self._of_filter.items()
+            name: {quantity: (known[value], known[std]) for quantity, value, std in self._of_filter[name]}
+            for name in (self._of_filter if names is None else names)
         }
 
 
@@ -114,7 +114,9 @@ def angle_with_std(value_deg: float, std_deg: float) -> str:
     """An angle and its standard deviation (°), to the same digit: +13.1° ±0.4°, +13.12° ±0.05°."""
     if not math.isfinite(value_deg + std_deg):
         return signed_angle(value_deg)
-    decimals = next(count for below, count in _ANGLE_DECIMALS if std_deg < below)
+    for below, decimals in _ANGLE_DECIMALS:  # noqa: B007  # the last one is infinite
+        if std_deg < below:
+            break
     bound = max(std_deg, 10.0**-decimals)  # ±0 would claim certainty
     return f"{signed_angle(value_deg, decimals)} ±{bound:.{decimals}f}°"
 
@@ -169,7 +171,10 @@ def std_text(std_m: float) -> str:
 
 def _digits(std_m: float) -> _Digits:
     """An unknown σ gives a value in mm."""
-    return next((digits for digits in _LENGTH_DIGITS if std_m < digits.below_m), _LENGTH_DIGITS[-2])
+    for digits in _LENGTH_DIGITS:
+        if std_m < digits.below_m:
+            return digits
+    return _LENGTH_DIGITS[-2]
 
 
 def same_digits(first: float, *others: float) -> list[str]:

@@ -9,6 +9,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -29,7 +30,7 @@ from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
 from linkpose.page import Page, PageStatus, geometry
-from linkpose.page.changes import Changes
+from linkpose.page.changes import Changes, uncompressed_frame
 from linkpose.page.history import PATH_POINTS, SPAN_S, History
 from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
@@ -331,6 +332,68 @@ def test_a_browser_that_reads_nothing_gets_no_more_until_it_does(monkeypatch: py
         changes.write(element, "1.5 m")
         changes.broadcast({1, 2})
     assert sent == [[connections[1]], list(connections.values())]
+
+
+@pytest.mark.parametrize("size", [1, 735, 1 << 17, (1 << 17) + 1, 300_000])
+def test_messages_travel_as_zstd_frames_without_compression(size: int) -> None:
+    data = np.random.default_rng(1).bytes(size)
+    frame = uncompressed_frame(data)
+    assert zstandard.ZstdDecompressor().decompress(frame) == data
+    assert zstandard.frame_content_size(frame) == size
+
+
+def decoded(message: bytes) -> tuple[list[dict[str, Any]], Callable[[dict[str, Any]], list[float]]]:
+    """The messages of viser in one of the server, and a function that reads the array of a placeholder."""
+    text_size, frame_size = struct.unpack_from("<QQ", message)
+    text = zstandard.ZstdDecompressor().decompress(message[16 : 16 + frame_size])
+    assert len(text) == text_size
+    content, starts, at = msgspec.msgpack.decode(text), [], 16 + frame_size
+    for length in content["binaryBufferLengths"]:
+        at += -at % 8
+        starts.append(at)
+        at += length
+
+    def array(of: dict[str, Any]) -> list[float]:
+        index, kind = of["__binary_index"], np.dtype(of["dtype"])
+        count = content["binaryBufferLengths"][index] // kind.itemsize
+        return list(np.frombuffer(message, kind, count, starts[index]))
+
+    return content["messages"], array
+
+
+def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
+    """A sample waits for one update on its way to the screen; charts, which are large, may be later."""
+    rows, sent = link_rows(), []
+    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
+        page._is_closed = True  # the updates are made here
+        page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, assignment, dict-item, return-value]
+        transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
+        page._changes._socket._live_connections = {7: SimpleNamespace(transport=transport)}  # type: ignore[dict-item]
+        page._changes._broadcast = lambda _, message: sent.append(decoded(message))  # type: ignore[assignment]
+        for row in rows[:14]:
+            page.show(row, status())
+            page._update()
+    assert len(sent) == 14
+    for row, (messages, _) in zip(rows, sent, strict=False):
+        assert any(f"{row[1]:.3f} m ±2.0 cm" in str(m.get("updates")) for m in messages)
+        turn = next(m["wxyz"] for m in messages if m.get("name") == "/link" and "wxyz" in m)
+        assert turn == pytest.approx(geometry.attitude(row[3], row[5], 0.0))
+    charts = [(array, m["updates"]["data"]) for messages, array in sent for m in messages if "data" in str(m)]
+    assert len(charts) == 3 * 3  # with the first, the seventh and the thirteenth row
+    array, (time, low, high, height) = charts[6]
+    assert array(time) == pytest.approx(rows[:13, 0])
+    assert array(height) == pytest.approx(rows[:13, 1])
+    assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(13), rel=1e-4)
+
+
+def test_an_error_of_the_sender_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: Page) -> None:
+        raise RuntimeError("cannot draw")
+
+    monkeypatch.setattr(Page, "_update", fail)
+    with Page(LINK, Rig(), "sim://link") as page, pytest.raises(RuntimeError, match="cannot draw"):
+        while True:
+            page.raise_if_stopped()
 
 
 def test_no_file_of_the_machine_is_served_and_the_page_has_its_title() -> None:
