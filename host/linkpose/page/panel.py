@@ -115,7 +115,7 @@ class Panel:
         rows = with_gap_rows(window)
         lines = curves.lines(rows)
         time = self._changes.array(rows[:, 0])
-        is_whole: NDArray[np.bool_] = np.isfinite(lines).all(axis=2)
+        is_whole = np.asarray(np.isfinite(lines).all(axis=2))
         for at, quantity in enumerate(curves.quantities):
             count = 3 + (quantity.column in self._columns)
             data = [
