@@ -43,6 +43,8 @@ _ELLIPSES = 12  # along a path
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
 _ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
+_SKY, _GROUND = (255, 255, 255), (200, 200, 205)
+_SKY_INTENSITY = 3.5  # of light from everywhere, in viser's unit; colours look as they are stated
 _FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does not hide parts of them
 
 
@@ -303,6 +305,7 @@ def scene_of(
 
     The camera of a robot's scene also shows `places` (N, 2), m.
     """
+    _light(server.scene)
     estimated = {quantity for of in filters for quantity in of}
     if QW in estimated:
         return ChainScene(server, changes, rig)
@@ -310,6 +313,16 @@ def scene_of(
     if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
         return RobotScene(server, changes, surroundings, places)
     return LinkScene(server, changes, None if j2s is None else np.array(j2s))
+
+
+def _light(scene: viser.SceneApi) -> None:
+    """Plain light instead of viser's shadows and environment map.
+
+    Without a graphics card those take two thirds of the time of each frame, and some seconds before the first one.
+    """
+    scene.configure_default_lights(cast_shadow=False)
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere("/sky", sky_color=_SKY, ground_color=_GROUND, intensity=_SKY_INTENSITY)
 
 
 def _extent(points: Floats) -> tuple[Floats, float]:
