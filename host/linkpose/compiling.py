@@ -46,7 +46,7 @@ from numba.core.caching import (
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 
-from linkpose.lean_compiler import Inner, Outer
+from linkpose.lean_compiler import Inner, Outer, interruptible
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -289,7 +289,8 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
                 data = files.load(key)
                 if data is None:
                     continue
-                loaded = self._impl.rebuild(target_context, data)
+                with interruptible():
+                    loaded = self._impl.rebuild(target_context, data)
                 if tuple(loaded.signature.args) == tuple(sig):
                     return loaded
             except Exception:  # code of another numba or LLVM raises anything
