@@ -282,15 +282,18 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
         Numba's own method first registers all that it can compile (0.6 s of CPU and an import of scipy). Loading needs
         the runtime's symbols alone, and compiling registers the rest anyway.
         """
+        with interruptible():
+            rtsys.initialize(target_context)
+            return self._load(sig, target_context)
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())
-        rtsys.initialize(target_context)
         for files in self._layers:
             try:
                 data = files.load(key)
                 if data is None:
                     continue
-                with interruptible():
-                    loaded = self._impl.rebuild(target_context, data)
+                loaded = self._impl.rebuild(target_context, data)
                 if tuple(loaded.signature.args) == tuple(sig):
                     return loaded
             except Exception:  # code of another numba or LLVM raises anything

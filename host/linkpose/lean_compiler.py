@@ -176,19 +176,18 @@ def _make_usable_or_raise(library: Any) -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Within this context, Ctrl-C while numba loads stored code raises KeyboardInterrupt."""
-    JITCodeLibrary._finalize_specific = _make_usable_or_raise
+    """Within this context, Ctrl-C while numba loads or compiles raises KeyboardInterrupt."""
+    before, JITCodeLibrary._finalize_specific = JITCodeLibrary._finalize_specific, _make_usable_or_raise
     try:
         yield
     finally:
-        JITCodeLibrary._finalize_specific = _make_usable
+        JITCodeLibrary._finalize_specific = before
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code that is optimised once, as a whole, when the outermost function is complete."""
 
     _linking_libraries: list[Any]
-    _finalize_specific = _make_usable_or_raise
 
     def _optimize_functions(self, module: Any) -> None:
         """Nothing to do for one function alone."""
@@ -248,7 +247,7 @@ class Outer(CompilerBase):  # type: ignore[misc]
         searches = gc.isenabled()
         gc.disable()
         try:
-            with _remembering():
+            with _remembering(), interruptible():
                 return super().compile_extra(func)
         finally:
             if searches:
