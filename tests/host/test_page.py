@@ -69,7 +69,8 @@ def link_rows(count: int = 200) -> np.ndarray:
 
 
 def status(imu: str = "ok") -> Callable[[], PageStatus]:
-    health: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": imu}, "baro": {"state": "ok"}})
+    sensors = {"imu": {"state": imu}, "baro": {"state": "ok"}}
+    health: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors=sensors, silent_s=0.0)
     return lambda: PageStatus(health)
 
 
@@ -120,11 +121,12 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         band = browser.evaluate(f"[...{chart_data('height')}[2]]")
         assert max(filter(None, band)) < 2.0
         assert len(missing) == 11 and rows[99, 0] < missing[0] < rows[100, 0]
-        page.show(np.empty(0), status(imu="not answering"))
+        page.show(np.empty(0), status(imu="silent"))
         alarm = "[...document.querySelectorAll('[role=alert]')].find(e => e.innerText.includes('IMU NOT ANSWERING'))"
         browser.wait_for(alarm)
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
-        assert "IMU ok" not in browser.evaluate("document.body.innerText")
+        text = browser.evaluate("document.body.innerText")
+        assert "IMU ok" not in text and "not known" in text and "m ±2.0 cm" not in text
         found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
         page.show(np.empty(0), lambda: PageStatus(status()().health, found))
         browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")

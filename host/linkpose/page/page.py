@@ -11,21 +11,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from linkpose import quantities
 from linkpose.errors import LinkposeError
 from linkpose.exclusions import Exclusions
+from linkpose.filters import required_sensors
 from linkpose.localization.surroundings import Surroundings
 from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import PageStatus
-from linkpose.presentation import fault_lines, working_sensors
+from linkpose.presentation import fault_lines, lost_filters, working_sensors
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     import viser
 
+    from linkpose.device.session import Health
     from linkpose.estimation import FoundJ2s
 
 LOOPBACK = "127.0.0.1"
@@ -78,6 +81,8 @@ class Page:
         self._columns = list(columns)
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
+        self._of_filter = quantities.by_filter(columns)
+        self._lost_at: list[int] = []  # columns whose values are not shown
         self._exclusions = Exclusions(self._columns)
         self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
         self._status, self._blocks = PageStatus(), 0
@@ -251,6 +256,10 @@ class Page:
         if self._is_status_changed:
             self._is_status_changed = False
             self._draw_health(newest, status)
+            self._lost_at = self._lost_columns(status.health)
+        if newest is not None and self._lost_at:
+            newest = newest.copy()
+            newest[self._lost_at] = np.nan
         name = None if newest is None else self._panel.chosen or self._drawing.best(newest)
         if newest is not None and name is not None:
             if status.j2s is not None:
@@ -262,6 +271,11 @@ class Page:
                 self._panel.draw_charts(self._history.window(), name)
                 self._drawing.draw_slow(row, name, self._history)
         self._changes.broadcast(self._clients)
+
+    def _lost_columns(self, health: Health | None) -> list[int]:
+        """The columns of filters that have lost what they need."""
+        lost = lost_filters(self._of_filter, health, required_sensors) if health is not None else ()
+        return [self._columns.index(column) for name in lost for column in self._of_filter[name].values()]
 
     def _draw_health(self, newest: Floats | None, status: PageStatus) -> None:
         health, words = status.health, []
