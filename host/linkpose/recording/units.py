@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,7 @@ _THIN_AIR_PA = 54_000.0  # at 5100 m, where the highest town is
 _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _STRONGEST_M_S2 = 160.0  # the MPU-6050 reads up to 16 g, 156.9 m/s²
+_COPIED, _FEWEST_CHANGES = 0.5, 50  # share of the rows that changed, and how many: no chance, and not a part alone
 _SPIKES = 0.001  # share of readings beyond these that are no wrong unit
 _TILTS_RAD_S = 0.1  # rms rate about horizontal axes at which gravity turns through the accelerometer's axes
 _LONGEST_STEP_S = 0.5
@@ -48,13 +51,10 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
     The first UNIT_ROWS samples are judged. `rate_hz` is the sample rate in the file's metadata, if it has one.
     """
     measurements = measurements[:UNIT_ROWS]
-    force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
-    unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     time = _time(_median(np.diff(measurements.time_s)), rate_hz)
-    force = unit or _force(measurements)
     found = [
-        force or _gravity(measurements, force_m_s2),
-        _rate(measurements.gyro_rad_s) or ("" if time or force else contradiction(measurements)),
+        *_imu(measurements, bool(time)),
+        *_second_imu(measurements, bool(time)),
         time,
         _pressure(_median(measurements.pressure_Pa)),
         _repeated("baro_fresh", "pressure_Pa", measurements.baro_fresh, measurements.pressure_Pa[:, None]),
@@ -63,6 +63,42 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
         _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
     ]
     return [suspicion for suspicion in found if suspicion]
+
+
+def _imu(measurements: Measurements, is_time_wrong: bool) -> list[str]:
+    """Remarks on the accelerometer and on the gyro; "" for none."""
+    force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
+    unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
+    force = unit or _force(measurements)
+    rate = _rate(measurements.gyro_rad_s) or ("" if is_time_wrong or force else contradiction(measurements))
+    return [force or _gravity(measurements, force_m_s2), rate]
+
+
+def _second_imu(measurements: Measurements, is_time_wrong: bool) -> list[str]:
+    """Remarks on the second inertial sensor, and on whether it is another one than the first."""
+    if not measurements.has_imu2:
+        return []
+    accel, gyro = measurements.accel2_m_s2, measurements.gyro2_rad_s
+    found = _imu(replace(measurements, accel_m_s2=accel, gyro_rad_s=gyro), is_time_wrong)
+    return [
+        *(re.sub(r"\b(?=(accel|gyro)_[*xyz])", "imu2_", text) for text in found),
+        _copied("accel", measurements.accel_m_s2, accel),
+        _copied("gyro", measurements.gyro_rad_s, gyro),
+    ]
+
+
+def _copied(name: str, first: Floats, second: Floats) -> str:
+    """A remark if two sensors read the same to the last digit, in rows in which the readings change."""
+    known = np.isfinite(first + second).all(axis=1)
+    first, second = first[known], second[known]
+    changed = (np.diff(first, axis=0) != 0).any(axis=1)
+    same = changed & (first[1:] == second[1:]).all(axis=1)
+    if np.count_nonzero(changed) < _FEWEST_CHANGES or np.count_nonzero(same) < _COPIED * np.count_nonzero(changed):
+        return ""
+    return (
+        f"imu2_{name}_* equals {name}_* in {np.count_nonzero(same)} of {len(first)} rows, which no two sensors do: "
+        "were the columns copied?"
+    )
 
 
 def is_negated(measurements: Measurements, j2s_m: Sequence[float]) -> bool:
