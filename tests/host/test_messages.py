@@ -266,6 +266,7 @@ PRODUCERS: list[Producer] = [
     rig("[joint\n"),
     rig("[joint]\nj2s = [0, 0, 1]\n"),
     rig("joint = 1\n"),
+    rig("[[mouse]]\nx_m = 1\ny_m = 0\n" * 5),
     rig("[mouse]\nx_m = 1\n"),
     rig("[baro]\npressure_noise_Pa = 0\n"),
     rig('[chain]\njoint = "knee"\n'),

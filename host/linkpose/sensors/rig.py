@@ -13,9 +13,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from linkpose.errors import CannotWrite, FileFormatError
+from linkpose.errors import CannotWrite, FileFormatError, InvalidValue
 from linkpose.inputs import read_bytes
 from linkpose.outputs import replace_file
+from linkpose.sensors.devices import MAX_MICE
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -171,7 +172,7 @@ class Rig:
 
     `joint` holds J2S (the vector from the joint centre to the sensor) in the first sensor's axes (m), `chain` the joint
     between two links, `mouse` each mouse in the robot's frame (m, degrees). `imu`, `noise`, `mag` and `baro` are
-    calibrations of the sensors.
+    calibrations of the sensors. Raises InvalidValue for more mice than a board reads.
     """
 
     joint: Joint = field(default_factory=Joint)
@@ -181,6 +182,12 @@ class Rig:
     baro: Baro = field(default_factory=Baro)
     mouse: tuple[Mouse, ...] = ()
     chain: Chain = field(default_factory=Chain)
+
+    def __post_init__(self) -> None:
+        if len(self.mouse) > MAX_MICE:
+            raise InvalidValue(
+                "mouse", f"has {len(self.mouse)} entries, and a board reads {MAX_MICE} mice at most: delete the others"
+            )
 
     def with_j2s(self, j2s_m: Vector) -> Rig:
         """The rig with another J2S, assumed accurate to 0.1 mm (1σ)."""
@@ -228,7 +235,10 @@ class Rig:
         if not isinstance(mice, list):
             raise FileFormatError(origin, f"{origin}: mouse is one table; write [[mouse]], once for each mouse")
         parts["mouse"] = tuple(_read_table(Mouse, table, origin, "mouse") for table in mice)
-        return Rig(**parts)
+        try:
+            return Rig(**parts)
+        except InvalidValue as error:
+            raise FileFormatError(origin, f"{origin}: {error}") from None
 
     @staticmethod
     def load(path: str | PathLike[str]) -> Rig:
