@@ -132,6 +132,35 @@ def test_the_std_holds_and_is_small_after_some_seconds_of_motion(
     assert np.sqrt(np.mean(std**2)) < most_deg
 
 
+@pytest.mark.parametrize(("joint", "seed"), [("ball", 2), ("ball", 3), ("hinge", 1), ("hinge", 5)])
+def test_gyro_biases_of_the_data_sheet_at_a_start_in_motion_stay_within_the_std(joint: str, seed: int) -> None:
+    """Biases of up to 20 °/s, without a rest that shows them or the first pose, from which the angle counts."""
+    run = ChainRun(joint, seed, 60.0, errors="datasheet", first_joint="free")
+    measured = run.measurements()
+    use = measured.time_s >= 8
+    measured, truth = measured[use], run.truth_columns(measured.time_s[use])
+    chain = ChainFilter(Rig(chain=Chain(joint)))  # type: ignore[arg-type]
+    found = dict(zip(chain.columns, chain.process(measured).T, strict=True))
+    error = _error_deg(found, _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz"))))
+    known, late = np.isfinite(error), measured.time_s > 20
+    assert known[late].all() and known.mean() > 0.9
+    assert np.mean(error[known] < 2 * found["chain_rotation_std_deg"][known]) > 0.9
+    assert np.sqrt(np.mean(error[late] ** 2)) < 4
+    if joint == "hinge":
+        angle = truth["angle_deg"] - truth["angle_deg"][0]
+        turned = min((sign * found["chain_angle_deg"] - angle for sign in (1, -1)), key=lambda e: np.std(e[late]))
+        assert np.mean(np.abs(turned[late]) < 2 * found["chain_angle_std_deg"][late]) > 0.9
+        assert np.sqrt(np.mean(turned[late] ** 2)) < 8
+
+
+@pytest.mark.parametrize("errors", ["calibrated", "datasheet"])
+def test_motion_shows_whether_the_gyros_were_calibrated(errors: str) -> None:
+    measured = ChainRun("ball", 1, 30.0, errors=errors).measurements()
+    chain = ChainFilter(Rig(chain=Chain("ball")))
+    chain.process(measured[measured.time_s >= 8])
+    assert chain.state["is_narrow"].tolist() == [int(errors == "calibrated")] * 2
+
+
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     measured, _, angle = _chain("hinge")
     estimates = lp.estimate(measured, filters=["chain"], joint="hinge")

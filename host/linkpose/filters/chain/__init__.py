@@ -21,6 +21,7 @@ from linkpose.filters._records import record_of
 from linkpose.filters.chain.misfit import MOST_MEAN_RATE_RAD_S
 from linkpose.filters.chain.process import process
 from linkpose.filters.chain.state import (
+    BA,
     BG,
     ESTIMATE,
     OF_SENSOR,
@@ -163,6 +164,10 @@ class ChainFilter:
             if learned.knows_heading:
                 state.axis, state.has_axis = other.axis, other.has_axis
             state.level = max(other.level, 1.0)
+            for k in np.flatnonzero(other.is_narrow > state.is_narrow).tolist():
+                at = slice(OF_SENSOR * k + BG, OF_SENSOR * k + BA)
+                state.covariance[at, at] = self.parameters.gyro_bias_rad_s**2 * np.eye(3)
+            state.is_narrow = other.is_narrow
             if backwards:
                 state.gyro_bias = -other.gyro_bias
             for first in set(range(0, self.size, 3)) - not_constant:

@@ -107,10 +107,11 @@ def angles_with_std(q: Floats, covariance: Floats, angles: Floats, std: Floats, 
 
 
 @inner
-def report_angles(bank: Record, s: Record, constant: float, out: Record) -> None:
+def report_angles(bank: Record, s: Record, constant: float, first: float, out: Record) -> None:
     """Angles of the best hypothesis s, with σ that includes the spread of the headings of all.
 
-    `constant`: variance (rad²) about each axis that P does not hold, of the rotation now and of the neutral one.
+    `constant`: variance (rad²) about each axis that P does not hold, of the rotation now and of the neutral one;
+    `first`: a further one of the first rotation.
     """
     between(s.attitude[0], s.attitude[1], s.relative)
     between(s.start[0], s.start[1], s.first)
@@ -122,7 +123,7 @@ def report_angles(bank: Record, s: Record, constant: float, out: Record) -> None
     _set_jacobian(bank, s)
     _set_covariance(bank, s, max(out.rotation_std**2 - s.rotation_std**2, 0.0))
     for i in range(3):
-        bank.covariance[i, i] += constant * (1.0 if bank.knows_neutral else 2.0)
+        bank.covariance[i, i] += constant + (0.0 if bank.knows_neutral else constant + first)
     for i in range(3):  # and in the segment's
         s.a[i] = bank.turned[1 + i]
     rotate_back(bank.frame, s.a, s.b)

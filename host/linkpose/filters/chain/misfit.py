@@ -64,8 +64,12 @@ def has_to_forget(bank: Record) -> bool:
 
 @inner
 def forget(bank: Record, states: Record, q: Record) -> None:
-    """All hypotheses as before the first sample, with an unknown mounting; r_0 and its variance stay."""
-    size, base = bank.length, bank.fixed
+    """All hypotheses as before the first sample, with an unknown mounting.
+
+    r_0 and its variance stay, and gyros that have turned out to be calibrated remain so.
+    """
+    size, base, best = bank.length, bank.fixed, states[bank.best]
+    calibrated = (best.is_narrow[0], best.is_narrow[1])
     for i in range(states.shape[0]):
         s = states[i]
         p = s.covariance
@@ -76,9 +80,11 @@ def forget(bank: Record, states: Record, q: Record) -> None:
             s.correction[a] = 0.0
         for k in range(2):
             o = OF_SENSOR * k
+            s.is_narrow[k] = calibrated[k]
+            bias = q.gyro_bias_rad_s if calibrated[k] else q.first_gyro_bias_rad_s
             for j in range(3):
                 s.gyro_bias[k, j] = s.accel_bias[k, j] = s.lever[k, j] = 0.0
-                p[o + BG + j, o + BG + j] = q.gyro_bias_rad_s**2
+                p[o + BG + j, o + BG + j] = bias**2
                 p[o + BA + j, o + BA + j] = q.accel_bias_m_s2**2
                 p[o + R + j, o + R + j] = q.lever_m**2
         _clear(s.relative_spread)

@@ -18,7 +18,11 @@ _REST_MEAN_S = 0.5  # over which readings are averaged to find rests
 
 @inner
 def update_velocity(s: Record, size: int, k: int, h: float, q: Record) -> float:
-    """Apply 0 = v_k + e, `h` (s) after the last time. Returns its log likelihood."""
+    """Apply 0 = v_k + e, `h` (s) after the last time. Returns its log likelihood.
+
+    e has no direction, so that this also holds of v_k turned back by the error of the heading: a turn of the whole
+    chain about the vertical, δθ = Z and δv = Z × v, must not change H x, or P holds a heading that nothing has shown.
+    """
     time = q.most_correlation_s
     if s.accel_square[k] > 0:
         time = min(max(math.sqrt(s.speed_square[k] / s.accel_square[k]), q.least_correlation_s), time)
@@ -28,6 +32,10 @@ def update_velocity(s: Record, size: int, k: int, h: float, q: Record) -> float:
     for row in range(3):
         clear_row(s)
         s.row[OF_SENSOR * k + V + row] = 1.0
+        if row == 0:
+            s.row[OF_SENSOR * k + 2] = s.heading_share * s.velocity[k, 1]
+        elif row == 1:
+            s.row[OF_SENSOR * k + 2] = -s.heading_share * s.velocity[k, 0]
         likelihood += update(s, size, -s.velocity[k, row], variance, q.huber)[0]
     return likelihood
 
@@ -40,8 +48,6 @@ def update_rest(s: Record, size: int, k: int, gyro: Floats, q: Record, noise: Fl
         clear_row(s)
         s.row[at] = 1.0
         innovation, variance = gyro[k, row] - s.gyro_bias[k, row], noise[0] + q.rest_std_rad_s**2
-        if s.covariance[at, at] > _UNLEARNED * q.gyro_bias_rad_s**2:  # it may be a sensor that nobody has calibrated
-            s.covariance[at, at] += innovation**2
         update(s, size, innovation, variance, q.huber)
 
 
@@ -59,7 +65,7 @@ def follow_rest(bank: Record, best: Record, k: int, gyro: Floats, accel: Floats,
         rate = max(rate, abs(bank.mean_gyro[k, i] - best.gyro_bias[k, i]))
     std = math.sqrt(p[o, o] + p[o + 1, o + 1] + p[o + 2, o + 2])
     allowed = min(q.most_rest_rad_s, 3 * std + 5 * q.rest_std_rad_s)
-    if std**2 > 3 * _UNLEARNED * q.gyro_bias_rad_s**2:
+    if std**2 > 3 * _UNLEARNED * q.first_gyro_bias_rad_s**2:
         allowed = q.most_first_rest_rad_s
     steady = rate_off < q.rest_gyro_rad_s and force_off < q.rest_accel_m_s2 and rate < allowed
     bank.still_s[k] = bank.still_s[k] + h if steady else 0.0

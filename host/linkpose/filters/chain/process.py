@@ -16,11 +16,13 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.angles import report_angles, set_frame
+from linkpose.filters.chain.first_pose import begin_path, begin_start, end_step, follow_path, trace_variance
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
 from linkpose.filters.chain.level import begin_level, follow_level, misalignment_variance
 from linkpose.filters.chain.misfit import follow_misfit, forget, has_to_forget, is_misfit
 from linkpose.filters.chain.motion import follow_rest, update_rest, update_velocity
+from linkpose.filters.chain.prior import narrow_prior
 from linkpose.filters.chain.propagate import integrate, propagate_covariance
 from linkpose.filters.chain.rotation import between, cross, rotate, rotate_back, to_matrix, turn
 from linkpose.filters.chain.state import OF_SENSOR, START, Floats, R, Record, V
@@ -96,7 +98,8 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
         clear_stops(s)
         s.alive, s.log_likelihood, s.odds, s.apart, s.rotation_std = int(i == 0), 0.0, 0.0, math.pi, math.pi
         if not bank.begun:
-            _begin_start(s, bank.length)
+            begin_start(s, bank.length)
+    begin_path(bank, -1 if bank.begun else 0)
     if bank.hinge < 0 and not bank.begun:
         set_frame(bank, states[0].rotation[0, 2])
     bank.rests = int(not bank.begun)
@@ -182,6 +185,7 @@ def _turn_block(p: Floats, size: int, at: int, m: Floats, column: Floats, turned
 def _copy_constants(best: Record, s: Record, size: int) -> None:
     """What a gap does not change, with its variances but without covariances between parts."""
     for k in range(2):
+        s.is_narrow[k] = best.is_narrow[k]
         for i in range(3):
             s.gyro_bias[k, i], s.accel_bias[k, i] = best.gyro_bias[k, i], best.accel_bias[k, i]
             s.lever[k, i], s.axis[k, i] = best.lever[k, i], best.axis[k, i]
@@ -197,22 +201,6 @@ def _copy_constants(best: Record, s: Record, size: int) -> None:
 
 
 @inner
-def _begin_start(s: Record, size: int) -> None:
-    """S_k is the attitude now, with its error."""
-    p = s.covariance
-    for k in range(2):
-        for i in range(4):
-            s.start[k, i] = s.attitude[k, i]
-        for i in range(3):
-            for j in range(size):
-                p[START + 3 * k + i, j] = p[OF_SENSOR * k + i, j]
-    for k in range(2):
-        for i in range(3):
-            for j in range(size):
-                p[j, START + 3 * k + i] = p[j, OF_SENSOR * k + i]
-
-
-@inner
 def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: Floats) -> None:
     """All measurements of one update, `h` (s) after the last."""
     size, hinge, base = bank.length, bank.hinge, bank.fixed
@@ -222,6 +210,7 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
     if base >= 0:
         likelihood += update_fixed_joint(s, size, base, gyro, q, noise)
     for k in range(2):
+        narrow_prior(s, size, k, q)
         likelihood += update_velocity(s, size, k, h, q)
         if bank.still_s[k] > q.rest_s:
             update_rest(s, size, k, gyro, q, noise)
@@ -236,7 +225,7 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
         if s.has_axis > 0.0:
             update_stop(s, size, hinge_angle(s), q)
             apply_correction(s, size, hinge, base)
-        first_and_now = 2 * misalignment_variance(s, q)
+        first_and_now = 2 * misalignment_variance(s, q) + trace_variance(s, q)
         s.angle_std = math.sqrt(s.angle_std**2 + stop_variance(s) + first_and_now)
     if bank.spread:
         add_linearization_errors(s, hinge, h, q)
@@ -257,9 +246,10 @@ def _select(bank: Record, states: Record, q: Record) -> None:
         if s.alive:
             far = 0.0  # a wrong heading is often explained by impossible gyro biases
             for k in range(2):
+                std = q.gyro_bias_rad_s if s.is_narrow[k] else q.first_gyro_bias_rad_s
                 for j in range(3):
-                    far += s.gyro_bias[k, j] ** 2
-            s.odds = s.log_likelihood - 0.5 * far / q.gyro_bias_rad_s**2
+                    far += (s.gyro_bias[k, j] / std) ** 2
+            s.odds = s.log_likelihood - 0.5 * far
             if s.odds > top:
                 top, bank.best = s.odds, i
     best = states[bank.best]
@@ -304,7 +294,7 @@ def _report(bank: Record, states: Record, out: Record, q: Record) -> None:
     for i in range(3):
         out.joint[i] = out.joint_std[i] = math.nan
     if hinge < 0 and out.rotation_std < q.unknown_rad:
-        report_angles(bank, best, misalignment_variance(best, q), out)
+        report_angles(bank, best, misalignment_variance(best, q), trace_variance(best, q), out)
     for k in range(2):
         out.height[k] = out.height_std[k] = math.nan
         if base >= 0:
@@ -441,6 +431,7 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
         if bank.still_s[k] == 0.0:
             bank.rests = 0
     bank.since_update += h
+    follow_path(bank, gyro, h)
     due = bank.since_update >= q.period_s
     for i in range(states.shape[0]):
         s = states[i]
@@ -451,9 +442,11 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
             if due:
                 _update(s, bank, gyro, bank.since_update, q, noise)
                 if bank.rests and min(bank.still_s[0], bank.still_s[1]) > q.rest_s:
-                    _begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
+                    begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
+                    begin_path(bank, -1)
     if due:
         bank.since_update = 0.0
+        end_step(bank, states)
         _select(bank, states, q)
         follow_misfit(bank, states[bank.best], q.period_s, q)
         if not bank.spread and states[0].heading_share > 0.0:

@@ -14,7 +14,7 @@ from linkpose.filters._imu import GRAVITY, LONGEST_STEP_S
 from linkpose.filters.chain.rotation import rotate, to_matrix, turn
 from linkpose.filters.chain.state import BA, BG, OF_SENSOR, Floats, R, Record, V
 
-_GYRO_MISFIT_S, _ACCEL_MISFIT_S = 0.1, 0.05  # correlation times of the misfits
+GYRO_MISFIT_S, _ACCEL_MISFIT_S = 0.1, 0.05  # correlation times of the misfits
 # Over a step longer than any sampling interval, rate and force between two readings are partly a guess.
 _JERK_RAD_S3, _JERK_M_S3 = 50.0, 100.0
 
@@ -64,8 +64,9 @@ def integrate(
     guess = h * h / 12 if h > LONGEST_STEP_S else 0.0
     rate_square = bx * bx + by * by + bz * bz
     gyro_misfit, accel_misfit = s.level * q.gyro_misfit**2, s.level * q.accel_misfit**2
-    s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * rate_square * _GYRO_MISFIT_S)
+    s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * rate_square * GYRO_MISFIT_S)
     s.rotation_variance[k] += (h * guess * _JERK_RAD_S3) ** 2
+    s.path_square[k] += h * rate_square
     s.velocity_variance[k] += h * (h * noise[1] * s.widening + accel_misfit * s.accel_square[k] * _ACCEL_MISFIT_S)
     s.velocity_variance[k] += (h * guess * _JERK_M_S3) ** 2
     turning = (by * fz - bz * fy) ** 2 + (bz * fx - bx * fz) ** 2 + (bx * fy - by * fx) ** 2

@@ -32,6 +32,7 @@ MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
 # Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
 # openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
 HYPOTHESES = 8
+PATH = 256  # updates over which the first pose can be traced back: 10 s
 
 
 class ChainParameters(NamedTuple):
@@ -133,6 +134,11 @@ class ChainParameters(NamedTuple):
     # less than P holds: the square of the move within the last second, times this, is added to P. Chosen on the
     # simulated leg, seeds 0-3: at 0, errors of a hinge after a start reach 8 σ; doubled, σ is the same 10 s later.
     relinearized_share: float = 3.0
+    # The same for gyro biases that have not been measured yet, which a wrong heading explains: the square of the move
+    # over `relinearized_rad`², times this, is the share by which their variances grow in 1 s. Chosen on the simulated
+    # leg in motion, seeds 400-409: at 0, biases of a start in fast motion are wrong by 5 σ; doubled, one ball joint in
+    # twenty follows a wrong heading for a minute.
+    relinearized_bias: float = 0.1
     relinearized_s: float = 1.0  # over which corrections count as one move (s)
     # A move that counts in full (rad); smaller ones are noise, and the error of a Jacobian is of second order.
     # [O]: at 0.03, the slow robot arm loses half of its accuracy.
@@ -145,7 +151,11 @@ class ChainParameters(NamedTuple):
     tilt_rad: float = 0.1
     tilt_moving_s: float = 0.1  # of the tilt, for each rad/s of a start in motion: limbs of 0.3 m swung at 1 Hz
     speed_m_s: float = 0.3
-    gyro_bias_rad_s: float = 0.02  # after a subtraction at rest; a first rest of 0.3 s finds any larger one
+    gyro_bias_rad_s: float = 0.02  # after a subtraction at rest, which the first estimates of the bias show
+    first_gyro_bias_rad_s: float = 0.2  # before that: data sheet of [MPU-6050], ±20 °/s, uniform
+    # Log odds of the former from which on it counts; e : 1. Chosen on the simulated leg in motion, seeds 400-409; at 3,
+    # calibrated sensors are recognised up to 20 s later.
+    prior_odds: float = 1.0
     accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
     lever_m: float = 0.3  # of an unknown r_k: links of people and robots
 
@@ -158,6 +168,7 @@ STATE = np.dtype(
         ("velocity", "f8", (2, 3)),
         ("gyro_bias", "f8", (2, 3)),
         ("accel_bias", "f8", (2, 3)),
+        ("is_narrow", "i8", 2),  # whether the prior of either gyro bias is the one after a subtraction
         ("lever", "f8", (2, 3)),  # r_k
         ("axis", "f8", (2, 3)),  # j_k
         ("start", "f8", (2, 4)),  # quaternions of S_k
@@ -171,6 +182,8 @@ STATE = np.dtype(
         ("impulse", "f8", (2, 3)),  # ∫ R_k f_k dt
         ("span", "f8"),  # s
         ("rotation_variance", "f8", 2),
+        ("path_square", "f8", 2),  # ∫ ‖ω‖² dt since the first sample,
+        ("traced_square", "f8"),  # and of both sensors, over which S_k has been traced back (rad²/s)
         ("velocity_variance", "f8", 2),
         ("force_rate_square", "f8", 2),  # mean ‖ω × f‖²
         # Memory of the measurement models.
@@ -221,6 +234,7 @@ STATE = np.dtype(
         ("b", *_V3),
         ("c", *_V3),
         ("m", "f8", (3, 3)),
+        ("by_bias", "f8", (2, 3, 3)),
         ("relative", *_Q),
         ("first", *_Q),
     ],
@@ -246,6 +260,11 @@ BANK = np.dtype(
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
         ("new_accel", "f8", (2, 3)),
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
+        ("path_length", "i8"),
+        ("path_s", "f8"),
+        ("path_sum", "f8", (2, 3)),
+        ("path_span", "f8", PATH),
+        ("path", "f8", (PATH, 2, 3)),
         ("best", "i8"),
         ("rejected", "i8"),
         ("misfit_s", "f8"),  # for how long the readings have not fitted two links with one joint
@@ -320,7 +339,7 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
     """The hypotheses before the first sample: mounting and sensor errors as the rig states them."""
     states = zeros(HYPOTHESES, STATE)
     chain = rig.chain
-    gyro_std = _known(rig.imu.gyro_bias_std_rad_s, parameters.gyro_bias_rad_s)
+    gyro_std = _known(rig.imu.gyro_bias_std_rad_s, parameters.first_gyro_bias_rad_s)
     accel_std = _known(rig.imu.accel_offset_std_m_s2, parameters.accel_bias_m_s2)
     for state in states:
         variance = np.zeros(MAX_SIZE)
@@ -328,7 +347,8 @@ def fresh_states(rig: Rig, parameters: ChainParameters, bank: Any) -> Any:
         for k, (lever, std) in enumerate(levers):
             first = OF_SENSOR * k
             state.lever[k] = (0.0, 0.0, 0.0) if lever is None else lever
-            variance[first + BG : first + BA] = (gyro_std if k == 0 else parameters.gyro_bias_rad_s) ** 2
+            variance[first + BG : first + BA] = (gyro_std if k == 0 else parameters.first_gyro_bias_rad_s) ** 2
+            state.is_narrow[k] = k == 0 and rig.imu.gyro_bias_std_rad_s is not None
             variance[first + BA : first + R] = (accel_std if k == 0 else parameters.accel_bias_m_s2) ** 2
             variance[first + R : first + OF_SENSOR] = np.square(parameters.lever_m if lever is None else std)
         if bank.fixed >= 0:

@@ -39,6 +39,16 @@ def clear_stops(s: Record) -> None:
 
 
 @inner
+def shift_stops(s: Record, by: float) -> None:
+    """The angle from which the others count has changed: all grow by the same (rad)."""
+    s.turn_angle += by
+    s.turn_farthest += by
+    for side in range(2):
+        s.turn_last[side] += by
+        s.stop_angle[side] += by
+
+
+@inner
 def update_stop(s: Record, size: int, angle: float, q: Record) -> None:
     """Follow the angle (rad) and apply a stop that has just been left; H of the angle is in `row`.
 

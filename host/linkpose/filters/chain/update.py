@@ -105,6 +105,11 @@ def add_linearization_errors(s: Record, hinge: int, h: float, q: Record) -> None
     p, keep = s.covariance, min(h / q.relinearized_s, 1.0)
     wider = keep * _of_move(s.moved_heading**2, q)
     o, start = OF_SENSOR + 2, START + 5  # the heading of link 2 at the first sample turns with the present one
+    share = keep * q.relinearized_bias * s.moved_heading**2 / q.relinearized_rad**2
+    for k in range(2):
+        for i in range(OF_SENSOR * k + BG, OF_SENSOR * k + BA):
+            unknown, missing = p[i, i] - q.gyro_bias_rad_s**2, q.first_gyro_bias_rad_s**2 - p[i, i]
+            p[i, i] += max(min(share * unknown, missing), 0.0)
     p[o, o] += wider
     p[o, start] += wider
     p[start, o] += wider
