@@ -83,7 +83,9 @@ _FREE_PASSES = 2  # before the residuals are small enough to measure their corre
 # Largest changes of a calibrated sensor's gyro bias (rad/s), accelerometer offset (m/s²) and scale.
 _AS_CALIBRATED = (0.01, 0.15, 0.01)
 _FIRST_STD = 0.01
-_USUAL_STD, _USUAL_WEIGHT = 0.003, 2.0  # of a calibrated sensor, weighted as this many members
+# Of a calibrated sensor, weighted as this many members. With a weight of 2, 93 % of the J2S of 40 simulated sensors
+# within the data sheet lay within 2σ, with 1 it is 95 %.
+_USUAL_STD, _USUAL_WEIGHT = 0.003, 1.0
 
 
 SENSOR_ERRORS = (
