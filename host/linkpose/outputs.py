@@ -32,22 +32,28 @@ def numbered(path: Path) -> Iterator[Path]:
 
 
 def check_outputs(paths: Iterable[Path], force: bool) -> None:
-    """Raises FileError where two of the files are one, one exists and `force` is not set, or has no folder.
+    """Raises FileError where two of the files are one, one exists and `force` is not set, or its folder is not there
+    or not open to this user.
 
     Called before the work whose results the files take: nobody waits for minutes to learn that a file exists.
     """
-    named = [path if path == STDOUT else path.absolute() for path in paths]
-    for path in named:
-        if named.count(path) > 1:
+    named = [(path, path if path == STDOUT else path.absolute()) for path in paths]
+    for path, place in named:
+        if [other for _, other in named].count(place) > 1:
             raise NamedTwice(path)
         if path == STDOUT:
             continue
-        if path.is_dir():
+        try:
+            is_folder, is_file = path.is_dir(), path.is_file()
+            has_folder = place.parent.is_dir()
+        except OSError as error:  # a folder that is closed to this user, a name that is too long
+            raise CannotWrite(path, error.strerror) from error
+        if is_folder:
             raise CannotWrite(path, "it is a folder")
-        if path.is_file() and not force:
+        if is_file and not force:
             raise FileExists(path)
-        if not path.parent.is_dir():
-            raise CannotWrite(path, f"there is no folder {path.parent}")
+        if not has_folder:
+            raise CannotWrite(path, f"there is no folder {place.parent}")
 
 
 def create(path: Path, force: bool) -> int:

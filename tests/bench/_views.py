@@ -11,6 +11,8 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "host"))
 from browser import Browser  # noqa: E402
 
-HEALTH: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": "ok"}, "baro": {"state": "ok"}})
+HEALTH: Any = SimpleNamespace(
+    rate_hz=100.0, lost=0, sensors={"imu": {"state": "ok"}, "baro": {"state": "ok"}}, silent_s=0.0
+)
 
 __all__ = ["HEALTH", "ROOT", "Browser"]

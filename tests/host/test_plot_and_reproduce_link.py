@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from linkpose import plotting
 from linkpose.cli import plot
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.scores import evaluate
-from linkpose.experiments.mice import PaperRun
+from linkpose.experiments import indoor, underwater
+from linkpose.experiments.mice import PaperRun, paper_run
 from linkpose.experiments.variants import Variant
 from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
@@ -343,19 +345,52 @@ def test_reproduce_link_prints_every_method_on_every_test(linkpose, tmp_path):
 
 def test_reproduce_link_shows_the_papers_tables_beside(linkpose):
     shown = linkpose("reproduce", "link", "--seeds", 1).out
+    assert shown.startswith("Table 1: height RMSE (cm), 1 seed, errors: calibrated\n")
     assert "Table 1" in shown and "Table 2" in shown and "17.34" in shown and "joint A" in shown
 
 
 @pytest.mark.parametrize("errors_m", [(0.033, 0.048), (0.03, 0.09), (0.027, 79.2)])
 def test_the_errors_of_variants_are_labelled_with_plain_numbers(errors_m):
     run = Variant("ekf", "fixed", 0.0, None, scores=[PathScore(error, error, None) for error in errors_m])
-    axis = plotting.variants("Indoor localization", [run], ["ekf, fixed R"]).axes[0].xaxis
+    axis = plotting.variants("Indoor localization", [run], [("gate", "fixed R")]).axes[0].xaxis
     low, high = axis.get_view_interval()
     places = [place for place in axis.get_majorticklocs() if low <= place <= high]
     assert 2 <= len(places) <= 15
     labels = axis.get_major_formatter().format_ticks(places)
     assert [float(label) for label in labels] == pytest.approx(places)
     assert not any(label.get_text() for label in axis.get_ticklabels(minor=True))
+
+
+@pytest.mark.parametrize("experiment", [indoor, underwater])
+def test_the_picture_of_all_variants_has_room_for_the_errors(experiment):
+    """Names of 60 characters left a fifth of the width to the errors, cut the label of the axis and hid its numbers."""
+    if experiment is indoor:
+        compared = list(indoor.variants())
+    else:
+        cases = itertools.product(("asynchronous", "synchronous"), (False, True), (0, underwater.OUTLIERS))
+        compared = [variant for case in cases for variant in underwater._case(*case).variants]
+    for at, variant in enumerate(compared):
+        variant.scores += [PathScore(0.03 * 1.02**at, 0.1, None), PathScore(0.04 * 1.02**at, 0.1, None)]
+    figure = plotting.variants("Localization", compared, [experiment.label(variant) for variant in compared])
+    figure.draw_without_rendering()
+    axes, width = figure.axes[0], figure.bbox.width
+    assert axes.get_window_extent().width > 0.55 * width
+    low, high = axes.get_xlim()
+    texts = [axes.xaxis.label, *axes.get_yticklabels(), *axes.get_legend().get_texts()]
+    inside = [text.get_window_extent() for text in texts]
+    assert min(box.x0 for box in inside) >= 0 and max(box.x1 for box in inside) <= width
+    shown = [text.get_window_extent() for text in axes.get_xticklabels() if low <= text.get_position()[0] <= high]
+    assert len(shown) >= 3
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(shown))
+    rows = [round(line.get_ydata()[0], 2) for line in axes.lines if line.get_marker() == "o"]
+    assert len(set(rows)) == len(rows) == len(compared)
+
+
+def test_the_panels_of_the_redundant_mice_begin_at_one_height():
+    figure = plotting.redundant_mice(paper_run(3, 0))
+    figure.draw_without_rendering()
+    left, right = (axes.get_legend().get_window_extent() for axes in figure.axes[:2])
+    assert left.y1 == pytest.approx(right.y1, abs=2)
 
 
 def test_a_legend_reads_row_by_row_and_single_values_are_dots(tmp_path):

@@ -128,7 +128,7 @@ def test_an_estimate_is_drawn_with_its_errors_along_the_way(floor, number: str, 
     band = position.collections[0].get_paths()[0].get_extents()
     assert band.y1 == pytest.approx(2 * 2.0)  # 2σ in cm
     within = 100 * np.mean(drawn.error_m <= 2 * drawn.std_m)
-    assert position.collections[0].get_label() == f"2σ ({within:.0f} % of the errors within)"
+    assert position.collections[0].get_label() == f"2σ ({within:.0f} % within)"
     assert position.get_ylim() == floor["3.2"].axes[1].get_ylim()  # comparable between the figures
     assert f"{100 * drawn.rms_m:.1f} cm rms" in floor[number].get_suptitle()
 

@@ -39,6 +39,40 @@ def test_a_folder_that_is_missing_is_named(refused, tmp_path):
     assert "there is no folder" in sentence and not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("simulate", "link", "-o", "OUT.csv", "--truth", "t.csv"),
+        ("estimate", "--live", "--port", "sim://link", "-o", "OUT.csv"),
+        ("reproduce", "mice", "--seeds", 1, "--plot", "OUT.png"),
+        ("plot", "r.csv", "-o", "OUT.png"),
+        ("evaluate", "r.csv", "t.csv", "--plot", "OUT.png"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_an_output_that_cannot_be_made_is_named_with_what_to_do(command, refused, tmp_path, monkeypatch):
+    """A closed folder fails in the same way, except for the superuser."""
+    monkeypatch.chdir(tmp_path)
+    sentence = refused(*(str(word).replace("OUT", "x" * 300) for word in command))
+    assert sentence.startswith("linkpose: cannot write xxx")
+    assert sentence.endswith("File name too long; name a file in a folder you may write to")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_rig_file_that_cannot_be_made_is_named(linkpose, refused, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("simulate", "link", "-o", recording, "--truth", tmp_path / "t.csv", "--duration", 20)
+    sentence = refused("calibrate", "joint", recording, "--rig", tmp_path / ("x" * 300))
+    assert sentence.startswith("linkpose: cannot write the rig file") and "folder you may write to" in sentence
+
+
+def test_the_statistics_of_the_noise_stand_in_columns(linkpose, tmp_path):
+    shown = linkpose("simulate", "underwater", "-o", tmp_path / "u.csv", "--truth", tmp_path / "t.csv", "--duration", 5)
+    lines = shown.out.splitlines()
+    assert lines[0].split() == ["check", "asked", "measured"] and len(lines) > 20
+    assert {line[lines[0].index("asked") - 2 : lines[0].index("asked")] for line in lines} == {"  "}
+
+
 @pytest.mark.parametrize("kind", ["link", "mice"])
 def test_a_duration_that_does_not_fit_is_refused(kind, refused, tmp_path):
     sentence = refused("simulate", kind, "-o", tmp_path / "r", "--truth", tmp_path / "t", "--duration", "1e9")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
+from linkpose.errors import CannotWrite
 from linkpose.sensors.rig import LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig
 
 if TYPE_CHECKING:
@@ -363,7 +364,11 @@ def recordings_and_rig(
     loaded = [load_recording(path) for path in paths]
     for remark in (remark for recording in loaded for remark in recording.remarks):
         report(remark)
-    return loaded, resolve_rig(rig_file if rig_file.exists() else None, None, loaded[0].rig)
+    try:
+        is_there = rig_file.exists()
+    except OSError as error:
+        raise CannotWrite(rig_file, error.strerror, "the rig file") from error
+    return loaded, resolve_rig(rig_file if is_there else None, None, loaded[0].rig)
 
 
 # The recording that a calibration needs: its file, and the motion of the simulated link.

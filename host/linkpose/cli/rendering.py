@@ -50,11 +50,14 @@ def wrapped(text: str, stream: TextIO) -> str:
 
 
 def show_table(table: Table) -> None:
-    """Prints a table. It is never cut: a narrow terminal wraps its lines, and a file or a pipe gets whole ones."""
+    """Prints a table below its title. It is never cut: a narrow terminal wraps its lines, a file gets whole ones."""
     from rich.console import Console
 
     console = Console()
     console.width = max(console.width, _TABLE_WIDTH)
+    title, table.title = table.title, None  # above the table, rich would wrap it at the table's width
+    if title:
+        console.print(title, highlight=False)
     console.print(table)
 
 

@@ -44,8 +44,9 @@ def _show(entries: list[Entry], seeds: int, errors: str) -> None:
 
     from linkpose.cli.rendering import show_table
     from linkpose.experiments.link import PAPER_ROLL_PITCH_DEG, title
+    from linkpose.presentation import counted
 
-    heights = Table("test", "method", title=f"Table 1: height RMSE (cm), {seeds} seeds, errors: {errors}")
+    heights = Table("test", "method", title=f"Table 1: height RMSE (cm), {counted(seeds, 'seed')}, errors: {errors}")
     for name in ("mean", "spread", "worst", "paper", "mean ‖a‖ (m/s²)"):
         heights.add_column(name, justify="right")
     attitudes = Table("test", "method", title="Table 2: roll and pitch RMSE (°), mean")

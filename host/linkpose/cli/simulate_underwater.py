@@ -64,6 +64,7 @@ def command(
 
     Prints the statistics of the noise as set and as computed from the log.
     """
+    from linkpose.cli.rendering import as_table
     from linkpose.outputs import check_outputs
     from linkpose.simulation.export import write_underwater
     from linkpose.simulation.underwater import UnderwaterErrors, self_check, simulate_underwater
@@ -79,9 +80,8 @@ def command(
     )
     run = simulate_underwater(seed, errors, duration, synchronous)
     write_underwater(run, seed, output, truth, beacons, force)
-    for row in self_check(run):
-        values = {"check": row.check, "asked": row.asked, "measured": row.measured}
-        click.echo(
-            json.dumps(values) if json_lines else f"{row.check:<20} asked {row.asked:<8g} measured {row.measured:.5g}"
-        )
+    rows: list[dict[str, object]] = [
+        {"check": row.check, "asked": row.asked, "measured": row.measured} for row in self_check(run)
+    ]
+    click.echo("\n".join(map(json.dumps, rows)) if json_lines else as_table(rows))
     options.show_next(quiet, "localize", output, "--beacons", beacons, "--truth", truth)

@@ -128,15 +128,14 @@ def _find(
     return next(v for v in compared if (v.filter, v.noise, v.correlation, v.gate, v.others) == wanted)
 
 
-def label(variant: Variant) -> str:
-    """The variant in one line of a plot: the filter, R, and what differs from the plain case."""
+def label(variant: Variant) -> tuple[str, str]:
+    """For a plot: what the drives and the gate are like, and the settings that are compared under these conditions."""
     of_q, transform, unmapped = (variant.others[name] for name in ("motion_correlation", "transform", "unmapped"))
-    words = [variant.filter, f"{variant.noise} R"]
-    words += [f"correlated R ({variant.correlation:g})"] * bool(variant.correlation)
-    words += [f"correlated Q ({of_q})"] * bool(of_q)
-    words += [f"{transform} transform"] * (transform != "unscented")
-    words += ["no gate"] * (not variant.gate)
-    return ", ".join([*words, *[f"unmapped beams ({unmapped})"] * bool(unmapped)])
+    conditions = ["gate" if variant.gate else "no gate"]
+    conditions += [f"{unmapped:.0%} of the beams unmapped".replace("%", " %")] * bool(unmapped)
+    words = [f"{variant.noise} R", *[f"{transform} transform"] * (transform != "unscented")]
+    words += [f"ρ of R = {variant.correlation:g}"] * bool(variant.correlation)
+    return ", ".join(conditions), ", ".join([*words, *[f"ρ of Q = {of_q}"] * bool(of_q)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -200,14 +200,16 @@ def _find(
     return next(v for v in case.variants if (v.filter, v.gate, v.correlation > 0) == (name, gate, rho))
 
 
-def label(variant: Variant) -> str:
-    """The variant in one line of a plot: the filter, when sensors are read, and what differs from the plain case."""
+def label(variant: Variant) -> tuple[str, str]:
+    """For a plot: what the measurements are like, and the settings that are compared under these conditions."""
     common_m, outliers = variant.others["correlation_std_m"], variant.others["outliers"]
-    words = [variant.filter, str(variant.others["timing"])]
-    words += [f"correlated R ({variant.correlation:g})"] * bool(variant.correlation)
-    words += ["no gate"] * (not variant.gate)
-    words += [f"common error {common_m} m"] * bool(common_m)
-    return ", ".join([*words, *[f"{outliers} outliers"] * bool(outliers)])
+    conditions = [str(variant.others["timing"])]
+    conditions += [f"common error {common_m} m"] * bool(common_m)
+    conditions += [f"{outliers} outliers"] * bool(outliers)
+    words = ["gate" if variant.gate else "no gate"]
+    return ", ".join(conditions), ", ".join(
+        [*words, *[f"ρ of R = {variant.correlation:g}"] * bool(variant.correlation)]
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from linkpose.errors import CannotWrite, FileExists, UnknownPicture
-from linkpose.outputs import STDOUT, new_file
+from linkpose.errors import CannotWrite, UnknownPicture
+from linkpose.outputs import STDOUT, check_outputs, new_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -191,10 +191,7 @@ def check_output(path: Path | None, force: bool, formats: Sequence[str] = FORMAT
         return
     if path.suffix.lower() not in formats:
         raise UnknownPicture(path, formats)
-    if path.exists() and not force:
-        raise FileExists(path)
-    if not path.absolute().parent.is_dir():
-        raise CannotWrite(path, f"there is no folder {path.absolute().parent}")
+    check_outputs((path,), force)
 
 
 def picture_files(place: Path, whole: str, names: Sequence[str], force: bool) -> dict[str, Path]:

@@ -24,6 +24,7 @@ _SHOWN_S = (30.0, 35.0)  # the five seconds of Figure 2 (a) and (b)
 _WHOLE = 3  # Figure 2 shows the whole run of this Test
 _MICE_SHOWN_S = 4.0
 _VARIANT_LETTERING = 7.0  # points: names of variants beside their errors
+_APART = 0.4  # rows between two filters in one row
 
 
 def paper_figure_2(runs: Sequence[Traces]) -> Figure:
@@ -74,6 +75,7 @@ def redundant_mice(run: PaperRun) -> Figure:
             place.axhline(scale * run.truth[j], label="truth", **TRUTH)
             finish(place, "")
         axes[j, 0].set_ylabel(label)
+    figure.draw_without_rendering()  # lays the axes out: the entries of a legend fit in one row just so
     for place, title in zip(axes[0], ("Each mouse alone (Figure 2)", "Least squares (Figure 3)"), strict=True):
         legend_above(place, title=title)
     for place in axes[-1]:
@@ -82,24 +84,44 @@ def redundant_mice(run: PaperRun) -> Figure:
     return figure
 
 
-def variants(title: str, compared: Sequence[Variant], labels: Sequence[str]) -> Figure:
-    """Position error of each variant: a dot for each seed, a bar for the mean."""
-    figure = new_figure(1.2 + 0.17 * len(compared), title)
+def variants(title: str, compared: Sequence[Variant], labels: Sequence[tuple[str, str]]) -> Figure:
+    """Position error of each variant: a dot for each seed, a bar for the mean.
+
+    `labels` are the conditions and the settings of each. Variants of the same conditions stand together, and those of
+    the same settings in one row, a filter above the other.
+    """
+    rows = _rows_of_variants(labels)
+    figure = new_figure(1.2 + 0.17 * len(rows), title)
     axes = figure.add_subplot()
-    for row, variant in enumerate(compared):
+    names = list(dict.fromkeys(variant.filter for variant in compared))
+    for variant, of in zip(compared, labels, strict=True):
         errors = [score.position_rmse_m for score in variant.scores]
+        row = rows.index(of) + _APART * (names.index(variant.filter) - 0.5 * (len(names) - 1))
         colour = line_style(variant.filter)["color"]
-        axes.plot(errors, [row] * len(errors), "o", color=colour, alpha=0.5, markersize=4, label=variant.filter)
-        axes.plot([variant.position_rmse_m()], [row], "|", color=colour, markersize=11, markeredgewidth=2)
-    axes.set_yticks(range(len(compared)), labels, fontsize=_VARIANT_LETTERING)
+        axes.plot(errors, [row] * len(errors), "o", color=colour, alpha=0.5, markersize=3, label=variant.filter)
+        axes.plot([variant.position_rmse_m()], [row], "|", color=colour, markersize=6, markeredgewidth=2)
+    axes.plot([], [], "|", color="black", markersize=6, markeredgewidth=2, label="mean of the runs")
+    axes.set_yticks(range(len(rows)), [settings or conditions for conditions, settings in rows])
     axes.set_xscale("log")
     _label_plainly(axes.xaxis)
-    axes.set_xlabel("position error, rms of a run (m); bars: mean over the seeds")
+    axes.set_xlabel("position error, rms of a run (m)")
     finish(axes, "")
+    for text, (_, settings) in zip(axes.get_yticklabels(), rows, strict=True):
+        text.set_fontsize(_VARIANT_LETTERING)
+        text.set_fontweight("normal" if settings else "bold")
+    axes.tick_params(axis="y", length=0)
     axes.margins(x=0.05)
-    axes.set_ylim(len(compared), -1)
-    legend_above(axes)
+    axes.set_ylim(len(rows), -1)
+    legend_above(axes, [*names, "mean of the runs"])
     return figure
+
+
+def _rows_of_variants(labels: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Conditions and settings, from top to bottom; the heading of a group of rows has no settings."""
+    groups: dict[str, dict[str, None]] = {}
+    for conditions, settings in labels:
+        groups.setdefault(conditions, {})[settings] = None
+    return [(conditions, of) for conditions, settings in groups.items() for of in ("", *settings)]
 
 
 def _label_plainly(axis: Axis) -> None:

@@ -74,7 +74,7 @@ def _titled(height_inches: float, number: str, words: str) -> Figure:
 
 
 def _summary(path: ComparedPath) -> str:
-    return f"position error {100 * path.rms_m:.1f} cm rms, {100 * path.error_m.max():.0f} cm at most"
+    return f"{100 * path.rms_m:.1f} cm rms, {100 * path.error_m.max():.0f} cm at most"
 
 
 def _plot(axes: Axes, points: Floats, **style: object) -> None:
@@ -111,7 +111,7 @@ def _map_and_path(drive: DrawnDrive) -> Figure:
 
 def _estimate(number: str, path: ComparedPath, grid: GridMap, largest: tuple[float, float]) -> Figure:
     """Figures 3.2, 3.3, 3.5, 3.6: the path on the map over its errors along the way."""
-    figure = _titled(6.4, number, f"{path.label}, simulated: {_summary(path)}")
+    figure = _titled(6.4, number, f"{path.label}, simulated: position error {_summary(path)}")
     above, position, heading = figure.subplots(3, 1, height_ratios=[3.2, 1.5, 1.5])
     draw_map(above, grid)
     _plot(above, path.position_m, label=path.filter, **line_style(path.filter) | _UNDER_TRUTH)
@@ -143,7 +143,7 @@ def _errors(position: Axes, heading: Axes, path: ComparedPath, along: Floats, la
 def _position_error(axes: Axes, path: ComparedPath, along: Floats, largest: tuple[float, float]) -> None:
     style = line_style(path.filter) | {"linewidth": 0.9}
     within = 100 * np.mean(path.error_m <= 2 * path.std_m)
-    label = f"2σ ({within:.0f} % of the errors within)"
+    label = f"2σ ({within:.0f} % within)"
     axes.fill_between(along, 0.0, 200 * path.std_m, label=label, color=style["color"], alpha=BAND_ALPHA, linewidth=0)
     axes.plot(along, 100 * path.error_m, label=path.filter, **style)
     axes.set_ylim(0.0, 100 * _HEADROOM * largest[0])
@@ -264,7 +264,7 @@ def _from_above_among_beacons(axes: Axes, path: ComparedPath, beacons: Beacons) 
 
 def _dive_estimate(number: str, path: ComparedPath, beacons: Beacons, largest: tuple[float, float]) -> Figure:
     """Figures 3.9 and 3.10: the path from above, the depth, and the errors over time."""
-    figure = _titled(5.2, number, f"{path.label}, simulated: {_summary(path)}")
+    figure = _titled(5.2, number, f"{path.label}, simulated: position error {_summary(path)}")
     above, (depth, position, heading) = _beside(figure, 3)
     _from_above_among_beacons(above, path, beacons)
     depth.plot(path.time_s, -path.position_m[:, 2], **line_style(path.filter) | _UNDER_TRUTH)
