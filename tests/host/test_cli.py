@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from linkpose.cli import COMMANDS
+from linkpose.cli.characters import replacement
 from linkpose.device import ports
 from linkpose.device.ports import PortInfo
 from linkpose.recording.table import read_table
@@ -231,7 +232,9 @@ def test_every_command_has_help(linkpose):
     listing = linkpose("--help").out
     for name in COMMANDS:
         assert name in listing
-        assert linkpose(name, "--help").out.startswith(f"Usage: linkpose {name}")
+        shown = linkpose(name, "--help").out
+        assert shown.startswith(f"Usage: linkpose {name}")
+        assert "?" not in replacement("".join(char for char in shown if not char.isascii()))  # on a code page
     assert linkpose("--version").out.strip().startswith("linkpose, version")
 
 

@@ -252,7 +252,7 @@ class Sectioned(click.Command):
     type=click.Choice(["fixed", "adaptive", "affine"]),
     default=DEFAULTS.noise,
     show_default=True,
-    help="How the variance of a range follows from it: σ², η (r/r̄) σ², or σ² + (k r)² with the growth k.",
+    help="How the variance of a range follows from it: σ², η (r/mean r) σ², or σ² + (k r)² with the growth k.",
 )
 @_number("--eta", "eta", "η of --noise adaptive.")
 @_number("--correlation", "correlation", "Between ranges taken at one instant.")
