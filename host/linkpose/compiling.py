@@ -46,7 +46,7 @@ from numba.core.caching import (
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 
-from linkpose.lean_compiler import Inner, Outer
+from linkpose.lean_compiler import Inner, Outer, interruptible
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -282,8 +282,12 @@ class _KeptCode(FunctionCache):  # type: ignore[misc]
         Numba's own method first registers all that it can compile (0.6 s of CPU and an import of scipy). Loading needs
         the runtime's symbols alone, and compiling registers the rest anyway.
         """
+        with interruptible():
+            rtsys.initialize(target_context)
+            return self._load(sig, target_context)
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         key = self._index_key(sig, target_context.codegen())
-        rtsys.initialize(target_context)
         for files in self._layers:
             try:
                 data = files.load(key)

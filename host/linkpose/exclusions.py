@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,15 +38,12 @@ class Exclusions:
                 since_s[mouse] = self._since_s.get(mouse, float(rows[0, 0]))
         self._since_s = since_s
 
-    @property
-    def names(self) -> set[str]:
-        """The sensors that are left out: mouse1, ..."""
-        return {f"mouse{mouse}" for mouse in self._since_s}
-
-    def lines(self) -> list[str]:
-        """One line for each mouse that is left out."""
+    def lines(self, faulty: Collection[str] = ()) -> list[str]:
+        """One line for each mouse that is left out although it answers; `faulty` are those that do not: mouse1, ..."""
         return [
-            f"mouse {mouse} LEFT OUT since {since:.1f} s (disagrees)" for mouse, since in sorted(self._since_s.items())
+            f"mouse {mouse} LEFT OUT since {since:.1f} s (disagrees)"
+            for mouse, since in sorted(self._since_s.items())
+            if f"mouse{mouse}" not in faulty
         ]
 
 

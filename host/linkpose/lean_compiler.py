@@ -17,10 +17,11 @@ import contextlib
 import functools
 import gc
 import operator
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from llvmlite.binding import Linkage
+from llvmlite.binding import Linkage, executionengine
 from numba.core import base, ir, lowering, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
@@ -145,6 +146,44 @@ def _remembering() -> Iterator[None]:
         _functions.get_call_type, base._has_loc = _resolve, inspected
 
 
+_make_usable = JITCodeLibrary._finalize_specific
+
+
+def _make_usable_or_raise(library: Any) -> None:
+    """Numba's last step to machine code. Raises what the handler of a signal raised meanwhile, such as Ctrl-C's.
+
+    LLVM hands the machine code to a function in Python, or asks it for the stored one. A signal that came before is
+    handled there, and ctypes drops the exception: Ctrl-C was lost, and what was missing then made numba fail ("no
+    compiled object yet") or the process crash.
+    """
+    lost: list[BaseException] = []
+
+    def keep(unraisable: Any) -> None:
+        trace, error = unraisable.exc_traceback, unraisable.exc_value
+        if trace is not None and error is not None and trace.tb_frame.f_globals is vars(executionengine):
+            lost.append(error)
+        else:
+            before(unraisable)
+
+    before, sys.unraisablehook = sys.unraisablehook, keep
+    try:
+        _make_usable(library)
+    finally:
+        sys.unraisablehook = before
+    if lost:
+        raise lost[0]
+
+
+@contextlib.contextmanager
+def interruptible() -> Iterator[None]:
+    """Within this context, Ctrl-C while numba loads or compiles raises KeyboardInterrupt."""
+    before, JITCodeLibrary._finalize_specific = JITCodeLibrary._finalize_specific, _make_usable_or_raise
+    try:
+        yield
+    finally:
+        JITCodeLibrary._finalize_specific = before
+
+
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code that is optimised once, as a whole, when the outermost function is complete."""
 
@@ -208,7 +247,7 @@ class Outer(CompilerBase):  # type: ignore[misc]
         searches = gc.isenabled()
         gc.disable()
         try:
-            with _remembering():
+            with _remembering(), interruptible():
                 return super().compile_extra(func)
         finally:
             if searches:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from linkpose import quantities
 from linkpose.quantities import Quantity
@@ -41,7 +41,10 @@ UNKNOWN = "not known"  # in place of a value
 _MOST_DECIMALS = 4  # that a column of lengths aligns
 _MOST_ERROR_DECIMALS = 6
 _ANGLE_DECIMALS = ((0.0095, 3), (0.095, 2), (9.95, 1), (math.inf, 0))  # σ (°) below -> decimals
-_STATES = ("being set up", "left out")  # that need no cure here
+STALE_S = 1.0  # without a sample, from which on estimates are out of date: a busy computer delays samples by less
+_FINE = ("ok", "absent", "left out", None)  # states of a sensor that are no fault of its own
+_WIRING, _MOUSE_WIRING = "check VCC, SDA=A4, SCL=A5", "check its cable and pull-ups"
+_POWER = "unplug the board and plug it in again"
 
 
 class RowReader:
@@ -66,12 +69,12 @@ class RowReader:
             name: {quantity: rows[:, value] for quantity, value, _ in found} for name, found in self._of_filter.items()
         }
 
-    def read(self, estimates: Sequence[float]) -> Row:
-        """One row of estimates (columns,)."""
+    def read(self, estimates: Sequence[float], names: Iterable[str] | None = None) -> Row:
+        """One row of estimates (columns,), of all filters or of these."""
         known = [*estimates, math.nan]
         return {
-            name: {quantity: (known[value], known[std]) for quantity, value, std in found}
-            for name, found in self._of_filter.items()
+            name: {quantity: (known[value], known[std]) for quantity, value, std in self._of_filter[name]}
+            for name in (self._of_filter if names is None else names)
         }
 
 
@@ -84,17 +87,45 @@ def best_filter(row: Row, filters: Iterable[str], quantity: Quantity) -> str | N
 
 def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
     """One line for each sensor that does not work, with what to check, and for each mouse that is left out."""
-    lines = []
-    for name, of in health.sensors.items():
-        state = of.get("state")
-        if state in ("ok", "absent", None) or name in exclusions.names:
-            continue
-        cure = "check VCC, SDA=A4, SCL=A5" if not name.startswith("mouse") else "check its cable and pull-ups"
-        if state in _STATES:
-            lines.append(f"{name.upper()} is {state}")
-        else:
-            lines.append(f"{name.upper()} {state.upper()}: {cure}")
-    return lines + exclusions.lines()
+    faulty = faulty_sensors(health)
+    lines = [_fault_line(name, health) for name in faulty]
+    if health.silent_s > STALE_S:
+        lines.insert(0, f"NO SAMPLES ({health.silent_s:.1f} s): check the cable of the board")
+    return lines + exclusions.lines(faulty)
+
+
+def faulty_sensors(health: Health) -> list[str]:
+    """The names of the sensors whose readings are missing or wrong: imu, mouse1, ..."""
+    return [name for name, of in health.sensors.items() if of.get("state") not in _FINE]
+
+
+def _fault_line(name: str, health: Health) -> str:
+    of = health.sensors[name]
+    state = state_text(of)
+    if state == "being set up":
+        return f"{name.upper()} is {state}"
+    lasted = f" ({health.duration_s - of['since_s']:.1f} s)" if "since_s" in of else ""
+    wiring = _MOUSE_WIRING if name.startswith("mouse") else _WIRING
+    return f"{name.upper()} {state.upper()}{lasted}: {wiring if of['state'] in ('silent', 'blank') else _POWER}"
+
+
+def state_text(sensor: Mapping[str, Any]) -> str:
+    """The state of a sensor in words; `sensor` is its part of Health.sensors."""
+    state = str(sensor.get("state"))
+    return "not answering" if state == "silent" else state
+
+
+def lost_filters(names: Iterable[str], health: Health, needed: Callable[[str], Iterable[str]]) -> list[str]:
+    """The filters that have lost what they need: samples, or one of the sensors `needed(filter)`."""
+    faulty = set(faulty_sensors(health))
+    is_stale = health.silent_s > STALE_S
+    return [name for name in names if is_stale or faulty.intersection(needed(name))]
+
+
+def current(row: Row, health: Health, needed: Callable[[str], Iterable[str]]) -> Row:
+    """The row with NaN for each filter that has lost what it needs, as in `lost_filters`."""
+    lost = lost_filters(row, health, needed)
+    return row | {name: dict.fromkeys(row[name], (math.nan, math.nan)) for name in lost}
 
 
 def working_sensors(health: Health) -> list[str]:
@@ -114,7 +145,9 @@ def angle_with_std(value_deg: float, std_deg: float) -> str:
     """An angle and its standard deviation (°), to the same digit: +13.1° ±0.4°, +13.12° ±0.05°."""
     if not math.isfinite(value_deg + std_deg):
         return signed_angle(value_deg)
-    decimals = next(count for below, count in _ANGLE_DECIMALS if std_deg < below)
+    for below, decimals in _ANGLE_DECIMALS:  # noqa: B007  # the last one is infinite
+        if std_deg < below:
+            break
     bound = max(std_deg, 10.0**-decimals)  # ±0 would claim certainty
     return f"{signed_angle(value_deg, decimals)} ±{bound:.{decimals}f}°"
 
@@ -169,7 +202,10 @@ def std_text(std_m: float) -> str:
 
 def _digits(std_m: float) -> _Digits:
     """An unknown σ gives a value in mm."""
-    return next((digits for digits in _LENGTH_DIGITS if std_m < digits.below_m), _LENGTH_DIGITS[-2])
+    for digits in _LENGTH_DIGITS:
+        if std_m < digits.below_m:
+            return digits
+    return _LENGTH_DIGITS[-2]
 
 
 def same_digits(first: float, *others: float) -> list[str]:

@@ -59,7 +59,9 @@ def test_without_o_the_estimates_go_to_stdout(linkpose, tmp_path):
     linkpose("record", recording, "--port", SIM, "--duration", 1)
     done = linkpose("estimate", recording)
     assert done.out.startswith("# linkpose estimate 1\n# {")
-    assert len(done.out.splitlines()) == 103
+    assert len(done.out.splitlines()) == 104
+    assert json.loads(done.out.splitlines()[-1].removeprefix("# "))["rows"] == 100
+    assert linkpose("estimate", recording, "--plain").out.count("\n") == 101
 
 
 def test_a_filter_that_cannot_run_is_named_with_its_reason(linkpose, refused, tmp_path):

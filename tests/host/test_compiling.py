@@ -276,6 +276,38 @@ def test_ctrl_c_leaves_what_compiles_to_the_run_that_started_it(tmp_path):
     assert (output.splitlines()[-1], errors) == ("True", "")
 
 
+INTERRUPTED = """
+import os, signal
+import numpy as np
+from numba.core.registry import cpu_target
+from linkpose.recording import fixedpoint
+engine, sent = cpu_target.target_context.codegen()._engine._ee, []
+def interrupt(module, *code):
+    if ("_format" in module.name) == IS_OURS and not sent:
+        sent.append(module)
+        os.kill(os.getpid(), signal.SIGINT)
+    return before(module, *code)
+before, engine.HOOK = engine.HOOK, interrupt
+try:
+    fixedpoint.format_rows(np.array([[1.25]]), np.array([2]))
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@pytest.mark.parametrize(
+    ("state", "hook", "is_ours"), [("cold", "notify", True), ("cold", "notify", False), ("warm", "getbuffer", True)]
+)
+def test_ctrl_c_while_llvm_calls_back_stops_the_compiler_and_loses_nothing(tmp_path, state, hook, is_ours):
+    """ctypes dropped it: "no compiled object yet" followed, and a crash where stored code was loaded."""
+    place = {"NUMBA_CACHE_DIR": tmp_path / "cache"}
+    if state == "warm":
+        run(TEXT, HOST, **place)
+    code = INTERRUPTED.replace("HOOK", f"_object_cache_{hook}").replace("IS_OURS", str(is_ours))
+    assert run(code + TEXT, HOST, **place) == f"interrupted\n1.25 {int(state == 'warm')}"
+    assert run(TEXT, HOST, **place) == "1.25 1"
+
+
 def test_progress_is_shown_on_a_real_cache_miss_only(tmp_path):
     place = {"NUMBA_CACHE_DIR": tmp_path / "cache", "NUMBA_DISABLE_JIT": 1}
     first = eval(run(PREPARE, HOST, **place))

@@ -9,6 +9,7 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -29,7 +30,7 @@ from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
 from linkpose.page import Page, PageStatus, geometry
-from linkpose.page.changes import Changes
+from linkpose.page.changes import Changes, uncompressed_frame
 from linkpose.page.history import PATH_POINTS, SPAN_S, History
 from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
@@ -68,7 +69,8 @@ def link_rows(count: int = 200) -> np.ndarray:
 
 
 def status(imu: str = "ok") -> Callable[[], PageStatus]:
-    health: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors={"imu": {"state": imu}, "baro": {"state": "ok"}})
+    sensors = {"imu": {"state": imu}, "baro": {"state": "ok"}}
+    health: Any = SimpleNamespace(rate_hz=100.0, lost=0, sensors=sensors, silent_s=0.0)
     return lambda: PageStatus(health)
 
 
@@ -119,11 +121,12 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         band = browser.evaluate(f"[...{chart_data('height')}[2]]")
         assert max(filter(None, band)) < 2.0
         assert len(missing) == 11 and rows[99, 0] < missing[0] < rows[100, 0]
-        page.show(np.empty(0), status(imu="not answering"))
+        page.show(np.empty(0), status(imu="silent"))
         alarm = "[...document.querySelectorAll('[role=alert]')].find(e => e.innerText.includes('IMU NOT ANSWERING'))"
         browser.wait_for(alarm)
         assert browser.evaluate(f"getComputedStyle({alarm}).backgroundColor") == "rgb(201, 42, 42)"
-        assert "IMU ok" not in browser.evaluate("document.body.innerText")
+        text = browser.evaluate("document.body.innerText")
+        assert "IMU ok" not in text and "not known" in text and "m ±2.0 cm" not in text
         found = FoundJ2s.of(np.array([0.0, 0.0, 1.6]), np.diag([1e-6, 1e-6, 0.04]))
         page.show(np.empty(0), lambda: PageStatus(status()().health, found))
         browser.wait_for_text("not excited yet: J2S along the sensor's z axis. Turn the link about x or y.")
@@ -331,6 +334,68 @@ def test_a_browser_that_reads_nothing_gets_no_more_until_it_does(monkeypatch: py
         changes.write(element, "1.5 m")
         changes.broadcast({1, 2})
     assert sent == [[connections[1]], list(connections.values())]
+
+
+@pytest.mark.parametrize("size", [1, 735, 1 << 17, (1 << 17) + 1, 300_000])
+def test_messages_travel_as_zstd_frames_without_compression(size: int) -> None:
+    data = np.random.default_rng(1).bytes(size)
+    frame = uncompressed_frame(data)
+    assert zstandard.ZstdDecompressor().decompress(frame) == data
+    assert zstandard.frame_content_size(frame) == size
+
+
+def decoded(message: bytes) -> tuple[list[dict[str, Any]], Callable[[dict[str, Any]], list[float]]]:
+    """The messages of viser in one of the server, and a function that reads the array of a placeholder."""
+    text_size, frame_size = struct.unpack_from("<QQ", message)
+    text = zstandard.ZstdDecompressor().decompress(message[16 : 16 + frame_size])
+    assert len(text) == text_size
+    content, starts, at = msgspec.msgpack.decode(text), [], 16 + frame_size
+    for length in content["binaryBufferLengths"]:
+        at += -at % 8
+        starts.append(at)
+        at += length
+
+    def array(of: dict[str, Any]) -> list[float]:
+        index, kind = of["__binary_index"], np.dtype(of["dtype"])
+        count = content["binaryBufferLengths"][index] // kind.itemsize
+        return list(np.frombuffer(message, kind, count, starts[index]))
+
+    return content["messages"], array
+
+
+def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
+    """A sample waits for one update on its way to the screen; charts, which are large, may be later."""
+    rows, sent = link_rows(), []
+    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
+        page._is_closed = True  # the updates are made here
+        page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, assignment, dict-item, return-value]
+        transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
+        page._changes._socket._live_connections = {7: SimpleNamespace(transport=transport)}  # type: ignore[dict-item]
+        page._changes._broadcast = lambda _, message: sent.append(decoded(message))  # type: ignore[assignment]
+        for row in rows[:14]:
+            page.show(row, status())
+            page._update()
+    assert len(sent) == 14
+    for row, (messages, _) in zip(rows, sent, strict=False):
+        assert any(f"{row[1]:.3f} m ±2.0 cm" in str(m.get("updates")) for m in messages)
+        turn = next(m["wxyz"] for m in messages if m.get("name") == "/link" and "wxyz" in m)
+        assert turn == pytest.approx(geometry.attitude(row[3], row[5], 0.0))
+    charts = [(array, m["updates"]["data"]) for messages, array in sent for m in messages if "data" in str(m)]
+    assert len(charts) == 3 * 3  # with the first, the seventh and the thirteenth row
+    array, (time, low, high, height) = charts[6]
+    assert array(time) == pytest.approx(rows[:13, 0])
+    assert array(height) == pytest.approx(rows[:13, 1])
+    assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(13), rel=1e-4)
+
+
+def test_an_error_of_the_sender_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: Page) -> None:
+        raise RuntimeError("cannot draw")
+
+    monkeypatch.setattr(Page, "_update", fail)
+    with Page(LINK, Rig(), "sim://link") as page, pytest.raises(RuntimeError, match="cannot draw"):
+        while True:
+            page.raise_if_stopped()
 
 
 def test_no_file_of_the_machine_is_served_and_the_page_has_its_title() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,7 +34,7 @@ OK = {"imu": {"state": "ok"}, "baro": {"state": "ok"}}
 
 
 def health(**sensors: dict[str, Any]) -> Any:
-    return SimpleNamespace(rate_hz=100.0, lost=0, sensors=OK | sensors)
+    return SimpleNamespace(rate_hz=100.0, lost=0, sensors=OK | sensors, duration_s=30.0, silent_s=0.0)
 
 
 def table(interval_s: float, rows: Sequence[Row]) -> tuple[list[str], Floats]:
@@ -105,11 +106,40 @@ def test_faults_and_exclusions_are_never_cut(width: int) -> None:
     rows = [{"planar-ekf": pose, "mice": {**pose, quantities.EXCLUDED: (mask, math.nan)}} for mask in masks]
     screen = screen_of("sim://mice", 0.1, rows)
     shown = screen.render(health(imu={"state": "silent"}), width, 6).plain
-    assert "IMU SILENT" in shown
+    assert "IMU NOT ANSWERING" in shown
     assert "mouse 2 LEFT OUT since 5.1 s" in shown
     mice = {f"mouse{port}": {"state": "left out" if port == 2 else "ok"} for port in (1, 2, 3)}
     shown = screen.render(health(**mice), width, 20).plain
     assert all(state in shown for state in ("MOUSE1 ok", "MOUSE2 left out", "MOUSE3 ok")) and "MOUSE2 is" not in shown
+
+
+def test_a_faulty_sensor_blanks_the_estimates_that_need_it_and_says_since_when() -> None:
+    """Filters predict on for seconds; a frozen number beside a fault would pass for a measurement."""
+    rows = [{"joint": {quantities.HEIGHT: (1.5, 0.1)}, "baro": {quantities.HEIGHT: (1.7, 0.3)}}] * 9
+    screen = screen_of("sim://link", 0.1, rows)
+    lines = screen.render(health(imu={"state": "silent", "since_s": 25.9}), 80, 24).plain.splitlines()
+    assert (
+        lines[1] == "IMU NOT ANSWERING (4.1 s): check VCC, SDA=A4, SCL=A5" and "IMU not answering BARO ok" in lines[0]
+    )
+    assert lines[2].split("   ")[1] == "1.700 m ±30.0 cm"
+    assert [line.split()[:3] for line in lines[-2:]] == [["joint", "–", "–"], ["▸", "baro", "1.700"]]
+    frozen = screen.render(health(imu={"state": "frozen", "since_s": 29.0}), 80, 24).plain
+    assert "IMU FROZEN (1.0 s): unplug the board and plug it in again" in frozen
+    pulled = health()
+    pulled.silent_s = 3.14
+    lines = screen.render(pulled, 80, 24).plain.splitlines()
+    assert lines[1] == "NO SAMPLES (3.1 s): check the cable of the board" and lines[2].endswith("not known")
+    assert [line.split()[-2:] for line in lines[-2:]] == [["–", "–"]] * 2
+    pulled.silent_s = 0.9
+    assert screen.render(pulled, 80, 24).plain == screen.render(health(), 80, 24).plain
+
+
+def test_an_unplugged_mouse_does_not_disagree() -> None:
+    pose = {quantities.X: (1.0, 0.001), quantities.Y: (0.0, 0.001), quantities.HEADING: (0.2, 0.01)}
+    screen = screen_of("sim://mice", 0.1, [{"mice": {**pose, quantities.EXCLUDED: (2.0, math.nan)}}] * 9)
+    shown = screen.render(health(mouse2={"state": "silent", "since_s": 28.0}), 80, 24).plain
+    assert "MOUSE2 NOT ANSWERING (2.0 s): check its cable and pull-ups" in shown and "LEFT OUT" not in shown
+    assert "x 1.0000 m" in shown
 
 
 def test_an_unknown_height_is_said_to_be_unknown() -> None:
@@ -223,7 +253,7 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
         assert "m mark   f next filter   q stop" in terminal.text
         terminal.press("m")
         terminal.until(lambda text: "mark at " in text)
-        terminal.press("ff")
+        terminal.press("f")
         terminal.until(lambda text: "▸ tilt" in text)
         terminal.resize(52, 20)
         wide = "difference"
@@ -243,8 +273,32 @@ def test_a_terminal_that_cannot_move_its_cursor_shows_a_line() -> None:
     with Terminal(*command, kind="dumb") as terminal:
         assert terminal.wait() == 0, terminal.text
     assert "200 samples" in terminal.text and "lowest" in terminal.text
-    line = link_screen().line(health(imu={"state": "not answering"}))
-    assert line.startswith("25.0 s   IMU NOT ANSWERING: check VCC") and "HEIGHT" in line and len(line) <= 78
+    line = link_screen().line(health(imu={"state": "silent", "since_s": 25.9}), 100)
+    assert line.startswith("25.0 s   IMU NOT ANSWERING (4.1 s): check VCC") and "HEIGHT" in line and len(line) <= 78
+    for width in (78, 60, 50):  # no part without its value
+        assert re.fullmatch(
+            r"25\.0 s   HEIGHT .* m ±0\.4 mm(   (roll|pitch) \+[0-9.]+°)*", link_screen().line(health(), width)
+        )
+
+
+@pytest.mark.parametrize("output", ["--json", "-o-"])
+def test_rows_on_the_terminal_itself_are_whole(output: str) -> None:
+    """A view or a progress line on the same terminal would overwrite them."""
+    command = ["estimate", "--live", "--port", "sim://link", "--filter", "tilt", "--duration", 2, output]
+    with Terminal(*command, columns=300, rows=250) as terminal:
+        assert terminal.wait() == 0, terminal.text
+    lines = [line for line in terminal.text.splitlines() if line]
+    assert lines[0] == "Running: tilt"
+    rows = [line for line in lines if re.match(r'\{"time_s"|\d+\.\d{6},', line)]
+    assert len(rows) == 200 and all(line.endswith("}") if "{" in line else line.count(",") == 4 for line in rows)
+    assert lines.index(rows[-1]) - lines.index(rows[0]) == 199 and "HEIGHT" not in terminal.text
+
+
+def test_the_lines_after_the_view_break_between_words() -> None:
+    command = ["estimate", "--live", "--port", "sim://link?speed=0", "--filter", "tilt", "--duration", 1]
+    with Terminal(*command, columns=30) as terminal:
+        assert terminal.wait() == 0, terminal.text
+    assert "1.0 s, 100 samples, 100.0 Hz,\n0 lost, 0 corrupt" in terminal.text
 
 
 def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
@@ -366,7 +420,7 @@ def test_sentences_break_between_words_on_a_terminal_alone(monkeypatch: pytest.M
 def test_the_next_filter_is_shown_with_its_own_curve() -> None:
     screen = link_screen()
     before = screen.render(health(), 80, 24).plain
-    for _ in range(3):
+    for _ in range(2):
         screen.next_filter()
     chosen = screen.render(health(), 80, 24).plain
     assert "▸ joint-inertial" in before and "▸ tilt" in chosen

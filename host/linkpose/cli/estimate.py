@@ -126,7 +126,7 @@ def command(
     """
     from linkpose.cli.estimate_live import estimate_live
     from linkpose.cli.live import Console, refuse_same_file
-    from linkpose.outputs import check_outputs
+    from linkpose.outputs import STDOUT, check_outputs
 
     if is_live == (recording is not None):
         both = f"--live estimates from the board: leave out {recording}, or leave out --live"
@@ -150,7 +150,7 @@ def command(
     request = Request(
         output, filter_names, rig_file, joint, smooth, json_lines, force, plain, targets, page, chain_joint, mag
     )
-    console = Console(quiet, verbose)
+    console = Console(quiet, verbose, json_lines or output == STDOUT)
     if recording is not None:
         _replay(recording, request, console)
     else:

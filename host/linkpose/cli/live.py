@@ -32,9 +32,10 @@ PROGRESS_INTERVAL_S = 0.2
 class Console:
     """Lines for the user on stderr, and a progress line there when it is a terminal."""
 
-    def __init__(self, quiet: bool, verbose: bool) -> None:
+    def __init__(self, quiet: bool, verbose: bool, prints_rows: bool = False) -> None:
+        """`prints_rows`: rows go to stdout. On the same terminal, a progress line or a view would overwrite them."""
         self.is_quiet, self._verbose = quiet, verbose
-        self.shows_progress = sys.stderr.isatty() and not quiet
+        self.shows_progress = sys.stderr.isatty() and not quiet and not (prints_rows and sys.stdout.isatty())
         self._width = 0
         self._shown_at = 0.0
         self._print: Callable[[str], object] = lambda text: click.echo(wrapped(text, sys.stderr), err=True)

@@ -56,13 +56,14 @@ def command(
     from linkpose.board import Board
     from linkpose.cli import live
     from linkpose.cli.keys import Keys
+    from linkpose.outputs import STDOUT
 
     page = PageOptions(has_page, view_host, view_port)
     page.check()
     path = out or Path(f"linkpose-{datetime.datetime.now():%Y%m%d-%H%M%S}.csv")
     live.refuse_same_file(path, raw)
     options.refuse_mixed_output(path, json_lines)
-    console = live.Console(quiet, verbose)
+    console = live.Console(quiet, verbose, path == STDOUT)
     with contextlib.ExitStack() as stack:
         connected = stack.enter_context(
             Board(port, settings=board, rig=rig_file, raw=raw, force=force, notify=console.report)

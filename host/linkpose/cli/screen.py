@@ -17,12 +17,14 @@ from linkpose import quantities
 from linkpose.cli.curve import curve, path_map, time_axis
 from linkpose.device.session import Health
 from linkpose.exclusions import Exclusions
+from linkpose.filters import required_sensors
 from linkpose.presentation import (
     Row,
     RowReader,
     aligned_length,
     angle_with_std,
     best_filter,
+    current,
     fault_lines,
     joint_angle,
     joint_texts,
@@ -30,6 +32,7 @@ from linkpose.presentation import (
     minus,
     pose_text,
     signed_angle,
+    state_text,
     std_text,
 )
 from linkpose.quantities import Quantity
@@ -45,6 +48,7 @@ CURVE_ROWS, MAP_ROWS = 5, 8
 POINT_INTERVAL_S = 0.05  # between two points of a curve: a column of dots is wider
 PATH_POINTS = 4000  # of the map; older ones are thinned out
 WIDEST = 78
+_LEAST_WIDTH = 20  # of a part of a line
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 LEAST_ANGLE_DEG = 5.0  # that the axis of a joint angle covers
 _FAULTS, _HEADLINE = 10, 8  # priorities of sections
@@ -60,7 +64,8 @@ class Screen:
         self._rows, self._columns = RowReader(columns), columns
         self._title, self._filters, self._keys = title, self._rows.filters, keys
         self._time_s = 0.0
-        self._row: Row = {}
+        self._newest: Row = {}
+        self._row: Row = {}  # the newest as it is shown
         self._chosen: str | None = None  # None: the best filter
         self.forget()
 
@@ -74,14 +79,22 @@ class Screen:
         self._exclusions = Exclusions(self._columns)
 
     def next_filter(self) -> None:
-        """Chooses the next filter to show: the best one, then each of the others."""
-        choices = [None, *self._filters]
-        self._chosen = choices[(choices.index(self._chosen) + 1) % len(choices)]
+        """Shows the next filter of the table; after the last one, the best one again."""
+        shown = quantities.HEIGHT if self._shows_height else quantities.HEADING
+        able = [name for name in self._filters if shown in self._newest.get(name, {})]
+        later = able[able.index(self._shown(shown) or able[-1]) + 1 :] if able else []
+        self._chosen = later[0] if later else None
+
+    @property
+    def _shows_height(self) -> bool:
+        """Whether a height is shown; a robot has one only where J2S is known."""
+        is_robot = self._shown(quantities.HEADING) is not None
+        return self._shown(quantities.HEIGHT) is not None and (self._has_height or not is_robot)
 
     def add(self, rows: Floats) -> None:
         """Adds rows (N ≥ 1, columns) of estimates."""
         times = rows[:, 0].tolist()
-        self._time_s, self._row = times[-1], self._rows.read(rows[-1].tolist())
+        self._time_s, self._newest = times[-1], self._rows.read(rows[-1].tolist())
         for name, values in self._rows.series(rows).items():
             if quantities.HEIGHT in values:
                 heights_m = values[quantities.HEIGHT]
@@ -116,11 +129,14 @@ class Screen:
         text.rstrip()
         return text
 
-    def line(self, health: Health) -> str:
-        """Time, faults and headlines, as far as they fit one line."""
-        sections = self._sections(health, WIDEST, "")
-        parts = [lines[0][0] for wanted in (_FAULTS, _HEADLINE) for priority, lines in sections if priority == wanted]
-        return "   ".join([f"{self._time_s:.1f} s", *parts])[:WIDEST]
+    def line(self, health: Health, width: int) -> str:
+        """Time, faults and headlines, as far as they fit one line of at most `width` characters."""
+        text, width = f"{self._time_s:.1f} s", min(width, WIDEST)
+        for wanted in (_FAULTS, _HEADLINE):
+            for priority, lines in self._sections(health, max(width - len(text) - 3, _LEAST_WIDTH), ""):
+                if priority == wanted:
+                    text += f"   {lines[0][0]}"
+        return text[:width]
 
     @staticmethod
     def _fit(sections: list[tuple[int, list[tuple[str, str]]]], height: int) -> list[tuple[str, str]]:
@@ -132,6 +148,7 @@ class Screen:
 
     def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
         """(priority, [(line, style), …]) from top to bottom."""
+        self._row = current(self._newest, health, required_sensors)
         found = fault_lines(health, self._exclusions)
         faults = [(part, "bold red") for line in found for part in textwrap.wrap(line, width)]
         sections = [(9, [(line, "bold") for line in self._head(health, width)]), (_FAULTS, faults)]
@@ -139,7 +156,7 @@ class Screen:
         link, robot = self._shown(quantities.HEIGHT), self._shown(quantities.HEADING)
         if chain is not None:
             sections += self._chain_sections(chain, width)
-        if link is not None and (self._has_height or robot is None):
+        if link is not None and self._shows_height:
             sections += self._link_sections(link, width)
         if robot is not None:
             sections += self._robot_sections(robot, width)
@@ -178,7 +195,9 @@ class Screen:
 
         Narrow screens drop the title, then rate and time; the state of a sensor is never cut.
         """
-        states = [f"{name.upper()} {of['state']}" for name, of in health.sensors.items() if of.get("state") != "absent"]
+        states = [
+            f"{name.upper()} {state_text(of)}" for name, of in health.sensors.items() if of.get("state") != "absent"
+        ]
         sensors = " ".join(states)
         lost = f"{health.lost} lost"
         parts = [f"linkpose  {self._title}", f"{self._time_s:.1f} s", f"{health.rate_hz:.0f} Hz", lost, sensors]
@@ -204,14 +223,16 @@ class Screen:
     def _height_table(self, best: str, width: int) -> list[tuple[str, str]]:
         """One line per filter: height, σ, difference from the best; narrow screens drop the difference first."""
         reference = self._row[best][quantities.HEIGHT][0]
-        head = f"  {'filter':<16} {'height':>10} {'σ':>9}   difference from best"
-        lines = [(head if width >= 60 else head[:40], "dim")]
+        short = f"  {'filter':<16} {'height':>10} {'σ':>9}"
+        head = f"{short}   difference from best"
+        has_difference = len(head) <= width
+        lines = [(head if has_difference else short, "dim")]
         for name in self._filters:
             if quantities.HEIGHT not in self._row.get(name, {}):
                 continue
             value, std = self._row[name][quantities.HEIGHT]
             line = f"{'▸' if name == best else ' '} {name:<16} {aligned_length(value, std):>10} {std_text(std):>9}"
-            if name != best and width >= 60 and math.isfinite(value - reference):
+            if name != best and has_difference and math.isfinite(value - reference):
                 line += f"   {_signed_length(value - reference)}"
             lines.append((line, "bold" if name == best else ""))
         return lines

@@ -37,7 +37,7 @@ class Sink:
 
         self._estimator = estimator
         self._outputs = [_output(target, estimator.columns) for target in request.targets]
-        self._json = request.json_lines
+        self._json, self._is_plain = request.json_lines, request.plain
         self._file: EstimateWriter | None = None
         if request.output is not None:
             self._file = EstimateWriter(request.output, head, estimator.columns, request.force, request.plain)
@@ -73,9 +73,13 @@ class Sink:
         ]
 
     def close(self, closing: dict[str, Any]) -> None:
-        """Writes the closing line of the file."""
+        """Writes the closing line."""
+        from linkpose.recording.csvfile import tail
+
         if self._file is not None:
             self._file.close(closing)
+        if self._prints and not self._is_plain:
+            _print(tail(closing))
 
     def __enter__(self) -> Sink:
         return self

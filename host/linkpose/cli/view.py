@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -10,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
+from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen
 from linkpose.device.session import Health
 
@@ -60,12 +63,12 @@ class View:
     def line(self, health: Health) -> str:
         """The faults and the headline in one line, where the view is not on the screen."""
         self._take_waiting()
-        return self._screen.line(health)
+        return self._screen.line(health, shutil.get_terminal_size().columns - 1)
 
     def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""
         if self._live is None:
-            click.echo(text, err=True)
+            click.echo(wrapped(text, sys.stderr), err=True)
         else:
             self._live.console.print(text, markup=False, highlight=False)
 

@@ -110,6 +110,7 @@ class Health:
     drift_std_ppm: float | None
     status: Status | None  # the board's own counters, as it last sent them
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts, by sensor (sensors.health)
+    silent_s: float = 0.0  # since the last sample arrived, or since the stream began
 
 
 class Session:
@@ -134,7 +135,7 @@ class Session:
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
         self._pinged_at = self._looked_s = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
-        self._arrived_s = 0.0  # s, the connection's clock: of the last sample
+        self._arrived_s = math.nan  # s, the connection's clock: of the last sample, or of the stream's begin
         self._repeats = 0  # samples since the last one with a new number
         self._clock_faults: set[str] = set()  # reported
         self._silent_s = 0.0  # waited for a sample since the last one
@@ -590,6 +591,7 @@ class Session:
             drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
             status=self.status,
+            silent_s=0.0 if math.isnan(self._arrived_s) else self._connection.now() - self._arrived_s,
         )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import CannotRun, MissingJ2S, SensorMissing, UncertainJ2S, UnknownFilter
-from linkpose.sensors.devices import MAX_MICE, Sensors
+from linkpose.sensors.devices import DEVICE_NAMES, DEVICES, MAX_MICE, Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
 
@@ -62,6 +62,12 @@ NAMES = tuple(REGISTRY)
 def capabilities(name: str) -> Capabilities | None:
     """The filter's capabilities; None for a name outside this registry, such as `ekf` of `localize`."""
     return REGISTRY.get(name)
+
+
+def required_sensors(name: str) -> list[str]:
+    """The sensors without which a filter cannot run, as in Health.sensors: imu, baro, ...; none of an unknown name."""
+    needed = REGISTRY[name].sensors if name in REGISTRY else _ANY
+    return [sensor for flag, sensor in zip(DEVICES, DEVICE_NAMES, strict=True) if flag & needed]
 
 
 class Filter(Protocol):

@@ -24,6 +24,7 @@ ENDING = ".html"
 FORMATS = (*plotting.FORMATS, ENDING)  # of pictures of estimates
 FRAME_INTERVAL_S = 0.05  # motion looks smooth at 20 Hz
 MOST_FRAMES = 2400  # two minutes at 20 Hz, about 1 MB; a longer recording gets fewer frames per second
+_SLOW_INTERVAL = 5  # frames between two of σ and of the path, which is larger than a pose
 
 
 def save_picture(
@@ -64,13 +65,13 @@ def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Su
         start, end = replay.span_s
         frames = int(np.clip(round((end - start) / FRAME_INTERVAL_S), 1, MOST_FRAMES)) + 1
         recorded = server.get_scene_serializer()
-        for time_s in np.linspace(start, end, frames):
+        for at, time_s in enumerate(np.linspace(start, end, frames)):
             replay.seek(float(time_s))
-            newest = replay.newest
-            row = drawing.read(newest)
-            name = drawing.best(row)
+            name = drawing.best(replay.newest)
             if name is not None:
-                drawing.draw(newest, row, name, replay)
+                row = drawing.draw(replay.newest, name)
+                if at % _SLOW_INTERVAL == 0:
+                    drawing.draw_slow(row, name, replay)
                 changes.queue()
             recorded.insert_sleep((end - start) / frames)
         return titled(recorded.as_html())

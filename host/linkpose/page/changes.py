@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import time
+import struct
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose.sensors.measurements import Floats
 
 if TYPE_CHECKING:
     import viser
 
-Nullable = Floats | list[float | None]  # values of a chart; None is a gap
+Array = NDArray[np.float64] | NDArray[np.float32]
+ChartData = dict[str, Any] | list[float | None]  # an array, as `Changes.array` keeps it, or values; None is a gap
 
-# Bytes that wait for a browser, from which on it gets no further change until it has read them: some four updates with
-# charts. Ten times as many would show a slow browser what was measured seconds ago.
-_MOST_WAITING = 200_000
+_ZSTD_START = b"\x28\xb5\x2f\xfd\xa0"  # magic number; then: one segment, its size in four bytes
+_ZSTD_BLOCK = 1 << 17  # bytes of a block, at most
 
 
 class Changes:
@@ -29,72 +30,93 @@ class Changes:
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        from zstandard import ZstdCompressor
+        from msgspec.msgpack import Encoder
+        from viser.infra._infra import _append_aligned_buffers
+        from websockets.asyncio.server import broadcast
 
         self._socket = server._websock_server
-        self._compressor = ZstdCompressor(level=1)
-        self._messages: list[tuple[str, dict[str, Any]]] = []  # viser's kind of message, and its fields
+        self._encode, self._append_arrays, self._broadcast = Encoder().encode, _append_aligned_buffers, broadcast
+        self._messages: list[dict[str, Any]] = []  # in viser's format, without arrays
         self._arrays: list[memoryview] = []  # of the charts
 
     def turn(self, node: viser.SceneNodeHandle, wxyz: Floats) -> None:
         """Gives a node of the scene this quaternion (4,)."""
-        self._messages.append(("SetOrientationMessage", {"name": node.name, "wxyz": tuple(wxyz.tolist())}))
+        self._add("SetOrientationMessage", {"name": node.name, "wxyz": wxyz.tolist()})
 
     def move(self, node: viser.SceneNodeHandle, place_m: Floats) -> None:
         """Gives a node of the scene this position (3,), m."""
-        self._messages.append(("SetPositionMessage", {"name": node.name, "position": tuple(place_m.tolist())}))
+        self._add("SetPositionMessage", {"name": node.name, "position": place_m.tolist()})
 
     def scale(self, node: viser.SceneNodeHandle, factors: tuple[float, float, float]) -> None:
         """Scales a node of the scene along its axes."""
-        self._messages.append(("SceneNodeUpdateMessage", {"name": node.name, "updates": {"scale": factors}}))
+        self._add("SceneNodeUpdateMessage", {"name": node.name, "updates": {"scale": factors}})
 
     def write(self, element: viser.GuiHtmlHandle, text: str) -> None:
         """Gives an element of the panel this content."""
-        self._messages.append(("GuiUpdateMessage", {"uuid": element._impl.uuid, "updates": {"content": text}}))
+        self._add("GuiUpdateMessage", {"uuid": element._impl.uuid, "updates": {"content": text}})
 
-    def plot(self, chart: viser.GuiUplotHandle, data: Sequence[Nullable]) -> None:
-        """Gives a chart its data: arrays travel as binary, lists, which may have gaps, as text."""
-        parts = [self._placeholder(values) if isinstance(values, np.ndarray) else values for values in data]
-        self._messages.append(("GuiUpdateMessage", {"uuid": chart._impl.uuid, "updates": {"data": parts}}))
+    def plot(self, chart: viser.GuiUplotHandle, data: Sequence[ChartData]) -> None:
+        """Gives a chart its data: arrays, as `array` keeps them, or lists, which may have gaps."""
+        self._add("GuiUpdateMessage", {"uuid": chart._impl.uuid, "updates": {"data": data}})
 
-    def _placeholder(self, values: Floats) -> dict[str, Any]:
-        """Keeps an array for the end of the message, and returns what viser has in its place."""
+    def array(self, values: Array) -> dict[str, Any]:
+        """Keeps an array (N,) for the end of the message, and returns what stands in its place, any number of times."""
         self._arrays.append(np.ascontiguousarray(values).data)
         return {"__binary_index": len(self._arrays) - 1, "dtype": values.dtype.str}
+
+    def _add(self, kind: str, fields: dict[str, Any]) -> None:
+        fields["type"], fields["owner"] = kind, ""
+        self._messages.append(fields)
 
     def queue(self) -> None:
         """Puts the changes of the scene into viser's queue, of which viser makes recordings."""
         from viser import _messages
 
-        for kind, fields in self._messages:
+        for fields in self._messages:
+            kind = fields.pop("type")
+            del fields["owner"]
             self._socket.queue_message(getattr(_messages, kind)(**fields))
         self._messages = []
 
     def broadcast(self, clients: Collection[int]) -> None:
-        """Sends the changes to these clients of the server. Runs on the server's event loop."""
-        from websockets.asyncio.server import broadcast
+        """Sends the changes to these clients of the server. Runs on the server's event loop.
 
+        A browser that has not read all of what was sent before gets none of them: it would show old values.
+        """
         connections = [
             connection
             for client, connection in self._socket._live_connections.items()
-            if client in clients and connection.transport.get_write_buffer_size() < _MOST_WAITING
+            if client in clients and not connection.transport.get_write_buffer_size()
         ]
         if self._messages and connections:
-            broadcast(connections, self._encoded())
+            self._broadcast(connections, self._encoded())
         self._messages, self._arrays = [], []
 
     def _encoded(self) -> bytes:
-        """As viser's `_message_producer` encodes messages: sizes, the compressed messages, and the arrays."""
-        from msgspec.msgpack import encode
-        from viser.infra._infra import _append_aligned_buffers
+        """As viser's `_message_producer` encodes messages: sizes, the messages in zstd's format, and the arrays.
 
-        text = encode({
-            "messages": [{"type": kind, "owner": "", **fields} for kind, fields in self._messages],
-            "timestampSec": time.perf_counter(),
-            "binaryBufferLengths": [array.nbytes for array in self._arrays],
-        })  # fmt: skip
-        compressed = self._compressor.compress(text)
-        parts: list[bytes | memoryview] = [len(size).to_bytes(8, "little") for size in (text, compressed)]
-        parts.append(compressed)
-        _append_aligned_buffers(parts, self._arrays, 16 + len(compressed))
+        Messages of a kilobyte are not worth a compressor. The time of sending is left at 0: from a real one, viser's
+        client makes the intervals between messages even, and shows them later for it.
+        """
+        text = self._encode(
+            {
+                "messages": self._messages,
+                "timestampSec": 0.0,
+                "binaryBufferLengths": [array.nbytes for array in self._arrays],
+            }
+        )
+        frame = uncompressed_frame(text)
+        parts: list[bytes | memoryview] = [struct.pack("<QQ", len(text), len(frame)), frame]
+        if self._arrays:
+            self._append_arrays(parts, self._arrays, 16 + len(frame))
         return b"".join(parts)
+
+
+def uncompressed_frame(data: bytes) -> bytes:
+    """Data (at least one byte) in zstd's format (RFC 8878, section 3.1.1), as blocks that are not compressed."""
+    parts = [_ZSTD_START, struct.pack("<I", len(data))]
+    for at in range(0, len(data), _ZSTD_BLOCK):
+        block = data[at : at + _ZSTD_BLOCK]
+        is_last = at + _ZSTD_BLOCK >= len(data)
+        parts += [(len(block) << 3 | is_last).to_bytes(3, "little"), block]
+    return b"".join(parts)

@@ -12,7 +12,7 @@ from linkpose import quantities
 from linkpose.localization.surroundings import Surroundings
 from linkpose.page.changes import Changes
 from linkpose.page.history import History, Replay
-from linkpose.page.scene import scene_of
+from linkpose.page.scene import LinkScene, scene_of
 from linkpose.presentation import Row, RowReader
 from linkpose.quantities import HEADING, Quantity, X, Y
 from linkpose.sensors.measurements import Floats
@@ -50,28 +50,39 @@ class Drawing:
         ]
         places = self._corners(np.empty((0, len(columns))) if known is None else known)
         self._scene = scene_of(server, changes, self._of_filter.values(), rig, surroundings, places)
-        self._candidates = [(q, name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of]
+        self._candidates = [
+            (self._at[of[q]], name) for q in self._scene.shown_by for name, of in self._of_filter.items() if q in of
+        ]
 
     @property
     def charted(self) -> tuple[Quantity, ...]:
         """The quantities that belong to what the scene shows."""
         return self._scene.charted
 
-    def read(self, newest: Floats) -> Row:
-        """A row (columns,) by filter and quantity."""
-        return self._rows.read(newest.tolist())
+    def best(self, newest: Floats) -> str | None:
+        """The best filter with a value in this row (columns,); without any value, the best filter at all."""
+        for at, name in self._candidates:
+            if math.isfinite(newest[at]):
+                return name
+        return self._candidates[0][1] if self._candidates else None
 
-    def best(self, row: Row) -> str | None:
-        """The best filter with a value in this row; without any value, the best filter at all."""
-        known = (name for q, name in self._candidates if math.isfinite(row[name][q][0]))
-        return next(known, self._candidates[0][1] if self._candidates else None)
+    def draw(self, newest: Floats, name: str) -> Row:
+        """Draws the newest row (columns,) as the filter `name` estimates it.
 
-    def draw(self, newest: Floats, row: Row, name: str, history: History | Replay, j2s_m: Floats | None = None) -> None:
-        """Draws the newest row as the filter `name` estimates it; `j2s_m` (3,) is J2S if it is being estimated."""
-        if j2s_m is not None and hasattr(self._scene, "set_j2s"):
+        Returns the values of this filter at least, by filter and quantity.
+        """
+        row = self._rows.read(newest.tolist(), None if self._scene.combines_filters else (name,))
+        self._scene.draw(row, name, self._reference(newest))
+        return row
+
+    def draw_slow(self, row: Row, name: str, history: History | Replay) -> None:
+        """Draws what changes slowly or is large, as the filter `name` estimates it: σ and the path."""
+        self._scene.draw_slow(row, name, self._path(name, history))
+
+    def set_j2s(self, j2s_m: Floats) -> None:
+        """Draws a link with this J2S (3,), which is being estimated."""
+        if isinstance(self._scene, LinkScene):
             self._scene.set_j2s(j2s_m)
-        path = self._path(name, history) if self._scene.is_path_due else None
-        self._scene.draw(row, name, self._reference(newest), path)
 
     def _corners(self, rows: Floats) -> Floats:
         """Two opposite corners (2, 2) of the area that the paths in these rows cover; (0, 2) without a path."""
@@ -83,7 +94,10 @@ class Drawing:
         return {quantity: float(newest[at]) for quantity, at in self._reference_at}
 
     def _path(self, name: str, history: History | Replay) -> Floats | None:
-        """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path."""
+        """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path.
+
+        None of a filter that estimates no path.
+        """
         of = self._of_filter.get(name, {})
         if not {X, Y, HEADING} <= of.keys():
             return None

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from linkpose.sensors.measurements import Floats
 
+_HALF = math.radians(0.5)  # half an angle in radians, of one in degrees
 _SEGMENTS = 48  # of a circle
 _WIDEST_RAD = math.radians(80.0)  # half the opening of a cone: wider ones cannot be drawn
 
@@ -19,9 +20,10 @@ def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
     NaN where roll or pitch is NaN; an unknown yaw is drawn as 0.
     """
     yaw = yaw_deg if math.isfinite(yaw_deg) else 0.0
-    (cr, sr), (cp, sp), (cy, sy) = (
-        (math.cos(half), math.sin(half)) for half in (math.radians(angle) / 2 for angle in (roll_deg, pitch_deg, yaw))
-    )
+    roll, pitch, yaw = _HALF * roll_deg, _HALF * pitch_deg, _HALF * yaw
+    cr, sr, cp, sp, cy, sy = (
+        math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
+    )  # fmt: skip
     return np.array([
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import socket
 import threading
@@ -12,29 +11,32 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from linkpose import quantities
 from linkpose.errors import LinkposeError
 from linkpose.exclusions import Exclusions
+from linkpose.filters import required_sensors
 from linkpose.localization.surroundings import Surroundings
 from linkpose.page.changes import Changes
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import PageStatus
-from linkpose.presentation import fault_lines, working_sensors
+from linkpose.presentation import fault_lines, lost_filters, working_sensors
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     import viser
 
+    from linkpose.device.session import Health
     from linkpose.estimation import FoundJ2s
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
-# Seconds between two updates of the page. An update costs about 1 ms of CPU (tests/bench/page.py): twice the interval
-# halves the cost, and a sample takes up to 0.12 s more to the screen.
-UPDATE_INTERVAL_S = 0.12
-CHART_INTERVAL = 3  # updates between two of the charts, which are the largest messages
+# Seconds between two updates of the page. A sample waits that long at most, a browser needs up to 30 ms more for a
+# frame, and the sum is to stay below 0.1 s. An update costs about half a millisecond of CPU (tests/bench/page.py).
+UPDATE_INTERVAL_S = 0.07
+CHART_INTERVAL = 6  # updates between two of the charts and of a path, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
 J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
@@ -79,17 +81,22 @@ class Page:
         self._columns = list(columns)
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
+        self._of_filter = quantities.by_filter(columns)
+        self._lost_at: list[int] = []  # columns whose values are not shown
         self._exclusions = Exclusions(self._columns)
         self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
         self._status, self._blocks = PageStatus(), 0
-        self._updates = 0
+        self._updates = 0  # since everything was drawn last
         self._clients: set[int] = set()
         self._marks: list[float] = []
         self._is_changed = self._is_status_changed = True  # since the last update
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._build(rig, surroundings or Surroundings())
-        self._sender = asyncio.run_coroutine_threadsafe(self._send(), self._server.get_event_loop())
+        self._is_closed = False
+        self._error: Exception | None = None
+        self._loop = self._server.get_event_loop()
+        self._loop.call_soon_threadsafe(self._send)
 
     def show(self, estimates: Floats, status: Callable[[], PageStatus]) -> None:
         """Takes estimates (N, columns) or the newest row (columns,). Never waits.
@@ -115,12 +122,12 @@ class Page:
         """
         if self.stopped.is_set():
             raise KeyboardInterrupt
-        if self._sender.done():
-            self._sender.result()
+        if self._error is not None:
+            raise self._error
 
     def close(self) -> None:
         """Ends the server."""
-        self._sender.cancel()
+        self._is_closed = True
         # viser waits up to 6 s for the farewell of browsers; the end of a measurement does not.
         threading.Thread(target=self._server.stop, name="linkpose page stop", daemon=True).start()
 
@@ -171,37 +178,46 @@ class Page:
         self._slider.on_update(jump)
 
     def _mark(self) -> None:
-        newest = self._history.newest
+        newest = self._newest()
         if newest is not None and self._on_mark is not None:
             self._marks.append(float(newest[0]))
             self._on_mark(self._marks[-1])
             self._redraw()
 
-    async def _send(self) -> None:
-        """The sender: everything that arrived since the last update, as one update.
+    def _send(self) -> None:
+        """The sender: shows the newest row, and now and then all rows that arrived. Calls itself again after a while.
 
         It runs on the server's event loop: with a thread of its own, each update would wake two threads, which wait for
         each other.
         """
-        while True:
-            await asyncio.sleep(UPDATE_INTERVAL_S)
+        if self._is_closed:
+            return
+        try:
             self._update()
+        except Exception as error:
+            self._error = error
+        else:
+            self._loop.call_later(UPDATE_INTERVAL_S, self._send)
 
     def _update(self) -> None:
-        self._take()
-        clients = set(self._server.get_clients())
-        if clients - self._clients:
+        clients = self._server.get_clients().keys()
+        if clients != self._clients:
+            self._clients = set(clients)
             self._redraw()
-        self._clients = clients
+        is_full = self._updates % CHART_INTERVAL == 0
+        self._updates += 1
+        if is_full:
+            self._take()
         if not clients:
             return
         if self._replay is not None:
             self._advance(self._replay)
-        if self._is_changed or self._updates % CHART_INTERVAL:  # the charts catch up with the last rows
+        if self._is_changed or is_full:  # charts catch up with the last rows
             self._is_changed = False
-            self._draw()
+            self._draw(is_full)
 
     def _take(self) -> None:
+        """Takes the rows that wait into the history."""
         blocks = [self._queue.popleft() for _ in range(len(self._queue))]
         if not blocks or not isinstance(self._history, History):
             return
@@ -212,6 +228,14 @@ class Page:
         rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
         self._history.add(rows)
         self._exclusions.follow(rows)
+
+    def _newest(self) -> Floats | None:
+        """The newest row (columns,), which may still wait."""
+        try:
+            rows, _ = self._queue[-1]
+        except IndexError:
+            return self._history.newest
+        return rows if rows.ndim == 1 else rows[-1]
 
     def _advance(self, replay: Replay) -> None:
         """Plays on."""
@@ -224,26 +248,34 @@ class Page:
             self._is_changed = self._is_status_changed = True
         replay.seek(self._place_s)
 
-    def _draw(self) -> None:
-        newest, status = self._history.newest, self._status
-        row = self._drawing.read(newest) if newest is not None else {}
+    def _draw(self, is_full: bool) -> None:
+        """Draws the newest row; `is_full` also draws what is large and may be late."""
+        newest, status = self._newest(), self._status
         if self._replay is not None:
             self._exclusions.follow(self._replay.newest[np.newaxis])
-        name = self._panel.chosen or self._drawing.best(row)
         if self._is_status_changed:
             self._is_status_changed = False
             self._draw_health(newest, status)
+            self._lost_at = self._lost_columns(status.health)
+        if newest is not None and self._lost_at:
+            newest = newest.copy()
+            newest[self._lost_at] = np.nan
+        name = None if newest is None else self._panel.chosen or self._drawing.best(newest)
         if newest is not None and name is not None:
-            self._draw_estimates(newest, row, name, status)
+            if status.j2s is not None:
+                self._drawing.set_j2s(status.j2s.mean_m)
+            row = self._drawing.draw(newest, name)
+            self._panel.draw_headline(row[name], name)
+            if is_full:
+                self._panel.draw_details(row[name])
+                self._panel.draw_charts(self._history.window(), name)
+                self._drawing.draw_slow(row, name, self._history)
         self._changes.broadcast(self._clients)
-        self._updates += 1
 
-    def _draw_estimates(self, newest: Floats, row: Any, name: str, status: PageStatus) -> None:
-        self._panel.draw_headline(row, name)
-        j2s_m = status.j2s.mean_m if status.j2s is not None else None
-        self._drawing.draw(newest, row, name, self._history, j2s_m)
-        if self._updates % CHART_INTERVAL == 0:
-            self._panel.draw_charts(self._history.window(), name)
+    def _lost_columns(self, health: Health | None) -> list[int]:
+        """The columns of filters that have lost what they need."""
+        lost = lost_filters(self._of_filter, health, required_sensors) if health is not None else ()
+        return [self._columns.index(column) for name in lost for column in self._of_filter[name].values()]
 
     def _draw_health(self, newest: Floats | None, status: PageStatus) -> None:
         health, words = status.health, []

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose import quantities
-from linkpose.page.changes import Changes, Nullable
-from linkpose.presentation import Row, angle_with_std, joint_texts, length_with_std, pose_text
+from linkpose.page.changes import Changes
+from linkpose.presentation import angle_with_std, joint_texts, length_with_std, pose_text
 from linkpose.quantities import (
     HEADING,
     HEIGHT,
@@ -31,6 +32,7 @@ _CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
 _OTHER_HEIGHT = 105
 _CHART_PADDING = (10, 14, 0, 0)  # pixels above, right, below, left: the outermost labels are not cut
 _LABEL_SPACE = 18  # pixels between two labels of the y axis, at least; with uPlot's 30 a low chart has a single label
+_NOWHERE = 0  # in place of a column that is missing: that of the time
 _OK, _FAULT = "#2b8a3e", "#c92a2a"
 
 
@@ -53,14 +55,16 @@ class Panel:
         self._gui = gui
         self._columns = {column: at for at, column in enumerate(columns)}
         self._of_filter = quantities.by_filter(columns)
+        self._names = {name: html.escape(name) for name in self._of_filter}
         self._health = gui.add_html("")
-        self._headline = gui.add_html("")
+        self._headline, self._details = gui.add_html(""), gui.add_html("")
         able = {quantity for of in self._of_filter.values() for quantity in of}
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
             self._choice.on_update(lambda _: on_choice())
         self._shown = [quantity for quantity in charted if quantity in able]
         self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
+        self._curves: dict[str, _Curves] = {}
         self._charted = ""  # the filter whose charts are visible
 
     def add_charts(self) -> None:
@@ -99,33 +103,41 @@ class Panel:
 
     def draw_charts(self, window: Floats, name: str) -> None:
         """Draws the rows (N, columns) of the last seconds as the filter `name` estimates them."""
-        rows = with_gap_rows(window)
-        columns = self._of_filter.get(name, {})
+        if name not in self._curves:
+            self._curves[name] = self._curves_of(name)
+        curves = self._curves[name]
         if name != self._charted:
             self._charted = name
             for quantity, chart in self._charts.items():
-                chart.visible = quantity in columns
-        for quantity, chart in self._charts.items():
-            if quantity in columns:
-                self._changes.plot(chart, self._chart_data(rows, quantity, columns[quantity]))
+                chart.visible = quantity in curves.quantities
+        if not curves.quantities:
+            return
+        rows = with_gap_rows(window)
+        lines = curves.lines(rows)
+        time = self._changes.array(rows[:, 0])
+        is_whole = np.asarray(np.isfinite(lines).all(axis=2))
+        for at, quantity in enumerate(curves.quantities):
+            count = 3 + (quantity.column in self._columns)
+            data = [
+                self._changes.array(lines[at, line]) if is_whole[at, line] else _with_gaps(lines[at, line])
+                for line in range(count)
+            ]
+            self._changes.plot(self._charts[quantity], [time, *data])
 
-    def _chart_data(self, rows: Floats, quantity: Quantity, column: str) -> tuple[Nullable, ...]:
-        """Time, value − 2σ, value + 2σ, value, and the reference if there is one, with None in gaps."""
-        scale = quantity.value.scale
-        value = rows[:, self._columns[column]] * scale
-        if quantity.period is not None:
-            known = np.isfinite(value)
-            period = quantity.period * scale
-            if (np.abs(np.diff(value[known])) > 0.5 * period).any():
-                value[known] = np.unwrap(value[known], period=period)
-        std_at = self._columns.get(quantities.std_column(column) or "")
-        std = rows[:, std_at] * scale if std_at is not None else np.zeros(len(rows))
-        std = np.where(np.isfinite(std), std, 0.0)
-        low, high = _bounds(value, std)
-        data = [np.clip(value - 2 * std, low, high), np.clip(value + 2 * std, low, high), value]
-        if quantity.column in self._columns:
-            data.append(rows[:, self._columns[quantity.column]] * scale)
-        return (rows[:, 0].copy(), *map(_nullable, data))
+    def _curves_of(self, name: str) -> _Curves:
+        columns = self._of_filter.get(name, {})
+        shown = [quantity for quantity in self._charts if quantity in columns]
+
+        def at(names: Iterable[str | None]) -> list[int]:
+            return [self._columns.get(column or "", _NOWHERE) for column in names]
+
+        return _Curves(
+            shown,
+            at(columns[quantity] for quantity in shown),
+            at(quantities.std_column(columns[quantity]) for quantity in shown),
+            at(quantity.column for quantity in shown),
+            np.array([quantity.value.scale for quantity in shown]),
+        )
 
     def draw_health(self, title: str, summary: str, working: Sequence[str], faults: Sequence[str]) -> None:
         """Shows which sensors work, in green, and each fault as a red line."""
@@ -138,28 +150,41 @@ class Panel:
             f"<div style='margin-top:4px'>{pills}</div>{alarms}</div>",
         )
 
-    def draw_headline(self, row: Row, name: str) -> None:
-        """Shows the newest values of the filter `name`."""
-        values = row.get(name, {})
-        angles = joint_texts(values)
-        if HEIGHT in values:
-            first, lines = length_with_std(*values[HEIGHT]), [_angles(values)]
-            caption = "height over the joint"
-        elif angles:
-            first, *lines = angles
-            caption = "joint"
-        elif HEADING in values:
-            first, *lines = pose_text(values)
-            caption = "place and heading"
-        else:
-            first, lines, caption = _angles(values), [], "attitude"
-        below = "".join(f"<div>{html.escape(line)}</div>" for line in lines)
+    def draw_headline(self, values: Mapping[Quantity, tuple[float, float]], name: str) -> None:
+        """Shows what matters most of the newest values of the filter `name`."""
+        caption, first = _headline(values)
+        caption = f"{caption}, {self._names[name]}"
         self._changes.write(
             self._headline,
-            f"<div style='padding:2px 12px'><div style='font-size:12px;color:#666'>{caption}, {html.escape(name)}</div>"
-            f"<div style='font-size:26px;font-weight:600;font-variant-numeric:tabular-nums'>{html.escape(first)}</div>"
-            f"<div style='font-variant-numeric:tabular-nums;white-space:pre-wrap'>{below}</div></div>",
+            f"<div style='padding:2px 12px 0'><div style='font-size:12px;color:#666'>{caption}</div>"
+            f"<div style='font-size:26px;font-weight:600;font-variant-numeric:tabular-nums'>{first}</div></div>",
         )
+
+    def draw_details(self, values: Mapping[Quantity, tuple[float, float]]) -> None:
+        """Shows the other values below the headline."""
+        lines = "".join(f"<div>{line}</div>" for line in _details(values))
+        self._changes.write(
+            self._details,
+            f"<div style='padding:0 12px 2px;font-variant-numeric:tabular-nums;white-space:pre-wrap'>{lines}</div>",
+        )
+
+
+def _headline(values: Mapping[Quantity, tuple[float, float]]) -> tuple[str, str]:
+    """Caption and large line; like `_details`, without characters that HTML would have to escape."""
+    if HEIGHT in values:
+        return "height over the joint", length_with_std(*values[HEIGHT])
+    if HEADING in values:
+        return "place and heading", pose_text(values)[0]
+    if angles := joint_texts(values):
+        return "joint", angles[0]
+    return "attitude", _angles(values)
+
+
+def _details(values: Mapping[Quantity, tuple[float, float]]) -> list[str]:
+    """The lines below the headline."""
+    if HEIGHT in values:
+        return [_angles(values)]
+    return pose_text(values)[1:] if HEADING in values else joint_texts(values)[1:]
 
 
 def _angles(values: Mapping[Quantity, tuple[float, float]]) -> str:
@@ -186,20 +211,48 @@ def with_gap_rows(rows: Floats) -> Floats:
     return np.insert(rows, at + 1, between, axis=0)
 
 
-def _bounds(value: Floats, std: Floats) -> tuple[float, float]:
-    """Limits of what a chart shows: ±2σ of a filter that has just started would flatten all motion."""
-    known = np.isfinite(value)
-    if not known.any():
-        return -np.inf, np.inf
-    low, high = float(value[known].min()), float(value[known].max())
-    middle = np.count_nonzero(known) // 2
-    margin = max(0.3 * (high - low), 3 * float(np.partition(std[known], middle)[middle]))
+class _Curves(NamedTuple):
+    """What the charts draw of one filter: k quantities, and where their columns are."""
+
+    quantities: list[Quantity]
+    value_at: list[int]
+    std_at: list[int]
+    reference_at: list[int]
+    scale: Floats  # (k,), to the unit of the chart
+
+    def lines(self, rows: Floats) -> NDArray[np.float32]:
+        """Value − 2σ, value + 2σ, value and reference (k, 4, N) of rows (N, columns); NaN where there is none."""
+        values = self._unwrapped(rows[:, self.value_at] * self.scale)
+        std = rows[:, self.std_at] * self.scale
+        std[~np.isfinite(std) | (np.array(self.std_at) == _NOWHERE)] = 0.0
+        low, high = _bounds(values, std)
+        lines = np.empty((len(self.quantities), 4, len(rows)), np.float32)  # of a screen's precision
+        lines[:, 0], lines[:, 1] = np.clip(values - 2 * std, low, high).T, np.clip(values + 2 * std, low, high).T
+        lines[:, 2], lines[:, 3] = values.T, (rows[:, self.reference_at] * self.scale).T
+        return lines
+
+    def _unwrapped(self, values: Floats) -> Floats:
+        """Values (N, k) without the steps of angles by a whole turn."""
+        for at, quantity in enumerate(self.quantities):
+            if quantity.period is not None:
+                known, period = np.isfinite(values[:, at]), quantity.period * float(self.scale[at])
+                if (np.abs(np.diff(values[known, at])) > 0.5 * period).any():
+                    values[known, at] = np.unwrap(values[known, at], period=period)
+        return values
+
+
+def _bounds(values: Floats, std: Floats) -> tuple[Floats, Floats]:
+    """Limits (k,) of what charts show of values (N, k): ±2σ of a filter that just started would flatten all motion."""
+    known = np.isfinite(values)
+    count = np.count_nonzero(known, axis=0)
+    low = np.where(count, np.where(known, values, np.inf).min(axis=0), 0.0)
+    high = np.where(count, np.where(known, values, -np.inf).max(axis=0), 0.0)
+    median = np.sort(np.where(known, std, np.inf), axis=0)[count // 2, np.arange(len(count))]
+    margin = np.maximum(0.3 * (high - low), 3 * median)
     return low - margin, high + margin
 
 
-def _nullable(values: Floats) -> Nullable:
-    if np.isfinite(values).all():
-        return values
+def _with_gaps(values: NDArray[np.float32]) -> list[float | None]:
     return [value if value == value else None for value in values.tolist()]
 
 

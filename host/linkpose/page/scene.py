@@ -38,11 +38,13 @@ if TYPE_CHECKING:
 Colour = tuple[int, int, int]
 
 _BLUE, _GREY, _BLACK, _ORANGE = (0, 114, 178), (120, 130, 140), (30, 30, 30), (230, 159, 0)
+_UNKNOWN = (math.nan, math.nan)  # a value and its σ
 _ELLIPSES = 12  # along a path
-_PATH_INTERVAL = 5  # redraws of the scene between two of the path, which is larger
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
 _ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
+_SKY, _GROUND = (255, 255, 255), (200, 200, 205)
+_SKY_INTENSITY = 3.5  # of light from everywhere, in viser's unit; colours look as they are stated
 _FLOOR_M = 0.002  # of lines over the ground, at least, so that the ground does not hide parts of them
 
 
@@ -51,16 +53,16 @@ class Scene(Protocol):
 
     charted: ClassVar[tuple[Quantity, ...]]  # that charts show, if a filter estimates them
     shown_by: ClassVar[tuple[Quantity, ...]]  # the first of these with a value selects the best filter
+    combines_filters: ClassVar[bool]  # whether it draws values of several filters
 
-    def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
-        """Draws the newest row as the filter `name` estimates it.
+    def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
+        """Draws the newest row as the filter `name` estimates it."""
+
+    def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
+        """Draws what changes slowly or is large, as the filter `name` estimates it: σ and the path.
 
         `path` (N, 8) is x, y, heading, σ of x and of y (m), the covariance of x and y (m²), x and y of the reference.
         """
-
-    @property
-    def is_path_due(self) -> bool:
-        """Whether the next `draw` draws a path, if it gets one."""
 
 
 class LinkScene:
@@ -71,7 +73,7 @@ class LinkScene:
 
     charted: ClassVar[tuple[Quantity, ...]] = (HEIGHT, ROLL, PITCH)
     shown_by: ClassVar[tuple[Quantity, ...]] = (HEIGHT, ROLL)
-    is_path_due = False
+    combines_filters: ClassVar[bool] = False
 
     def __init__(self, server: viser.ViserServer, changes: Changes, j2s_m: Floats | None) -> None:
         """`j2s_m` (3,) is J2S, from the joint centre to the sensor, in the sensor's axes (m)."""
@@ -110,19 +112,23 @@ class LinkScene:
         self._cone.point_along(j2s_m)
         self._sensor.position = self._axes.position = j2s_m
 
-    def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
+    def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         values = row.get(name, {})
-        nothing = (math.nan, math.nan)
-        (roll, roll_std), (pitch, pitch_std), (yaw, _) = (values.get(q, nothing) for q in (ROLL, PITCH, YAW))
+        roll, pitch, yaw = (values.get(q, _UNKNOWN)[0] for q in (ROLL, PITCH, YAW))
         self._link.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
             self._changes.turn(self._link, geometry.attitude(roll, pitch, yaw))
-        self._cone.draw(max(roll_std, pitch_std) if is_known else math.nan)
+        if not reference:
+            return
         roll, pitch = (reference.get(q, math.nan) for q in (ROLL, PITCH))
         self._reference.visible = is_known = math.isfinite(roll + pitch)
         if is_known:
             # A yaw that starts at 0 with the estimate is comparable with the reference's only up to a constant.
             self._changes.turn(self._reference, geometry.attitude(roll, pitch, yaw))
+
+    def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
+        (_, roll_std), (_, pitch_std) = (row.get(name, {}).get(q, _UNKNOWN) for q in (ROLL, PITCH))
+        self._cone.draw(max(roll_std, pitch_std))
 
 
 class RobotScene:
@@ -130,9 +136,10 @@ class RobotScene:
 
     charted: ClassVar[tuple[Quantity, ...]] = (X, Y, HEADING)
     shown_by: ClassVar[tuple[Quantity, ...]] = (HEADING,)
+    combines_filters: ClassVar[bool] = False
 
     def __init__(self, server: viser.ViserServer, changes: Changes, surroundings: Surroundings, places: Floats) -> None:
-        self._scene, self._changes, self._draws = server.scene, changes, 0
+        self._scene, self._changes = server.scene, changes
         (x, y), size = _extent(np.vstack([surroundings.corners_m(), places]))
         self._floor_m = max(_FLOOR_M, 0.001 * size)
         _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
@@ -151,18 +158,15 @@ class RobotScene:
         server.initial_camera.position = (x, y - 0.5 * size, 0.75 * size)
         server.initial_camera.look_at = (x, y, 0.0)
 
-    @property
-    def is_path_due(self) -> bool:
-        return self._draws % _PATH_INTERVAL == 0
-
-    def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
-        self._draws += 1
+    def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         values = row.get(name, {})
-        x, y, heading = (values.get(q, (math.nan, math.nan))[0] for q in (X, Y, HEADING))
+        x, y, heading = (values.get(q, _UNKNOWN)[0] for q in (X, Y, HEADING))
         self._robot.visible = is_known = math.isfinite(x + y + heading)
         if is_known:
             self._changes.move(self._robot, np.array([x, y, 0.0]))
             self._changes.turn(self._robot, geometry.attitude(0.0, 0.0, math.degrees(heading)))
+
+    def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
         if path is not None:
             self._draw_path(path)
 
@@ -216,7 +220,7 @@ class ChainScene:
 
     charted: ClassVar[tuple[Quantity, ...]] = (ANGLE, *BALL_ANGLES, HEIGHT1, HEIGHT2)
     shown_by: ClassVar[tuple[Quantity, ...]] = (QW,)
-    is_path_due = False
+    combines_filters: ClassVar[bool] = True
 
     def __init__(self, server: viser.ViserServer, changes: Changes, rig: Rig) -> None:
         scene, chain, self._changes = server.scene, rig.chain, changes
@@ -245,23 +249,25 @@ class ChainScene:
         server.initial_camera.position = (0.9 * size, -1.5 * size, 1.0 * size)
         server.initial_camera.look_at = (0.0, 0.0, 0.7 * size)
 
-    def draw(self, row: Row, name: str, reference: dict[Quantity, float], path: Floats | None) -> None:
-        nothing = (math.nan, math.nan)
+    def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         first = best_filter(row, row, ROLL)
-        angles = [row[first].get(q, nothing)[0] if first is not None else math.nan for q in (ROLL, PITCH, YAW)]
+        angles = [row[first].get(q, _UNKNOWN)[0] if first is not None else math.nan for q in (ROLL, PITCH, YAW)]
         attitude = geometry.attitude(*angles)
         if not np.isfinite(attitude).all():
             attitude = np.array([1.0, 0.0, 0.0, 0.0])
         chain = best_filter(row, row, QW)
         values = row[chain] if chain is not None else {}
-        rotation = np.array([values.get(q, nothing)[0] for q in CHAIN_ROTATION])
+        rotation = np.array([values.get(q, _UNKNOWN)[0] for q in CHAIN_ROTATION])
         self._changes.turn(self._links[0], attitude)
         if self._fixed_m is not None:
             self._changes.move(self._joint, self._base_m - geometry.turned(attitude, self._fixed_m))
         self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
         if is_known:
             self._changes.turn(self._links[1], product(attitude, rotation / np.linalg.norm(rotation)))
-        self._cone.draw(values.get(QW, nothing)[1] if is_known else math.nan)
+
+    def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
+        chain = best_filter(row, row, QW)
+        self._cone.draw(row[chain][QW][1] if chain is not None else math.nan)
 
 
 class Cone:
@@ -299,6 +305,7 @@ def scene_of(
 
     The camera of a robot's scene also shows `places` (N, 2), m.
     """
+    _light(server.scene)
     estimated = {quantity for of in filters for quantity in of}
     if QW in estimated:
         return ChainScene(server, changes, rig)
@@ -306,6 +313,16 @@ def scene_of(
     if HEADING in estimated and (j2s is None or HEIGHT not in estimated):  # without J2S no height has a value
         return RobotScene(server, changes, surroundings, places)
     return LinkScene(server, changes, None if j2s is None else np.array(j2s))
+
+
+def _light(scene: viser.SceneApi) -> None:
+    """Plain light instead of viser's shadows and environment map.
+
+    Without a graphics card those take two thirds of the time of each frame, and some seconds before the first one.
+    """
+    scene.configure_default_lights(cast_shadow=False)
+    scene.configure_environment_map(None)
+    scene.add_light_hemisphere("/sky", sky_color=_SKY, ground_color=_GROUND, intensity=_SKY_INTENSITY)
 
 
 def _extent(points: Floats) -> tuple[Floats, float]:

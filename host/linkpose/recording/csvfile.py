@@ -30,6 +30,11 @@ def head(kind: str, metadata: Mapping[str, Any], columns: Sequence[str]) -> str:
     return f"# linkpose {kind} 1\n# {json.dumps(metadata)}\n{','.join(columns)}\n"
 
 
+def tail(closing: Mapping[str, Any]) -> str:
+    """The line after the rows."""
+    return f"# {json.dumps(closing)}\n"
+
+
 def metadata_path(path: Path) -> Path:
     """Where the metadata of a plain file are: run.meta.json for run.csv."""
     return path.with_suffix(".meta.json")
@@ -96,7 +101,7 @@ class CsvFile:
     def close(self, closing: Mapping[str, Any]) -> None:
         """Writes what is left and the closing line, and waits until the disk has it."""
         if not self._is_plain:
-            self.write(f"# {json.dumps(closing)}\n")
+            self.write(tail(closing))
         elif self._beside is not None:
             self._beside["closing"] = closing
             self._write_beside()

@@ -34,6 +34,7 @@ class Sensors(IntFlag):
 
 # Order of HELLO's and STATUS's devices.
 DEVICES = (Sensors.MPU6050, Sensors.IMU2, Sensors.BMP180, Sensors.MAG)
+DEVICE_NAMES = ("imu", "imu2", "baro", "mag")  # of the same devices, in reports of health
 # The flag of each mouse port, port 1 first. Their number is the largest number of mice that the protocol carries.
 MOUSE_VALID = tuple(int(flag) for flag in SampleFlags if re.fullmatch(r"MOUSE\d_VALID", flag.name or ""))
 MAX_MICE = len(MOUSE_VALID)

@@ -14,11 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.sensors.checks import BaroCheck, Bools, Cause, Codes, ImuCheck, MagCheck, imu_flags
-from linkpose.sensors.devices import MAX_MICE
+from linkpose.sensors.devices import DEVICE_NAMES, MAX_MICE
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.wire.messages import DeviceState, Hello, SampleFlags
-
-DEVICE_NAMES = ("imu", "imu2", "baro", "mag")  # in the order of HELLO's devices
 
 REPORT_AFTER_S = 0.25  # a state that lasts this long is reported; single lost readings are only counted
 SET_UP_S = 3.0  # longest set-up of a sensor that HELLO reports as being set up
@@ -143,15 +141,17 @@ class SensorHealth:
         return [] if silent else [change]
 
     def as_dict(self) -> dict[str, Any]:
-        """For the summary and the closing line."""
+        """For the summary and the closing line; `since_s` is the time from which on the sensor is faulty."""
         if self.cause == Cause.ABSENT and not self.samples:
             of: dict[str, Any] = {"state": Cause.ABSENT.label}
             return of | {"state": LEFT_OUT, "left_out": self.left_out} if self.left_out else of
         state = self._pending[0] if self.cause in (None, Cause.ABSENT) and self._pending else self.cause
         if state is None:
             state = Cause.STARTING if self.samples == 0 or self._starting else Cause.SILENT
+        since = {} if state == Cause.OK or state != self.cause else {"since_s": round(self._since_s, 6)}
         return {
             "state": state.label,
+            **since,
             "samples": self.samples,
             "valid": self.valid,
             "invalid": {cause.label: number for cause, number in sorted(self.invalid.items())},
