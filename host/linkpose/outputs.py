@@ -155,6 +155,25 @@ def is_changed(fd: int) -> bool:
     return os.fstat(fd).st_size != os.lseek(fd, 0, os.SEEK_CUR)
 
 
+def name_now(fd: int, path: Path) -> Path:
+    """The name of an open file, which another program may have renamed; `path` where the system does not tell."""
+    with contextlib.suppress(OSError):
+        of = os.fstat(fd)
+        if path == STDOUT or not stat.S_ISREG(of.st_mode) or _is_at(path, of):
+            return path
+        found = Path(f"/proc/self/fd/{fd}").readlink()
+        if _is_at(found, of):
+            return found if path.is_absolute() else Path(os.path.relpath(found))
+    return path
+
+
+def _is_at(path: Path, of: os.stat_result) -> bool:
+    try:
+        return os.path.samestat(path.stat(), of)
+    except OSError:
+        return False
+
+
 def write_all(fd: int, path: Path, data: bytes) -> None:
     """Writes all of `data`, or cuts the file back to its last whole line and raises FileError."""
     left = memoryview(data)

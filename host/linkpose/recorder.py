@@ -65,7 +65,7 @@ class Recorder:
 
     @property
     def path(self) -> Path | None:
-        """The recording, which has another name than at the start if another program took the file away."""
+        """The recording, which has another name than at the start if another program took it away or renamed it."""
         return self._path
 
     def _write(self, writer: RecordingWriter, write: Callable[[], None]) -> None:
@@ -114,6 +114,7 @@ class Recorder:
                     more["marks"] = [round(time_s, 6) for time_s in sorted(self.marks)]
                 end = closing(timeline, health.corrupt, health.drift_ppm, **more)
                 self._write(writer, partial(writer.close, end))
+                self._path = writer.path
 
     def __enter__(self) -> Recorder:
         return self

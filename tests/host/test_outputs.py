@@ -8,9 +8,10 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -255,3 +256,40 @@ def test_an_existing_map_is_kept(tmp_path: Path) -> None:
     with pytest.raises(FileExists):
         save_map(tmp_path / "m.yaml", np.zeros((4, 4), bool), 0.1, (0.0, 0.0))
     assert (tmp_path / "m.pgm").read_text() == "mine"
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="this system does not tell the name of an open file")
+@pytest.mark.parametrize("asked", ["run.csv", "/run.csv"], ids=["relative", "absolute"])
+def test_a_file_that_is_renamed_while_it_is_written_has_its_new_name_at_the_end(
+    asked: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The summary of a recording named a file that was not there any more, and proposed a command that would fail."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "kept").mkdir()
+    with CsvFile(Path(f"{tmp_path}{asked}" if asked[0] == "/" else asked), "recording", {}, ["time_s"], False) as file:
+        file.write("0.0\n")
+        (tmp_path / "run.csv").rename(tmp_path / "kept" / "best.csv")
+        file.write("1.0\n")
+        file.close({})
+    assert file.path == (tmp_path / "kept" / "best.csv" if asked[0] == "/" else Path("kept", "best.csv"))
+    assert file.path.read_text().endswith("0.0\n1.0\n# {}\n")
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="this system does not tell the name of an open file")
+def test_the_summary_names_a_recording_that_was_renamed(
+    linkpose: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    close = CsvFile.close
+
+    def rename_and_close(file: CsvFile, closing: Mapping[str, Any]) -> None:
+        file.path.rename(f"new-{file.path}")
+        close(file, closing)
+
+    monkeypatch.setattr(CsvFile, "close", rename_and_close)
+    done = linkpose("record", "r.csv", "--port", "sim://link?speed=0", "--duration", 1)
+    assert "corrupt: new-r.csv\nnext: linkpose estimate new-r.csv" in done.err
+    done = linkpose("estimate", "new-r.csv", "--filter", "tilt", "-o", "e.csv")
+    assert "rows of tilt: new-e.csv\nnext: linkpose plot new-e.csv" in done.err
+    done = linkpose("estimate", "--live", "--port", "sim://link?speed=0", "--duration", 1, "-o", "f.csv")
+    assert "corrupt: new-f.csv\nnext: linkpose plot new-f.csv" in done.err

@@ -66,6 +66,17 @@ def test_a_rig_file_that_cannot_be_made_is_named(linkpose, refused, tmp_path):
     assert sentence.startswith("linkpose: cannot write the rig file") and "folder you may write to" in sentence
 
 
+def test_a_log_on_the_standard_output_is_alone_there(linkpose, tmp_path, monkeypatch):
+    """The statistics of the noise stood below its rows, and files beside it were called -.yaml and -_beacons.csv."""
+    monkeypatch.chdir(tmp_path)
+    done = linkpose("simulate", "underwater", "-o", "-", "--truth", "t.csv", "--duration", 5)
+    assert "outlier_m" in done.err and "asked" not in done.out
+    assert linkpose("simulate", "indoor", "-o", "-", "--truth", "it.csv", "--duration", 5).status == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"t.csv", "t_beacons.csv", "it.csv", "it.yaml", "it.pgm"}
+    mixed = linkpose("simulate", "underwater", "-o", "-", "--truth", "u.csv", "--json")
+    assert mixed.status == 2 and "leave out one of them" in mixed.err
+
+
 def test_the_statistics_of_the_noise_stand_in_columns(linkpose, tmp_path):
     shown = linkpose("simulate", "underwater", "-o", tmp_path / "u.csv", "--truth", tmp_path / "t.csv", "--duration", 5)
     lines = shown.out.splitlines()

@@ -198,10 +198,10 @@ def _replay(path: Path, request: Request, console: Console) -> None:
         for line in final_table(extremes.summary(), shutil.get_terminal_size().columns):
             click.echo(line)
     report_findings(estimator, console)
-    if request.output or not sink.gives_rows:
-        console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(request.output)}")
-    if request.output:
-        options.show_next(console.is_quiet, *options.plot_command(request.output))
+    if sink.path or not sink.gives_rows:
+        console.report(f"{counted(rows, 'row')} of {', '.join(head['filters'])}{options.written(sink.path)}")
+    if sink.path:
+        options.show_next(console.is_quiet, *options.plot_command(sink.path))
     elif not sink.gives_rows:
         options.show_next(console.is_quiet, *sys.argv[1:], "-o", options.new_file("estimate.csv"))
 

@@ -69,9 +69,9 @@ def estimate_live(
 
         ended = live.run_board(connected, duration, handle)
         run.finish(ended)
-        live.show_summary(console, run.health, request.json_lines, options.written(request.output))
-        if request.output:
-            options.show_next(console.is_quiet, *options.plot_command(request.output))
+        live.show_summary(console, run.health, request.json_lines, options.written(sink.path))
+        if sink.path:
+            options.show_next(console.is_quiet, *options.plot_command(sink.path))
         connected.check_usable()
 
 

@@ -44,11 +44,11 @@ def command(
     quiet: bool,
 ) -> None:
     """Simulate a log of a robot with odometry and a laser scanner on a floor of 100 x 40 m, its map and its truth."""
-    from linkpose.outputs import check_outputs
+    from linkpose.outputs import STDOUT, check_outputs
     from linkpose.simulation.export import write_indoor
     from linkpose.simulation.indoor import IndoorErrors, simulate_indoor
 
-    map_file = map_file or output.with_suffix(".yaml")
+    map_file = map_file or (truth if output == STDOUT else output).with_suffix(".yaml")
     check_outputs((output, truth, map_file, map_file.with_suffix(".pgm")), force)
     errors = IndoorErrors(range_m=range_std, range_growth=range_growth, outlier_fraction=outliers)
     run = simulate_indoor(seed, errors, duration)

@@ -65,11 +65,13 @@ def command(
     Prints the statistics of the noise as set and as computed from the log.
     """
     from linkpose.cli.rendering import as_table
-    from linkpose.outputs import check_outputs
+    from linkpose.outputs import STDOUT, check_outputs
     from linkpose.simulation.export import write_underwater
     from linkpose.simulation.underwater import UnderwaterErrors, self_check, simulate_underwater
 
-    beacons = beacons or output.with_name(f"{output.stem}_beacons.csv")
+    options.refuse_mixed_output(output, json_lines)
+    named = truth if output == STDOUT else output
+    beacons = beacons or named.with_name(f"{named.stem}_beacons.csv")
     check_outputs((output, truth, beacons), force)
     errors = UnderwaterErrors(
         range_m=range_std,
@@ -83,5 +85,5 @@ def command(
     rows: list[dict[str, object]] = [
         {"check": row.check, "asked": row.asked, "measured": row.measured} for row in self_check(run)
     ]
-    click.echo("\n".join(map(json.dumps, rows)) if json_lines else as_table(rows))
+    click.echo("\n".join(map(json.dumps, rows)) if json_lines else as_table(rows), err=output == STDOUT)
     options.show_next(quiet, "localize", output, "--beacons", beacons, "--truth", truth)

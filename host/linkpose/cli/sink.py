@@ -12,6 +12,8 @@ import click
 from linkpose.errors import InvalidValue
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from linkpose.cli.estimate import Request
     from linkpose.estimation import EstimateWriter, Estimator
     from linkpose.sensors.measurements import Floats
@@ -59,6 +61,11 @@ class Sink:
                     output.send(row, start_s + (row["time_s"] or 0.0))
             if self._json:
                 _print("".join(json.dumps(row) + "\n" for row in rows))
+
+    @property
+    def path(self) -> Path | None:
+        """The file, under the name that it had last; None without one."""
+        return None if self._file is None else self._file.path
 
     @property
     def gives_rows(self) -> bool:

@@ -20,7 +20,17 @@ from pathlib import Path
 from typing import Any, Self
 
 from linkpose.errors import CannotWrite, FileExists
-from linkpose.outputs import STDOUT, check_unchanged, create, is_changed, numbered, replace_file, synchronise, write_all
+from linkpose.outputs import (
+    STDOUT,
+    check_unchanged,
+    create,
+    is_changed,
+    name_now,
+    numbered,
+    replace_file,
+    synchronise,
+    write_all,
+)
 
 _COPIED_BYTES = 1 << 20  # at once
 
@@ -99,12 +109,13 @@ class CsvFile:
                 self.write(self._start)
 
     def close(self, closing: Mapping[str, Any]) -> None:
-        """Writes what is left and the closing line, and waits until the disk has it."""
+        """Writes what is left and the closing line, and waits until the disk has it. `path` is the file's name then."""
         if not self._is_plain:
             self.write(tail(closing))
         elif self._beside is not None:
             self._beside["closing"] = closing
             self._write_beside()
+        self.path = name_now(self._fd, self.path)
         try:
             synchronise(self._fd)
             self._release()
