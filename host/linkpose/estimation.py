@@ -233,11 +233,8 @@ class Estimator:
 
     @property
     def mice_remarks(self) -> list[str]:
-        """Faults that all mice share, by the first filter that compares them with the gyro."""
-        for f in self.filters:
-            if isinstance(f, filters.RemarksOnMice):
-                return f.mice_remarks
-        return []
+        """Faults that mice share, by the filter that finds most."""
+        return max((f.mice_remarks for f in self.filters if isinstance(f, filters.RemarksOnMice)), key=len, default=[])
 
     @property
     def outcome(self) -> dict[str, Any]:

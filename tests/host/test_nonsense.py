@@ -175,6 +175,18 @@ def test_a_second_sensor_is_judged_as_the_first(seed: int, change, sentence: str
     assert found == [] if sentence is None else [sentence in each for each in found] == [True], found
 
 
+def on_a_robot(z: float) -> list[str]:
+    """With mice that count, and gravity along this direction of the z axis, and along x."""
+    measured = ChainRun("hinge", 2, 20.0).measurements()
+    accel = np.tile([9.80665 * np.sqrt(1 - z**2), 0.0, 9.80665 * z], (len(measured), 1))
+    return suspicions(dataclasses.replace(measured[:500], accel_m_s2=accel[:500], mice_counts=np.zeros((500, 2, 2))))
+
+
+@pytest.mark.parametrize("z", [1.0, 0.8, 0.5, 0.0, -1.0])
+def test_a_sensor_of_a_robot_that_is_not_upright_is_named(z: float) -> None:
+    assert any("points up: check its mounting" in remark for remark in on_a_robot(z)) == (z < 0.7)
+
+
 def put(name: str, row: int | slice, value: float) -> Callable[[dict[str, np.ndarray]], None]:
     return lambda table: table[name].__setitem__(row, value)
 
@@ -333,7 +345,7 @@ def test_each_remark_of_the_documentation_is_produced(tmp_path: Path) -> None:
     shown = re.findall(r"^\| `([^`]+)` \|", page.split("\n## Remarks on recordings")[1].split("\n## ")[0], re.MULTILINE)
     found = "\n".join(remarks(tmp_path, change) for change, _ in [*WRONG, (scale(1000.0, "time"), "")])
     found += "\n".join(fast_remarks(change) for change, _ in FAST)
-    found += "\n" + remarks(tmp_path, repeating(4)) + "\n".join(second_remarks(2, copied))
+    found += "\n" + remarks(tmp_path, repeating(4)) + "\n".join([*second_remarks(2, copied), *on_a_robot(-1.0)])
     found += "\n" + remarks(tmp_path, lambda table: with_second_sensor(table, np.full(N, 2 * BOTH_VALID)))
     assert len(shown) > 10
     for remark in shown:

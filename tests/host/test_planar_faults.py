@@ -12,6 +12,7 @@ import pytest
 from robot_counts import DEG, LEGS, TRIANGLE, Robot, counts, forces, gyro, measurements, rig, robot
 
 from linkpose.experiments.planar import PlanarRun, baseline, pose_error
+from linkpose.filters.mice import MiceFilter
 from linkpose.filters.planar import PlanarEkf
 from linkpose.rotations import wrapped
 from linkpose.sensors.measurements import Measurements
@@ -57,6 +58,39 @@ def test_a_jump_of_the_gyro_s_bias_under_way_is_found_and_undone(degrees_per_s, 
     assert after_s < filter_.gyro_jumps.last_time_s < after_s + 12.0
     assert min(share_within(run, out)) > 0.75 and min(share_within(run, out, 4.0)) > 0.9
     assert math.degrees(heading_errors(run, out)[-1]) < 2.0
+
+
+PAIR = TRIANGLE[1:]
+EXCHANGES = {
+    "mice 1 and 2 are exchanged": (TRIANGLE, [1, 0, 2]),
+    "mice 1, 2 and 3 are exchanged": (TRIANGLE, [2, 0, 1]),
+    "mice 1 and 2 are exchanged: in turns, each moves as at the place of another. Exchange their cables, or their "
+    "[[mouse]] tables in the rig file; or the gyro states the reverse": (PAIR, [1, 0]),
+}
+
+
+@pytest.mark.parametrize("make", [PlanarEkf, MiceFilter])
+@pytest.mark.parametrize("sentence", EXCHANGES, ids=["two of three", "all", "both"])
+def test_mice_that_are_exchanged_are_named(make, sentence):
+    """Their mean is sound, so that the ten lines of the baseline were 25 times better, and nothing was said."""
+    places, order = EXCHANGES[sentence]
+    run = robot(2)
+    filter_ = make(rig(places))
+    filter_.process(measurements(run, counts(run, places)[:, order], gyro(run) + 20 * DEG))
+    assert filter_.mice_remarks[0].startswith(sentence)
+    sound = make(rig(places))
+    sound.process(measurements(run, counts(run, places, seen=slips(0.5, 20.0, 30.0)(run)[:, order]), gyro(run)))
+    assert not any("exchanged" in remark for remark in sound.mice_remarks)
+
+
+@pytest.mark.parametrize("make", [PlanarEkf, MiceFilter])
+def test_a_gyro_that_is_upside_down_is_named(make):
+    run = robot(3)
+    filter_ = make(rig())
+    filter_.process(measurements(run, counts(run), -gyro(run)))
+    assert "the gyro states the reverse of the turns that the mice show: its z axis must point up" in (
+        filter_.mice_remarks
+    )
 
 
 def slips(share: float, start_s: float, end_s: float) -> Callable[[Robot], np.ndarray]:

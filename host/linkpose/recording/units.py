@@ -37,6 +37,7 @@ _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
 _STRONGEST_M_S2 = 160.0  # the MPU-6050 reads up to 16 g, 156.9 m/s²
 _COPIED, _FEWEST_CHANGES = 0.5, 50  # share of the rows that changed, and how many: no chance, and not a part alone
+_UPRIGHT = 0.7  # cosine of the slope of the steepest floor, 45°
 _SPIKES = 0.001  # share of readings beyond these that are no wrong unit
 _TILTS_RAD_S = 0.1  # rms rate about horizontal axes at which gravity turns through the accelerometer's axes
 _LONGEST_STEP_S = 0.5
@@ -55,6 +56,7 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
     found = [
         *_imu(measurements, bool(time)),
         *_second_imu(measurements, bool(time)),
+        _upright(measurements),
         time,
         _pressure(_median(measurements.pressure_Pa)),
         _repeated("baro_fresh", "pressure_Pa", measurements.baro_fresh, measurements.pressure_Pa[:, None]),
@@ -85,6 +87,17 @@ def _second_imu(measurements: Measurements, is_time_wrong: bool) -> list[str]:
         _copied("accel", measurements.accel_m_s2, accel),
         _copied("gyro", measurements.gyro_rad_s, gyro),
     ]
+
+
+def _upright(measurements: Measurements) -> str:
+    """A remark if gravity is not along z on a robot, whose turn rate is read from the gyro's z axis."""
+    up, force = _median(measurements.accel_m_s2[:, 2]), _median(np.linalg.norm(measurements.accel_m_s2, axis=1))
+    if not np.isfinite(measurements.mice_counts).any() or not up < _UPRIGHT * force:
+        return ""
+    return (
+        f"accel_z is {up:.3g} of {force:.3g} m/s² (medians), and on a robot with mice the z axis of the inertial "
+        "sensor points up: check its mounting, and the order and the signs of the columns"
+    )
 
 
 def _copied(name: str, first: Floats, second: Floats) -> str:

@@ -24,6 +24,7 @@ from linkpose.filters._records import record_of
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice.causes import causes
 from linkpose.filters.mice.faults import ACCEL_M_S2, ANGULAR_RAD_S2
+from linkpose.filters.mice.places import remarks_on_places
 from linkpose.filters.mice.plane import scaled, turned, turned_mean, unit
 from linkpose.filters.mice.reading import (
     BIAS_STD,
@@ -69,6 +70,7 @@ class MiceFilter:
         self.parameters = parameters or MiceParameters()
         self.state = fresh_state(len(rig.mouse), BIAS_STD)
         self._parameters, self._mice, self._imu = record_of(self.parameters), mouse_records(rig.mouse), rig.imu
+        self._placed = self._mice.copy()
 
     @property
     def rejected(self) -> int:
@@ -79,6 +81,11 @@ class MiceFilter:
     def mouse_causes(self) -> dict[int, str]:
         """Why mice were excluded so far (1 for the first; 0: all together)."""
         return causes(self.state[0], self._mice)
+
+    @property
+    def mice_remarks(self) -> list[str]:
+        """Mice that are exchanged, and a gyro that states the reverse."""
+        return remarks_on_places(self.state[0], self._mice, self._placed)
 
     def process(self, block: Measurements) -> Floats:
         """Velocity in b and its standard deviations, pose in n, excluded mice, at each of the N samples: (N, 10).

@@ -250,6 +250,21 @@ def _fill_window(state: Record, mice: Records) -> None:
 
 
 @inner
+def _watch_turns(state: Record, mice: Records) -> None:
+    """Add the step to the sums that show where each mouse sits."""
+    if state.sound != (1 << state.count) - 1 or not math.isfinite(state.mean_rate):
+        return
+    turn = state.mean_rate * state.step
+    state.turns += 1.0
+    state.turns_sum += turn
+    state.turns_squared += turn * turn
+    for i in range(state.count):
+        m = mice[i]
+        m.way += scaled(m.share, m.counts)
+        m.way_by_turn += scaled(turn * m.share, m.counts)
+
+
+@inner
 def _compare_excluded(state: Record, mice: Records) -> None:
     """Add the motion of each excluded mouse, and the motion that the others show at its place, to its sums."""
     for i in range(state.count):
@@ -301,6 +316,8 @@ def correct(state: Record, mice: Records, p: Record, finds_bias: bool) -> bool:
         faults.skip_late(state, mice, p.noise_m_s, p.mismatch)
     if not state.step > 0.0:
         return False
+    if not (is_gap or state.is_saturated):
+        _watch_turns(state, mice)
     is_known = _fuse(state, mice, p)
     if not is_known and math.isfinite(state.mean_rate):
         state.turn_rate = state.mean_rate - state.bias

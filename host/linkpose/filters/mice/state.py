@@ -79,6 +79,8 @@ MOUSE = np.dtype(
         ("agreed_s", "f8"),  # time for which an excluded mouse has agreed (s)
         ("agreed_m", "f8"),  # distance over which it has (m)
         ("while_excluded", _COMPARISON),  # its motion beside the motion that the others show at its place
+        ("way", "c16"),  # sums over the steps of `turns`: of its counts, and of its counts times the turn (rad)
+        ("way_by_turn", "c16"),
         ("snap_readings", "f8"),  # readings almost along an axis in which counts across it were expected
         ("snap_empty", "f8"),  # and those of them without such counts
         ("snaps", "?"),  # whether they show that the mouse snaps to its axes
@@ -140,6 +142,10 @@ STATE = np.dtype(
         ("disagree_s", "f8"),  # for how long the mice have disagreed (s)
         # While no mouse is used: motions of the mice relative to their mean, beside the gyro's turn.
         ("while_excluded", _COMPARISON),
+        # Turns of the gyro (rad), bias included, in steps in which all mice count: how many, their sum, and of squares.
+        ("turns", "f8"),
+        ("turns_sum", "f8"),
+        ("turns_squared", "f8"),
         # Result of a least-squares fit: motion (m, rad) or velocity (m/s, rad/s), and variances.
         ("fit", "c16"),
         ("fit_turn", "f8"),

@@ -25,6 +25,7 @@ from linkpose.filters import GyroJumps, MovedMouse
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
 from linkpose.filters.mice.causes import causes
+from linkpose.filters.mice.places import remarks_on_places
 from linkpose.filters.mice.reading import BIAS_STD
 from linkpose.filters.mice.state import Floats, fresh_state, mouse_records, sample_records
 from linkpose.filters.planar.process import process
@@ -149,7 +150,8 @@ class _PlanarFilter:
     @property
     def mice_remarks(self) -> list[str]:
         """Faults that all mice share, as the turns have shown them, and mice that count in an unusual way."""
-        return [*self._remarks_on_all(), *self._remarks_on_each()]
+        places = remarks_on_places(self._mice_state[0], self._mice, self._placed)
+        return [*places, *self._remarks_on_all(), *self._remarks_on_each()]
 
     def _remarks_on_all(self) -> Iterator[str]:
         state, limit = self.state[0], float(self._mice_state[0].speed_limit)
