@@ -372,7 +372,7 @@ REMARKS: dict[str, str | Producer] = {
     "the mice count … ± … % … per metre than the rig file states, compared with the gyro (another floor?): type linkpose calibrate mice on this floor": reported(
         mice_scale=(1.05, 0.001)
     ),
-    "mice … are exchanged: in turns, each moves as at the place of another. Exchange their cables, or their [[mouse]] tables in the rig file": "test_planar_faults.py::test_mice_that_are_exchanged_are_named",
+    "mice … and … are exchanged: in turns, each moves as at the place of another. Exchange their cables, or their [[mouse]] tables in the rig file": "test_planar_faults.py::test_mice_that_are_exchanged_are_named",
     "the gyro states the reverse of the turns that the mice show: its z axis must point up": "test_planar_faults.py::test_a_gyro_that_is_upside_down_is_named",
     "the mice show no speed above … m/s, where gyro or accelerometer show more: this is the limit of their sensors. Where the robot was faster, the path is too short, and the σ of the position includes it. Drive slower, or use mice for higher speeds": "test_planar_faults.py::test_a_speed_limit_of_all_mice_shows_in_bends_and_widens_the_position",
     "all mice count … times as much since a time before … s, compared with the gyro: their resolution was switched, and the path since then was corrected": "test_planar_faults.py::test_another_resolution_of_all_mice_is_found_in_two_turns",
