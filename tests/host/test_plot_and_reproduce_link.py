@@ -215,6 +215,23 @@ def test_a_map_and_beacons_lie_under_the_path(tmp_path):
     assert path.get_ylim()[1] >= 6.0
 
 
+@pytest.mark.parametrize("way_m", [40.0, 12.0, 0.0])
+def test_heading_ticks_do_not_hide_a_short_path(tmp_path, way_m):
+    """A drive of 12 m in a hall of 60 m was a row of arrows on top of each other."""
+    t = np.linspace(0.0, 1.0, 200)
+    file = write(
+        tmp_path / "e.csv", {"time_s": 10 * t, "ekf_x_m": way_m * t, "ekf_y_m": 0 * t, "ekf_heading_rad": 0 * t}
+    )
+    scene = Surroundings(None, {"1": (0.0, 0.0, 0.0), "2": (60.0, 60.0, 0.0)})
+    figure, _ = plotting.plot_tables([read_table(Path(file))], scene=scene)
+    figure.draw_without_rendering()
+    (ticks,) = (each for each in figure.axes[0].collections if type(each).__name__ == "Quiver")
+    places = figure.axes[0].transData.transform(np.asarray(ticks.get_offsets())) / figure.dpi  # inches
+    apart = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    assert (len(places) > 1) == (way_m > 0)
+    assert (apart > 1.2 / ticks.scale).all()
+
+
 def test_a_chain_shows_its_joint_angle_and_its_error(tmp_path):
     t = np.arange(300) / 100
     angle = 30 * np.sin(t)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _MARGIN = 0.1  # of a path's extents: heading ticks at its edge are in view
 _MARKS = 12  # heading ticks and ellipses along a path
+_TICK_INCHES = 0.22  # length of a heading tick
+_TICKS_APART = 1.4  # lengths of a tick between two, at least: those of a robot that moves little hid its path
 _MOST_CELLS = 3000  # of a map, along a side
 _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the whole width
 
@@ -80,7 +82,8 @@ def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: b
         _, x, y = broken(track.time_s, track.values[X], track.values[Y])
         keep = slice(None, None, max(1, len(x) // MOST_POINTS))
         axes.plot(x[keep], y[keep], label=track.label, **style)
-        _mark(axes, track, str(style["color"]))
+    for track in reversed(tracks):
+        _mark(axes, track, str((line_style(track.name, track.file) if track.name else TRUTH)["color"]))
     axes.set_aspect("equal", "datalim")
     if not wide:
         axes.set_box_aspect(1.0)
@@ -135,6 +138,7 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
     if not track.name:
         return
     at = known[np.linspace(0, len(known) - 1, min(_MARKS, len(known))).astype(int)]
+    at = at[_apart(np.column_stack([x[at], y[at]]), _TICKS_APART * _TICK_INCHES * _metres_an_inch(axes))]
     if HEADING in track.values:
         angle = np.radians(track.values[HEADING][at])
         axes.quiver(
@@ -147,7 +151,7 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
             units="inches",
             width=0.025,
             scale_units="inches",
-            scale=4.5,
+            scale=1 / _TICK_INCHES,
             zorder=4,
         )
     if X in track.std and Y in track.std:
@@ -158,6 +162,22 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
                     Ellipse((x[i], y[i]), 4 * sx, 4 * sy, facecolor=colour, edgecolor=colour, alpha=0.25, zorder=2)
                 )
         axes.fill([], [], color=colour, alpha=0.25, label=f"±2σ {track.label}")
+
+
+def _metres_an_inch(axes: Axes) -> float:
+    """Of axes with equal scales, before their limits are set: the scale at which all data have room."""
+    box, inch = axes.get_window_extent(), axes.figure.dpi
+    data = axes.dataLim
+    return (1 + 2 * _MARGIN) * inch * max(float(data.width / box.width), float(data.height / box.height))
+
+
+def _apart(places: Floats, least: float) -> list[int]:
+    """Indices of places (N, 2), each at least so far from the one before."""
+    kept = [0]
+    for at in range(1, len(places)):
+        if np.linalg.norm(places[at] - places[kept[-1]]) >= least:
+            kept.append(at)
+    return kept
 
 
 def _position_errors(axes: Axes, sources: Sources, best_only: bool = False) -> None:
