@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from linkpose.cli.localize import command
-from linkpose.errors import AmbiguousStart
+from linkpose.errors import AmbiguousStart, MissingStart
 from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.likelihood import run_filter
 from linkpose.localization.localizer import estimate_track
@@ -277,6 +277,68 @@ def test_a_tag_beside_anchors_near_one_line_is_not_mirrored_in_silence(depth_m: 
     paths = localize(log, beacons=anchors, drift_std_m=0.0)
     assert any("fits the log better than its mirror image" in remark for remark in paths.remarks)
     assert paths.ekf.position_m[-1, 1] == pytest.approx(5.0 + 2.0 * math.cos(0.17 * 59.95), abs=0.4)
+
+
+def walk(seed: int, fixes: int, every_s: float, at_once: bool = True) -> tuple[Log, Truth]:
+    """A tag that walks at 1 m/s from one place among BEACONS to the next, without odometry: a range to each beacon, at
+    one instant or in turn, every so many seconds (σ 0.1 m).
+    """
+    rng = np.random.default_rng(seed)
+    times = np.arange(0.0, fixes * every_s + 0.1, 0.1)
+    path, place, goal = [], np.array([5.0, 8.0]), np.array([5.0, 8.0])
+    for _ in times:
+        path.append(place)
+        left = goal - place
+        if np.linalg.norm(left) < 0.15:
+            goal = rng.uniform(2.0, 18.0, 2)
+        else:
+            place = place + 0.1 * left / np.linalg.norm(left)
+    log: Log = []
+    for i in range(fixes * (1 if at_once else 4)):
+        time = 0.03 + i * every_s / (1.0 if at_once else 4.0)
+        at = np.array([np.interp(time, times, column) for column in np.array(path).T])
+        for name in list(BEACONS) if at_once else [str(1 + i % 4)]:
+            distance = float(np.linalg.norm(at - BEACONS[name][:2])) + rng.normal(0.0, 0.1)
+            log.append(Event(time, "range", (distance,), name))
+    return log, Truth(times, np.array(path), None)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_tag_is_placed_by_a_fix_every_ten_seconds(smooth: bool) -> None:
+    """The tag may be anywhere in the area by then, where one extended filter was 2 to 7 m off and stated 0.5 m."""
+    errors, shares = [], []
+    for seed in range(4):
+        log, truth = walk(seed, 60, 10.0)
+        track = estimate_track(log, "ekf", settings(estimate=("scale", "bias"), smooth=smooth), None, BEACONS)
+        score = score_track(track, truth)
+        errors.append(score.position_rmse_m)
+        shares.append(score.within_2_sigma or 0.0)
+    assert max(errors) < 0.3  # a fit of each fix alone, of ranges without errors that persist: 0.11 m
+    assert np.mean(shares) > 0.9
+
+
+def test_a_tag_that_ranges_to_one_beacon_every_three_seconds_needs_no_start() -> None:
+    """No fix places it: the first ranges are circles, and the stated σ says so."""
+    for seed in range(3):
+        log, truth = walk(seed, 40, 12.0, at_once=False)
+        noises = settings(acceleration_std_m_s2=0.3)
+        track = estimate_track(log, "ekf", noises, None, BEACONS)
+        assert track.std[0, :2].min() > 3.0
+        score = score_track(track, truth)
+        late = np.linalg.norm(track.position_m[80:] - truth.position_at(track.time_s[80:]), axis=1)
+        assert float(np.sqrt(np.mean(late**2))) < 3.5  # the middle of the area: 6 m
+        assert score.within_2_sigma is not None and score.within_2_sigma > 0.9
+    near_line = {name: (x, 0.01 * y, 0.0) for name, (x, y, _) in BEACONS.items()}
+    with pytest.raises(MissingStart):
+        estimate_track(log, "ekf", noises, None, near_line)
+
+
+def test_a_range_of_metres_too_much_counts_as_an_outlier_between_slow_fixes() -> None:
+    log, truth = walk(9, 40, 10.0)
+    wrong = [replace(e, values=(e.values[0] + 4.0,)) if i % 9 == 4 else e for i, e in enumerate(log)]  # type: ignore[type-var]
+    score = score_track(estimate_track(wrong, "ekf", settings(), None, BEACONS), truth)
+    assert score.position_rmse_m < 0.5
+    assert score.within_2_sigma is not None and score.within_2_sigma > 0.85
 
 
 def test_a_current_and_a_wrong_speed_of_sound_are_constants_of_a_dive() -> None:

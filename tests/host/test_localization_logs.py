@@ -298,6 +298,20 @@ def test_wrong_units_are_named(events, reason):
         check_units(events, {"1": (0.0, 0.0, 0.0), "2": (5.0, 5.0, 0.0)}, "log.csv")
 
 
+def test_fixes_every_ten_seconds_are_no_milliseconds():
+    """A walker, a robot of 0.2 m/s and a tag at rest; the same numbers as a sensor of 100 Hz are refused."""
+    noise = np.random.default_rng(1).normal(0.0, 0.1, 200)
+    beacons = {"1": (0.0, 0.0, 0.0), "2": (5.0, 5.0, 0.0)}
+    for speed in (1.0, 0.2, 0.0, 0.001):
+        ranges = 2.0 + np.abs((speed * 10.0 * np.arange(200) + 4.0) % 8.0 - 4.0) + noise
+        log = [Event(10.0 * i, "range", (each,), "1") for i, each in enumerate(ranges)]
+        if speed == 0.001:
+            with pytest.raises(LinkposeError, match="milliseconds"):
+                check_units(log, beacons, "log.csv")
+        else:
+            check_units(log, beacons, "log.csv")
+
+
 def test_sparse_truth_is_compared_at_its_own_times():
     """True poses 6 s apart: each is compared, and a path that is off is not called right."""
     truth = Truth(np.arange(0.0, 60.0, 6.0), np.column_stack((np.arange(0.0, 60.0, 6.0), np.zeros(10))), None)

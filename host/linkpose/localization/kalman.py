@@ -46,7 +46,7 @@ class MotionModel:
 
 
 UNICYCLE = MotionModel(models.UNICYCLE, ("x_m", "y_m", "heading_rad"), 2, 2)
-CONSTANT_VELOCITY = MotionModel(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 0, 2)
+CONSTANT_VELOCITY = MotionModel(models.CONSTANT_VELOCITY, ("x_m", "y_m", "x_rate_m_s", "y_rate_m_s"), 1, 4)
 HOLONOMIC = MotionModel(models.HOLONOMIC, ("x_m", "y_m", "heading_rad"), 3, 3)
 SUBMERSIBLE = MotionModel(models.SUBMERSIBLE, ("x_m", "y_m", "z_m", "heading_rad", "wz_rad_s"), 5, 4)
 SUBMERSIBLE_IN_CURRENT = MotionModel(

@@ -11,14 +11,33 @@ from numpy.typing import NDArray
 from linkpose.compiling import compiled
 from linkpose.localization.drift import drift
 from linkpose.localization.ekf import ekf_predict, ekf_step
+from linkpose.localization.gaussian_sum import (
+    MOST_IN_SEARCH,
+    RangeRow,
+    collapse,
+    correct_sum,
+    expected,
+    is_bent,
+    predict_sum,
+    single,
+)
 from linkpose.localization.grid import GridMap
-from linkpose.localization.linalg import Floats, add_to, product, product_transposed, subtract_from
-from linkpose.localization.models import jacobian, predict
+from linkpose.localization.linalg import (
+    Floats,
+    add_to,
+    keep_positive_definite,
+    product,
+    product_transposed,
+    subtract_from,
+)
+from linkpose.localization.models import CONSTANT_VELOCITY, jacobian, predict
 from linkpose.localization.steps import Correction, Gaussian, Prediction
 
 # Degrees of freedom of Student's t: 5 gives outliers of six standard deviations a fifth of their normal weight. 3
 # underestimates the noise of normal errors by a tenth, 30 follows the outliers.
 TAILS = 5.0
+# ln of the largest density of Student's t, which `_student` leaves out.
+STUDENT_PEAK = -(math.lgamma(0.5 * (TAILS + 1.0)) - math.lgamma(0.5 * TAILS) - 0.5 * math.log(TAILS * math.pi))
 
 
 class Rows(NamedTuple):
@@ -50,6 +69,7 @@ def run_filter(
     variances: Floats,
     drifts: Floats,
     thresholds: Floats,
+    outliers: float,
     grid: GridMap,
     innovations: Floats,
 ) -> float:
@@ -58,21 +78,42 @@ def run_filter(
 
     Changes `estimate` and fills `innovations` (N, 2) with ν_i / √S_ii. `motion` is the motion model's number,
     `noise_root` (q, q) the lower Cholesky factor of Q, `variances` (N, 3) the diagonal of R, `drifts` (n, 2) as in
-    `drift`, and `thresholds` (3,) the gate for a measurement of one, two and three rows.
+    `drift`, and `thresholds` (3,) the gate for a measurement of one, two and three rows. A tag without odometry is a
+    sum of Gaussians where a range is no line within one; `outliers` is the density (1/m) of its outliers.
     """
     q = noise_root.shape[0]
     root, d2, total = np.empty((q, q)), np.empty(1), 0.0
+    mixture = single(estimate.mean, estimate.covariance)
     for k in range(rows.intervals_s.shape[0]):
         interval = rows.intervals_s[k]
         if interval > 0.0:
             for i in range(q):
                 for j in range(q):
                     root[i, j] = noise_root[i, j] * math.sqrt(rows.holds_s[k, i] / interval)
-            ekf_predict(estimate, Prediction(motion, rows.controls[k], root, interval))
-            drift(estimate, interval, drifts)
+            moves = Prediction(motion, rows.controls[k], root, interval)
+            if mixture.weights.shape[0] > 1:
+                mixture = predict_sum(mixture, moves, drifts)
+                collapse(mixture, estimate.mean, estimate.covariance)
+            else:
+                ekf_predict(estimate, moves)
+                drift(estimate, interval, drifts)
         m = rows.sizes[k]
         if m == 0:
             continue
+        if motion == CONSTANT_VELOCITY and not rows.is_direct[k]:
+            row = RangeRow(rows.values[k, 0], variances[k, 0], rows.parameters[k, 0], outliers)
+            is_many = mixture.weights.shape[0] > 1
+            if is_many or is_bent(estimate.mean, estimate.covariance, row):
+                if not is_many:
+                    mixture = single(estimate.mean, estimate.covariance)
+                off, spread = expected(mixture, row)
+                innovations[k, 0] = off / math.sqrt(spread)
+                mixture, density, _ = correct_sum(mixture, row, MOST_IN_SEARCH)
+                total -= density + STUDENT_PEAK
+                collapse(mixture, estimate.mean, estimate.covariance)
+                if not keep_positive_definite(estimate.covariance) or not math.isfinite(estimate.mean[0]):
+                    return math.inf
+                continue
         noise = np.zeros((m, m))
         for i in range(m):
             noise[i, i] = variances[k, i]
@@ -83,6 +124,7 @@ def run_filter(
         )  # fmt: skip
         if rows.counts[k]:
             total += _cost(estimate, correction, grid, innovations[k])
+        mixture = single(estimate.mean, estimate.covariance)  # other sensors are linear
         still = Prediction(motion, rows.controls[k], root, 0.0)
         if not ekf_step(estimate, still, correction, grid) or not math.isfinite(estimate.mean[0]):
             return math.inf

@@ -29,14 +29,18 @@ from linkpose.localization.noise import check_correlation
 from linkpose.localization.relocation import Relocator
 from linkpose.localization.settings import DRIFT, Pose, Settings
 from linkpose.localization.smoother import FilterPass
+from linkpose.localization.sum_filter import GaussianSumFilter, outlier_density
 from linkpose.localization.tables import Beacons
 from linkpose.localization.track import Track
 from linkpose.localization.vehicle import (
     CONTROLS,
     DIVING,
+    area_of,
     at_their_height,
     control_holds,
     drifts_of,
+    first_control,
+    first_place,
     first_pose,
     kinds_of,
     noise_root,
@@ -157,12 +161,14 @@ class Localizer:
         motion = vehicle.extended((*constants, *drift_states(settings, names)))
         self.prior = first_pose(head) if settings.start is None else None
         start = settings.start if self.prior is None else _pose_of(self.prior)
+        spread_m = 0.0
         if start is None and self.vehicle is CONSTANT_VELOCITY:
-            start = next(iter(places_from_ranges(head, beacons)), None)
+            start, spread_m = first_place(head, beacons)
         depth = next((event.values[0] for event in head if isinstance(event, Event) and event.kind == "depth"), 0.0)
         state, std = start_state(start or (0.0, 0.0, 0.0), depth, settings, motion)
+        std[:2] = np.hypot(std[:2], spread_m)
         kalman: FilterName = "ukf" if name == "ukf" else "ekf"
-        self.filter = KalmanFilter(
+        arguments = (
             kalman,
             motion,
             state,
@@ -173,10 +179,14 @@ class Localizer:
             grid or no_map(),
             drifts_of(settings, motion),
         )
+        if self.vehicle is CONSTANT_VELOCITY and name == "ekf":
+            self.filter: KalmanFilter = GaussianSumFilter(*arguments, outlier_density(beacons))
+        else:
+            self.filter = KalmanFilter(*arguments)
         # Of a row: all but the drifts of the ranges, which come last.
         self.states = tuple(name for name in motion.states if not name.startswith(DRIFT))
         self.sensors = MeasurementBuilder(settings, motion, beacons)
-        self.control, self.hold = np.zeros(motion.controls), np.ones(motion.noises)
+        self.control, self.hold = first_control(settings, self.vehicle), np.ones(motion.noises)
         self.now = head[0].time_s
         self.last_control_s: float | None = None
         self.lately_rejected: dict[str, deque[bool]] = {}
@@ -237,6 +247,8 @@ class Localizer:
             settings = replace(settings, drift_is_shared=self.settings.drift_is_shared)
         self.settings = self.sensors.settings = settings
         self.filter.noise_root = noise_root(settings, self.vehicle)
+        if self.vehicle is CONSTANT_VELOCITY:
+            self.control = first_control(settings, self.vehicle)
         if settings.drift_std_m and not has_drifts:
             self._add_drifts()
         self.filter.drifts = drifts_of(settings, self.filter.motion)
@@ -420,8 +432,9 @@ def _check_start(log: Log, name: Method, settings: Settings, beacons: Beacons, k
     """Raises MissingStart or AmbiguousStart where the start is not given and cannot be found."""
     if settings.start is not None or first_pose(log) is not None or (name == "scan-match" and "scan" in kinds):
         return
-    places = places_from_ranges(log, beacons) if vehicle_of(kinds) is CONSTANT_VELOCITY else []
-    if not places:
+    is_tag = vehicle_of(kinds) is CONSTANT_VELOCITY
+    places = places_from_ranges(log, beacons) if is_tag else []
+    if not places and (not is_tag or name != "ekf" or area_of(log, beacons) is None):
         raise MissingStart
     if len(places) > 1:
         raise AmbiguousStart(places[0][:2], places[1][:2])

@@ -15,6 +15,10 @@ from linkpose.localization.tables import Beacons
 # among or near its beacons has 0.1 to 3; a log in centimetres has 10 to 300, one in millimetres 100 to 3000.
 MILLIMETRES, CENTIMETRES = 100.0, 20.0
 MILLISECONDS_S = 10.0  # the median step of a log whose times are whole numbers
+# The fastest twentieth of the changes between fixes 10 s apart: 0.1 m/s for a robot of 0.2 m/s. Milliseconds taken
+# for seconds: noise of 0.1 m at 100 Hz is 0.03 m/s, a walk 0.001 m/s. Ranges that change by less than STANDING_M (m)
+# are those of a sensor at rest, whose place is right in either unit; no one fixes it once in RARE_FIX_S (s).
+SLOWEST_M_S, STANDING_M, RARE_FIX_S = 0.05, 1.0, 60.0
 FASTEST_TURN_RAD_S = 10.0  # 95 % of a robot's turn rates are below
 
 
@@ -46,11 +50,28 @@ def _check_times(log: Log, origin: str) -> None:
     if len(times) < 20 or not (times == np.floor(times)).all():
         return
     step = float(np.median(np.diff(times)))
-    if step >= MILLISECONDS_S:
+    if step >= MILLISECONDS_S and not _moves_between(log, step):
         raise LinkposeError(
             f"{origin}: the times look like milliseconds (whole numbers, {step:g} apart); "
             "divide them by 1000 to give seconds"
         )
+
+
+def _moves_between(log: Log, step: float) -> bool:
+    """Whether the ranges, or the places, of a log change as between fixes `step` seconds apart: at a speed that needs
+    no thousandfold, or not at all.
+    """
+    series: dict[str, list[tuple[float, float]]] = {}
+    for event in log:
+        if isinstance(event, Event) and event.kind in (*NAMED, "pose"):
+            series.setdefault(event.beacon, []).append((event.time_s, event.values[0]))
+    rows = [np.array(each) for each in series.values() if len(each) > 2]
+    if not rows:
+        return False
+    steps = np.concatenate([np.diff(each, axis=0) for each in rows])
+    speeds = np.abs(steps[:, 1]) / np.maximum(steps[:, 0], 1e-9)
+    spread = max(float(np.ptp(np.percentile(each[:, 1], (5, 95)))) for each in rows)
+    return float(np.percentile(speeds, 95)) > SLOWEST_M_S or (spread < STANDING_M and step < RARE_FIX_S)
 
 
 def _check_angles(events: Iterable[Event], origin: str) -> None:

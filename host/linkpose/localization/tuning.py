@@ -19,14 +19,24 @@ import numpy as np
 
 from linkpose.localization.events import NAMED, Event, Log
 from linkpose.localization.gate import chi_square_quantile
-from linkpose.localization.kalman import SUBMERSIBLE
+from linkpose.localization.kalman import CONSTANT_VELOCITY, SUBMERSIBLE
 from linkpose.localization.likelihood import Rows, run_filter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.localizer import Localizer
+from linkpose.localization.models import motion_jacobians
 from linkpose.localization.settings import Pose, Settings
 from linkpose.localization.steps import Gaussian
+from linkpose.localization.sum_filter import outlier_density
 from linkpose.localization.tables import Beacons
-from linkpose.localization.vehicle import CONTROLS, control_holds, drifts_of, kinds_of, noise_root, vehicle_of
+from linkpose.localization.vehicle import (
+    CONTROLS,
+    control_holds,
+    drifts_of,
+    first_control,
+    kinds_of,
+    noise_root,
+    vehicle_of,
+)
 
 # Fewer measurements do not determine four noises, or drifts beside them; more than MOST add time, not accuracy. Of a
 # longer log of ranges, the first DENSE show how errors change from one to the next, and the rest, evenly spread, how
@@ -78,6 +88,10 @@ LEAST_SPEED_M_S, LEAST_TURN_RAD_S = 0.01, 0.01
 # one that persists for less than SEEN_DRIFT of the log changes often enough to be seen. In the public log GOATS 14 it
 # persists for 0.4 of it, in simulated dives for 0.01.
 LEAST_ACOUSTIC, SEEN_DRIFT = 0.01, 0.1
+# Ranges within FIX_S (s) to so many beacons are a fix. Where a step between two has FREE_STEPS times the noise of a
+# range or more, the motion adds a tenth of the information or less, and its σ is multiplied by FREE_STEPS: the scale
+# error that it implies falls to a ninth, from 0.15 in a simulated circle.
+FIX_S, FEWEST_OF_FIX, FREE_STEPS = 0.5, 3, 3.0
 NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 
 
@@ -149,7 +163,8 @@ def _tune_ranges(log: Log, settings: Settings, beacons: Beacons, free: tuple[str
         if tuned.drift_std_m and hides and is_diving:
             usual = float(np.median([e.values[0] for e in log if isinstance(e, Event) and e.kind == "range"]))
             tuned = replace(tuned, drift_std_m=max(tuned.drift_std_m, LEAST_ACOUSTIC * usual))
-    return _with_slip(_as_large_as_innovations(log, tuned, beacons, names)[0], free)
+    tuned = _with_slip(_as_large_as_innovations(log, tuned, beacons, names)[0], free)
+    return _with_free_steps(log, tuned) if "acceleration" in names else tuned
 
 
 def _noises_of_ranges(log: Log, free: tuple[str, ...]) -> list[str]:
@@ -169,6 +184,34 @@ def _with_slip(settings: Settings, free: tuple[str, ...]) -> Settings:
     speed = max(settings.speed_std_m_s, LEAST_SPEED_M_S if "speed" in free else 0.0)
     turn = max(settings.turn_std_rad_s, LEAST_TURN_RAD_S if "turn" in free else 0.0)
     return replace(settings, speed_std_m_s=speed, turn_std_rad_s=turn)
+
+
+def _with_free_steps(log: Log, settings: Settings) -> Settings:
+    """The settings with a wider motion where each fix of a tag without odometry determines its place by itself.
+
+    The steps between slow fixes are known from the fixes alone. A motion as narrow as they are likes them shorter, and
+    shortens them by way of the ranges' scale error.
+    """
+    times: list[float] = []
+    beacons: set[str] = set()
+    fixes: list[tuple[float, int]] = []
+    for event in (event for event in log if isinstance(event, Event) and event.kind == "range"):
+        if times and event.time_s > times[0] + FIX_S:
+            fixes.append((times[0], len(times) if len(beacons) >= FEWEST_OF_FIX else 0))
+            times, beacons = [], set()
+        times.append(event.time_s)
+        beacons.add(event.beacon)
+    if len(fixes) < 2 or sum(size for _, size in fixes) < 0.5 * sum(event.kind == "range" for event in log):
+        return settings
+    interval = float(np.median(np.diff([time for time, size in fixes if size])))
+    by_state, by_noise = np.zeros((4, 4)), np.zeros((4, CONSTANT_VELOCITY.noises))
+    motion_jacobians(
+        CONSTANT_VELOCITY.model, np.zeros(4), first_control(settings, CONSTANT_VELOCITY), interval, by_state, by_noise
+    )
+    step = settings.acceleration_std_m_s2 * float(np.linalg.norm(by_noise[0])) / math.sqrt(interval)
+    usual = float(np.median([event.values[0] for event in log if isinstance(event, Event) and event.kind == "range"]))
+    noise = math.sqrt(settings.ranges.variances(np.array([usual]), usual)[0])
+    return _with(settings, "acceleration", FREE_STEPS if step > FREE_STEPS * noise else 1.0)
 
 
 def _may_drift(log: Log) -> bool:
@@ -424,6 +467,8 @@ def _run(rows: Rows, events: list[Event], settings: Settings, start: Localizer) 
     if drifts is not None:
         at = np.flatnonzero(drifts[:, 1])
         covariance[at, at] = drifts[at, 1]
+    if start.vehicle is CONSTANT_VELOCITY:
+        rows = rows._replace(controls=np.tile(first_control(settings, start.vehicle), (len(events), 1)))
     cost = run_filter(
         Gaussian(start.filter.state.copy(), covariance),
         start.filter.motion.model,
@@ -432,6 +477,7 @@ def _run(rows: Rows, events: list[Event], settings: Settings, start: Localizer) 
         _variances(rows, events, settings),
         np.zeros((len(start.filter.state), 2)) if drifts is None else drifts,
         np.array([chi_square_quantile(GATE, size) for size in (1, 2, 3)]),
+        outlier_density(start.sensors.beacons),
         start.filter.grid,
         innovations,
     )

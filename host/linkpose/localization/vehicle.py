@@ -29,6 +29,7 @@ FIT_STEPS = 20
 # Beacons near one line give two places if the mirror image is further away than MIRRORED_M (m) and the residual of each
 # range grows by less than MIRROR_MISFIT_M (m), the usual error of a radio range. Doubled, more starts are compared.
 MIRRORED_M, MIRROR_MISFIT_M = 1.0, 0.5
+NEAR_LINE = 0.1  # spread of beacons across their line, in that along it, below which a single range decides no side
 # Standard deviations of speed and turn rate of a robot whose log has no odometry (m/s, rad/s): a walk. With twice them,
 # a scan may be fitted to the next door.
 WALK_M_S, WALK_RAD_S = 1.0, 0.8
@@ -91,12 +92,11 @@ def places_from_ranges(log: Log, beacons: Beacons) -> list[Pose]:
     The ranges of FIRST_S are fitted by Gauss-Newton from each beacon and from their centre; the best fit is the first
     place. Beacons near one line have a second one, its mirror image, where that explains the ranges nearly as well.
     """
-    first = [e for e in log if isinstance(e, Event) and e.kind == "range" and e.time_s <= log[0].time_s + FIRST_S]
-    latest = {event.beacon: event.values[0] for event in reversed(first)}
-    if len(latest) < 3:
+    first = _first_ranges(log)
+    if len(first) < 3:
         return []
-    at = np.array([beacons[name] for name in latest])
-    ranges = np.array(list(latest.values()))
+    at = np.array([beacons[name] for name in first])
+    ranges = np.array([event.values[0] for event in first.values()])
     cost, place = min((_fitted(at, ranges, start) for start in (at.mean(axis=0), *at)), key=lambda fit: fit[0])
     if not np.isfinite(place).all():
         return []
@@ -107,6 +107,39 @@ def places_from_ranges(log: Log, beacons: Beacons) -> list[Pose]:
     is_apart = math.dist(place, other) > MIRRORED_M
     explains = other_cost < cost + len(at) * MIRROR_MISFIT_M**2
     return [(float(x), float(y), 0.0) for x, y in ([place, other] if is_apart and explains else [place])]
+
+
+def _first_ranges(log: Log) -> dict[str, Event]:
+    """The first range of FIRST_S to each beacon."""
+    first = [e for e in log if isinstance(e, Event) and e.kind == "range" and e.time_s <= log[0].time_s + FIRST_S]
+    return {event.beacon: event for event in reversed(first)}
+
+
+def first_place(log: Log, beacons: Beacons) -> tuple[Pose | None, float]:
+    """Where a tag without odometry is at the log's start, and how much (m, 1σ) it may have moved among the ranges that
+    say so, or how far the area reaches whose beacons it ranges to. None where neither is known.
+    """
+    if places := places_from_ranges(log, beacons):
+        times = [event.time_s for event in _first_ranges(log).values()]
+        return places[0], WALK_M_S * (max(times) - min(times))
+    return area_of(log, beacons) or (None, 0.0)
+
+
+def area_of(log: Log, beacons: Beacons) -> tuple[Pose, float] | None:
+    """Where a tag may be that no single fix places: the centre of the beacons that it ranges to, and a standard
+    deviation (m) on each axis, as far as they are apart.
+
+    None where they are fewer than three, or near one line: its ranges fit both sides then.
+    """
+    seen = {event.beacon for event in log if isinstance(event, Event) and event.kind == "range"}
+    at = np.array([beacons[name][:2] for name in sorted(seen)])
+    if len(at) < 3:
+        return None
+    centre = at.mean(axis=0)
+    spread = np.linalg.svd(at - centre)[1]
+    if spread[1] < NEAR_LINE * spread[0]:
+        return None
+    return (float(centre[0]), float(centre[1]), 0.0), float(np.linalg.norm(np.ptp(at, axis=0)))
 
 
 def _fitted(beacons: Floats, ranges: Floats, start: Floats) -> tuple[float, Floats]:
@@ -154,13 +187,21 @@ def drifts_of(settings: Settings, motion: MotionModel) -> Floats | None:
     return np.outer(is_drift, (1.0 / settings.drift_time_s, settings.drift_std_m**2))
 
 
+def first_control(settings: Settings, vehicle: MotionModel) -> Floats:
+    """The control (c,) before the log states one: no motion; for a tag without odometry, its velocity's time (s)."""
+    control = np.zeros(vehicle.controls)
+    if vehicle is CONSTANT_VELOCITY:
+        control[0] = settings.velocity_time_s
+    return control
+
+
 def noise_root(settings: Settings, vehicle: MotionModel) -> Floats:
     """The lower Cholesky factor of Q, (16): off-diagonal between the errors of speed and turn rate, or of a velocity's
     axes.
     """
     speed, turn, velocity = settings.speed_std_m_s, settings.turn_std_rad_s, settings.velocity_std_m_s
     if vehicle is CONSTANT_VELOCITY:
-        return settings.acceleration_std_m_s2 * np.eye(2)
+        return settings.acceleration_std_m_s2 * np.eye(vehicle.noises)
     std = {UNICYCLE: (speed, turn), HOLONOMIC: (speed, speed, turn), SUBMERSIBLE: (velocity, velocity, velocity)}[
         vehicle
     ]
