@@ -171,6 +171,18 @@ def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     assert np.mean(np.abs(error) < 2 * estimates["chain_angle_std_deg"][late]) > 0.9
 
 
+def test_a_hypothesis_that_knows_nothing_yet_does_not_end_those_that_do() -> None:
+    run = ChainRun("hinge", 2, 15.0)  # the leg of the notebook
+    measured = run.measurements()
+    angle = run.truth_columns(measured.time_s)["angle_deg"]
+    estimates = lp.estimate(measured, filters=["chain"], joint="hinge")
+    early = (measured.time_s > 6) & (measured.time_s < 9)
+    error = min(
+        (sign * estimates["chain_angle_deg"] - angle + angle[0] for sign in (1, -1)), key=lambda e: np.std(e[early])
+    )
+    assert np.sqrt(np.mean(error[early] ** 2)) < 6
+
+
 def test_blocks_do_not_change_the_estimates() -> None:
     measured = _chain("hinge")[0][:600]
     whole, parts = ChainFilter(Rig(chain=Chain("hinge"))), ChainFilter(Rig(chain=Chain("hinge")))

@@ -267,7 +267,8 @@ def _select(bank: Record, states: Record, q: Record) -> None:
         a, b = s.relative, best.relative
         cosine = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
         s.apart = 2 * math.acos(min(cosine, 1.0))
-        if s.odds < -q.most_odds or s.apart < max(s.rotation_std, best.rotation_std):
+        same = min(max(s.rotation_std, best.rotation_std), q.same_rad)
+        if s.odds < -q.most_odds or s.apart < same:
             s.alive = 0
 
 

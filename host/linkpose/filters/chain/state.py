@@ -147,6 +147,9 @@ class ChainParameters(NamedTuple):
     # [O]: at 0.03, the slow robot arm loses half of its accuracy.
     relinearized_rad: float = 0.1
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
+    # Two hypotheses whose rotations differ by less than their σ, and by less than this, are the same: half the spacing
+    # of the first headings (π / 8). Without this bound, one that is still unknown ends all others.
+    same_rad: float = 0.4
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
     unknown_m: float = 0.1  # ditto, of a height: an unknown r_k alone makes it 0.3 m
