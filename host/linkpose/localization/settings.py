@@ -28,8 +28,8 @@ class Settings:
 
     `speed_std_m_s` and `turn_std_rad_s` are the errors of one odometry sample, `velocity_std_m_s` those of one velocity
     sample on each axis; each holds until the next sample. `acceleration_std_m_s2` drives the constant-velocity model of
-    a log without odometry, on each axis; its velocity returns to 0 with the time constant `velocity_time_s`, which a walk
-    among places in a room has. `start` is the pose at the log's start, with `start_std` (m, rad); without it
+    a log without odometry, on each axis; its velocity returns to 0 with the time constant `velocity_time_s`, that of a
+    walk among places in a room. `start` is the pose at the log's start, with `start_std` (m, rad); without it
     the filter searches for the pose. `estimate` names constants of the range sensor, for all beacons together or, with
     `:each`, for each beacon. `error_time_s` is how long the error of a sighting persists; None: as ERROR_TIME_S.
 
