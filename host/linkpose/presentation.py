@@ -89,9 +89,14 @@ def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
     """One line for each sensor that does not work, with what to check, and for each mouse that is left out."""
     faulty = faulty_sensors(health)
     lines = [_fault_line(name, health) for name in faulty]
-    if health.silent_s > STALE_S:
+    if is_stale(health):
         lines.insert(0, f"NO SAMPLES ({health.silent_s:.1f} s): check the cable of the board")
     return lines + exclusions.lines(faulty)
+
+
+def is_stale(health: Health) -> bool:
+    """Whether no sample has arrived for so long that estimates and states of sensors are out of date."""
+    return health.silent_s > STALE_S
 
 
 def faulty_sensors(health: Health) -> list[str]:
@@ -118,8 +123,7 @@ def state_text(sensor: Mapping[str, Any]) -> str:
 def lost_filters(names: Iterable[str], health: Health, needed: Callable[[str], Iterable[str]]) -> list[str]:
     """The filters that have lost what they need: samples, or one of the sensors `needed(filter)`."""
     faulty = set(faulty_sensors(health))
-    is_stale = health.silent_s > STALE_S
-    return [name for name in names if is_stale or faulty.intersection(needed(name))]
+    return [name for name in names if is_stale(health) or faulty.intersection(needed(name))]
 
 
 def current(row: Row, health: Health, needed: Callable[[str], Iterable[str]]) -> Row:
@@ -129,8 +133,8 @@ def current(row: Row, health: Health, needed: Callable[[str], Iterable[str]]) ->
 
 
 def working_sensors(health: Health) -> list[str]:
-    """The names of the sensors that work."""
-    return [name.upper() for name, of in health.sensors.items() if of.get("state") == "ok"]
+    """The names of the sensors that work; none is known to without samples."""
+    return [name.upper() for name, of in health.sensors.items() if of.get("state") == "ok" and not is_stale(health)]
 
 
 def signed_angle(value_deg: float, decimals: int = 1) -> str:

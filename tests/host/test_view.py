@@ -129,6 +129,7 @@ def test_a_faulty_sensor_blanks_the_estimates_that_need_it_and_says_since_when()
     pulled.silent_s = 3.14
     lines = screen.render(pulled, 80, 24).plain.splitlines()
     assert lines[1] == "NO SAMPLES (3.1 s): check the cable of the board" and lines[2].endswith("not known")
+    assert lines[0].endswith("IMU – BARO –")
     assert [line.split()[-2:] for line in lines[-2:]] == [["–", "–"]] * 2
     pulled.silent_s = 0.9
     assert screen.render(pulled, 80, 24).plain == screen.render(health(), 80, 24).plain

@@ -26,6 +26,7 @@ from linkpose.presentation import (
     best_filter,
     current,
     fault_lines,
+    is_stale,
     joint_angle,
     joint_texts,
     length_with_std,
@@ -193,10 +194,12 @@ class Screen:
     def _head(self, health: Health, width: int) -> list[str]:
         """Title, time, rate, losses and the state of the sensors.
 
-        Narrow screens drop the title, then rate and time; the state of a sensor is never cut.
+        Narrow screens drop the title, then rate and time; the state of a sensor, unknown without samples, is never cut.
         """
         states = [
-            f"{name.upper()} {state_text(of)}" for name, of in health.sensors.items() if of.get("state") != "absent"
+            f"{name.upper()} {'–' if is_stale(health) else state_text(of)}"
+            for name, of in health.sensors.items()
+            if of.get("state") != "absent"
         ]
         sensors = " ".join(states)
         lost = f"{health.lost} lost"
