@@ -217,7 +217,7 @@ MORE: dict[str, dict[str, Producer]] = {
         "…: the ranges look like … (median … among beacons … m apart); divide them by … to give metres": units(
             "".join(f"{t},range,1,3000,\n" for t in range(5))
         ),
-        "…: the times look like milliseconds (whole numbers, … apart); divide them by 1000 to give seconds": units(
+        "…: the times look like milliseconds (… apart); divide them by 1000 to give seconds": units(
             "".join(f"{100 * t},odometry,1,0,\n" for t in range(30))
         ),
         "… line …: the … … looks like degrees; multiply angles by 0.0174533 to give radians": units("0,pose,0,0,90\n"),

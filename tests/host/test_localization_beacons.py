@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -71,6 +72,42 @@ def drive(
                     log.append(Event(time, "range", (distance,), name))
     table = np.array(rows)
     return log, Truth(table[:, 0], table[:, 1:3], np.unwrap(table[:, 3]))
+
+
+def changed(log: Log, kind: str, change: Callable[[Event], Event]) -> Log:
+    return [change(event) if isinstance(event, Event) and event.kind == kind else event for event in log]
+
+
+def scaled(*factors: float) -> Callable[[Event], Event]:
+    return lambda event: replace(event, values=tuple(np.multiply(event.values, factors).tolist()))
+
+
+def exchanged(event: Event) -> Event:
+    return replace(event, beacon={"1": "2", "2": "1"}.get(event.beacon, event.beacon))
+
+
+ODOMETRY = "of the odometry is"
+DOUBTED = {
+    "nothing": ("odometry", scaled(1.0, 1.0), ""),
+    "turned the other way": ("odometry", scaled(1.0, -1.0), ODOMETRY),
+    "backwards": ("odometry", scaled(-1.0, 1.0), ODOMETRY),
+    "radians of radians": ("odometry", scaled(1.0, math.pi / 180), ODOMETRY),
+    "no turn rate": ("odometry", scaled(1.0, 0.0), ODOMETRY),
+    "exchanged columns": ("odometry", lambda event: replace(event, values=event.values[::-1]), ODOMETRY),
+    "feet": ("range", scaled(1 / 0.3048), "times too long"),
+    "exchanged beacons": ("range", exchanged, "check"),
+}
+
+
+@pytest.mark.parametrize("fault", DOUBTED)
+@pytest.mark.parametrize("seed", [3, 4])
+def test_noises_and_constants_that_no_sensor_has_are_doubted(seed: int, fault: str) -> None:
+    """Estimated from the log, they explained wrong signs, units and columns, and the path was wrong in silence."""
+    kind, change, sentence = DOUBTED[fault]
+    log, _ = drive(seed)
+    remarks = localize(changed(log, kind, change), beacons=BEACONS).remarks
+    doubted = [remark for remark in remarks if "check" in remark.lower()]
+    assert any(sentence in remark for remark in doubted) if sentence else not doubted
 
 
 def settings(**others: object) -> Settings:

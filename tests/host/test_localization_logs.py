@@ -288,6 +288,7 @@ def test_beacon_names_are_strings(tmp_path):
         ([Event(0.1 * i, "range", (4000.0 + i,), "1") for i in range(9)], "millimetres"),
         ([Event(0.1 * i, "range", (400.0 + i,), "1") for i in range(9)], "centimetres"),
         ([Event(100.0 * i, "range", (4.0,), "1") for i in range(30)], "milliseconds"),
+        ([Event(99.5 * i, "odometry", (0.5, 0.1)) for i in range(30)], "milliseconds"),
         ([Event(0.0, "bearing_range", (4.0, 45.0), "1")], "degrees"),
         ([Event(0.1 * i, "odometry", (1.0, 40.0)) for i in range(30)], "degrees per second"),
         ([Event(0.0, "attitude", (0.0, 12.0, 0.0))], "degrees"),

@@ -443,6 +443,9 @@ REMARKS: dict[str, str | Producer] = {
     "… moved into the order of time": "test_localization_logs.py::test_rows_are_sorted_and_negative_ranges_left_out",
     "… older than the one before left out": "test_localization_cli.py::test_rows_from_standard_input_become_poses_at_once",
     "noises estimated from the log: …": "test_localization_beacons.py::test_the_command_reports_the_noises_it_found_and_draws_the_path",
+    "the … of the odometry is … …/s (rms) and errs by … … in a second: the measurements contradict it. Check its unit, its sign, its column and its times, unless the robot was carried": "test_localization_beacons.py::test_noises_and_constants_that_no_sensor_has_are_doubted",
+    "the ranges come out … times too long: check their unit, the unit of the beacons' places and that of the odometry": "test_localization_beacons.py::test_noises_and_constants_that_no_sensor_has_are_doubted",
+    "the ranges have errors of … m that persist, where the median range is … m: check the ids and the places of the beacons, and the units": "test_localization_beacons.py::test_noises_and_constants_that_no_sensor_has_are_doubted",
     "scale error and bias of the ranges are estimated, too": localized("0,pose,0,0,0\n" + driven(40)),
     "the odometry of the log is always at rest: the motion is taken from the scans; give --start": "test_localization_scans.py::test_scans_without_odometry_are_followed_from_a_given_start",
     "no two ranges of this log are of one instant, so their correlation changes nothing": localized(

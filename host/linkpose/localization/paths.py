@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from linkpose.errors import InvalidValue
+from linkpose.localization.doubts import doubts
 from linkpose.localization.events import Event, Log, LogFile, beacon_name, in_order
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import CONSTANT_VELOCITY
@@ -182,11 +183,12 @@ class PreparedLog:
 
     def run(self) -> Paths:
         """Runs the filters one after the other. Raises NothingApplied where one could not use any measurement."""
-        settings, remarks = self.settings, self.remarks
+        settings, remarks, is_tuned = self.settings, self.remarks, False
         if self.estimates_noises:
             first = next(iter(settings.values()))
             tuned = tune(self.log, first, self.beacons, self.free)
-            if tuned is not first:
+            is_tuned = tuned is not first
+            if is_tuned:
                 settings = {name: replace(tuned, start=own.start) for name, own in settings.items()}
                 remarks += (f"noises estimated from the log: {described(tuned, self.log)}",)
         tracks: dict[str, Track] = {}
@@ -197,6 +199,8 @@ class PreparedLog:
                 if remark := check_map(self.log, self.grid, share, str(self.origin)):
                     remarks += (remark,)
             track.check_applied(str(self.origin), method)
+            if is_tuned and not tracks:
+                remarks += tuple(doubts(self.log, chosen, track, self.free))
             tracks[method] = track
         return Paths(tracks, self.origin, remarks, next(iter(settings.values())))
 

@@ -14,7 +14,8 @@ from linkpose.localization.tables import Beacons
 # The median range in units of the beacons' largest distance from each other, beyond which it cannot be metres: a robot
 # among or near its beacons has 0.1 to 3; a log in centimetres has 10 to 300, one in millimetres 100 to 3000.
 MILLIMETRES, CENTIMETRES = 100.0, 20.0
-MILLISECONDS_S = 10.0  # the median step of a log whose times are whole numbers
+MILLISECONDS_S = 10.0  # the median step of a log whose times are whole numbers, or of odometry, which holds for a step
+SPEEDS = ("odometry", "twist")
 # The fastest twentieth of the changes between fixes 10 s apart: 0.1 m/s for a robot of 0.2 m/s. Milliseconds taken
 # for seconds: noise of 0.1 m at 100 Hz is 0.03 m/s, a walk 0.001 m/s. Ranges that change by less than STANDING_M (m)
 # are those of a sensor at rest, whose place is right in either unit; no one fixes it once in RARE_FIX_S (s).
@@ -47,13 +48,12 @@ def _check_ranges(events: list[Event], beacons: Beacons, origin: str) -> None:
 
 def _check_times(log: Log, origin: str) -> None:
     times = np.unique([event.time_s for event in log])
-    if len(times) < 20 or not (times == np.floor(times)).all():
-        return
-    step = float(np.median(np.diff(times)))
+    speeds = np.unique([event.time_s for event in log if isinstance(event, Event) and event.kind in SPEEDS])
+    judged = [speeds, *([times] if (times == np.floor(times)).all() else [])]
+    step = max(float(np.median(np.diff(each))) if len(each) >= 20 else 0.0 for each in judged)
     if step >= MILLISECONDS_S and not _moves_between(log, step):
         raise LinkposeError(
-            f"{origin}: the times look like milliseconds (whole numbers, {step:g} apart); "
-            "divide them by 1000 to give seconds"
+            f"{origin}: the times look like milliseconds ({step:g} apart); divide them by 1000 to give seconds"
         )
 
 
