@@ -142,7 +142,7 @@ def test_panels_of_a_figure_share_their_left_edge_and_no_text_lies_on_another(fl
         for figure in (floor[number], high[number]):
             figure.draw_without_rendering()
             assert len({round(axes.get_position().x0, 3) for axes in figure.axes}) == 1, number
-    for figure in (floor["3.4"], sea["3.8"]):
+    for figure in (floor["3.4"], sea["3.8"], sea["3.9"], sea["3.10"]):
         figure.draw_without_rendering()
         renderer = figure._get_renderer()
         texts = [axes.get_legend().get_window_extent(renderer) for axes in figure.axes if axes.get_legend()]
@@ -181,7 +181,7 @@ def test_figures_of_the_dive(sea) -> None:  # type: ignore[no-untyped-def]
         above, depth, position, heading = sea[number].axes
         assert lines(above)[name].get_color() == COLOURS[name]
         assert np.allclose(depth.lines[0].get_ydata(), 3.0)
-        assert list(lines(position)["range rejected"].get_xdata()) == [3.0]
+        assert list(lines(position)["rejected"].get_xdata()) == [3.0]
         assert heading.get_xlabel() == "time (s)"
         assert len(lines(above)["beacons"].get_xdata()) == len(BEACONS)
 

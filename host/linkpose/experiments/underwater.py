@@ -228,8 +228,8 @@ class Dive:
 # Figure 3.8: what the ranges carry beside Gaussian noise.
 SETS = (
     ("Gaussian noise alone", False, 0),
-    ("with common error", True, 0),
-    ("with common error, outliers", True, OUTLIERS),
+    ("common error", True, 0),
+    ("common error, outliers", True, OUTLIERS),
 )
 
 

@@ -275,7 +275,7 @@ def _dive_estimate(number: str, path: ComparedPath, beacons: Beacons, largest: t
     depth.tick_params(labelbottom=False)
     if len(path.rejected_s):
         marks = np.zeros(len(path.rejected_s))
-        position.plot(path.rejected_s, marks, "|", color=OTHERS[3], label="range rejected", clip_on=False)
+        position.plot(path.rejected_s, marks, "|", color=OTHERS[3], label="rejected", clip_on=False)
     _errors(position, heading, path, path.time_s, largest)
     heading.set_xlabel("time (s)")
     figure.align_ylabels([depth, position, heading])
