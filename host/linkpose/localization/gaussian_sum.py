@@ -84,8 +84,13 @@ def _across(mean: Floats, covariance: Floats, parameters: Floats) -> tuple[float
     distance = math.sqrt(dx * dx + dy * dy)
     if distance < 1e-9:
         return max(covariance[0, 0], covariance[1, 1]), distance
-    c, s = dx / distance, dy / distance
-    return s * s * covariance[0, 0] - 2.0 * s * c * covariance[0, 1] + c * c * covariance[1, 1], distance
+    return _variance_across(covariance, dx / distance, dy / distance), distance
+
+
+@inner
+def _variance_across(covariance: Floats, c: float, s: float) -> float:
+    """Variance (m²) of the position at right angles to the direction (c, s)."""
+    return float(s * s * covariance[0, 0] - 2.0 * s * c * covariance[0, 1] + c * c * covariance[1, 1])
 
 
 @compiled
@@ -292,7 +297,7 @@ def _rows(
     off_x, off_y = mean[0] - place[0], mean[1] - place[1]
     side[:] = 0.0
     side[0], side[1] = -s, c
-    across = s * s * covariance[0, 0] - 2.0 * s * c * covariance[0, 1] + c * c * covariance[1, 1]
+    across = _variance_across(covariance, c, s)
     bend = _departure(across, sigma, c * slopes[0] + s * slopes[1], radius)
     return row.value - value - bend - slopes[0] * off_x - slopes[1] * off_y, s * off_x - c * off_y, 2.0 * bend * bend
 
@@ -334,7 +339,7 @@ def _log_windows(mean: Floats, covariance: Floats, row: RangeRow, angles: Floats
         c, s = math.cos(angles[i]), math.sin(angles[i])
         off_x = mean[0] - row.parameters[0] - radius * c
         off_y = mean[1] - row.parameters[1] - radius * s
-        across = s * s * xx - 2.0 * s * c * xy + c * c * yy
+        across = _variance_across(covariance, c, s)
         bend = _departure(across, sigma, steep, radius)
         first, second = ahead - bend - steep * (c * off_x + s * off_y), s * off_x - c * off_y
         a = (

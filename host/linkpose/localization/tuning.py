@@ -195,21 +195,23 @@ def _with_free_steps(log: Log, settings: Settings) -> Settings:
     times: list[float] = []
     beacons: set[str] = set()
     fixes: list[tuple[float, int]] = []
-    for event in (event for event in log if isinstance(event, Event) and event.kind == "range"):
+    ranges = [event for event in log if isinstance(event, Event) and event.kind == "range"]
+    for event in ranges:
         if times and event.time_s > times[0] + FIX_S:
             fixes.append((times[0], len(times) if len(beacons) >= FEWEST_OF_FIX else 0))
             times, beacons = [], set()
         times.append(event.time_s)
         beacons.add(event.beacon)
-    if len(fixes) < 2 or sum(size for _, size in fixes) < 0.5 * sum(event.kind == "range" for event in log):
+    placed = [time for time, size in fixes if size]
+    if len(placed) < 2 or sum(size for _, size in fixes) < 0.5 * len(ranges):
         return settings
-    interval = float(np.median(np.diff([time for time, size in fixes if size])))
+    interval = float(np.median(np.diff(placed)))
     by_state, by_noise = np.zeros((4, 4)), np.zeros((4, CONSTANT_VELOCITY.noises))
     motion_jacobians(
         CONSTANT_VELOCITY.model, np.zeros(4), first_control(settings, CONSTANT_VELOCITY), interval, by_state, by_noise
     )
     step = settings.acceleration_std_m_s2 * float(np.linalg.norm(by_noise[0])) / math.sqrt(interval)
-    usual = float(np.median([event.values[0] for event in log if isinstance(event, Event) and event.kind == "range"]))
+    usual = float(np.median([event.values[0] for event in ranges]))
     noise = math.sqrt(settings.ranges.variances(np.array([usual]), usual)[0])
     return _with(settings, "acceleration", FREE_STEPS if step > FREE_STEPS * noise else 1.0)
 
