@@ -477,11 +477,12 @@ def _joint(j2s_m: Sequence[float] | Literal["auto"] | None, j2s_std_m: float | N
         raise InvalidValue("j2s_m", f"is {j2s_m!r}; it must be three finite numbers (m)")
     if np.linalg.norm(vector) > LONGEST_LINK_M:
         raise InvalidValue("j2s_m", f"is {j2s_m!r}, longer than {LONGEST_LINK_M:.0f} m; it must be in metres")
-    if j2s_std_m is None:
-        return Joint(to_vector(vector))
-    if not 0 < j2s_std_m < np.inf:
+    if j2s_std_m is not None and not 0 < j2s_std_m < np.inf:
         raise InvalidValue("j2s_std_m", f"is {j2s_std_m!r}; it must be above 0 (m)")
-    return Joint(to_vector(vector), j2s_std_m)
+    joint = Joint(to_vector(vector)) if j2s_std_m is None else Joint(to_vector(vector), j2s_std_m)
+    if joint.is_too_short:
+        raise InvalidValue("j2s_m", f'is {j2s_m!r}, the joint\'s centre; if J2S is unknown, give "auto"')
+    return joint
 
 
 def side_by_side(time_s: Floats, parts: Sequence[Floats]) -> Floats:

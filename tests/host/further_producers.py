@@ -416,6 +416,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "…: … is …; it must be four numbers: [w, x, y, z]": rig("chain", neutral=[1, 0, 0]),
         "…: … is …; a rotation must have length 1": rig("chain", neutral=[2, 0, 0, 0]),
         "…: … is …; no axis may be below 0": rig("noise", gyro_walk_rad_s_sqrts=[-1, 0, 0]),
+        "…: joint.j2s_m is zero, the joint's centre; delete it if it is unknown": rig("joint", j2s_m=[0, 0, 0]),
         "…: … is …; it must be between 0 and 0.1 s": rig("imu", delay_s=0.5),
     },
     "Evaluation of long files and takes": {
@@ -619,6 +620,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… is no array of numbers: …": "test_api.py::test_measurements_of_ones_own_sensor_are_checked",
         "source is of the type …; it must be a path, a Recording or Measurements: Measurements.from_imu(time_s, accel_m_s2, gyro_rad_s) makes them from arrays": "test_api.py::test_wrong_arguments_of_estimate_are_named",
         "j2s_m is …, longer than … m; it must be in metres": "test_api.py::test_wrong_arguments_of_estimate_are_named",
+        'j2s_m is …, the joint\'s centre; if J2S is unknown, give "auto"': "test_api.py::test_wrong_arguments_of_estimate_are_named",
         "… has the shape …; it must be (…, 3), one row per time": measured(np.arange(3), np.zeros((3, 2))),
     },
     "Wrong usage": {
@@ -656,6 +658,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… is not three numbers; type for example --j2s -0.09,-0.04,1.65 (metres)": typed("estimate a.csv --j2s 1,2"),
         "… takes its three numbers without spaces: type …=…": typed("localize a.csv --start 1 -2 0"),
         "… is longer than … m; J2S is in metres": typed("estimate a.csv --j2s 900,0,0"),
+        "--j2s places the sensor in the joint's centre; if J2S is unknown, type --j2s auto": typed(
+            "estimate a.csv --j2s 0,0,0"
+        ),
         "… is not a number of seconds above 0": typed("record --duration -1"),
         "… is not finite": typed("estimate a.csv --j2s 0,0,inf"),
         "… is beyond …": typed("localize a.csv --range-std 1e300"),

@@ -123,6 +123,7 @@ def test_remarks_of_a_file_reach_its_estimates(swing: Path, tmp_path: Path) -> N
         (np.ones((5, 7)), {}, "source is of the type ndarray"),
         (lp.Measurements.from_imu([], np.empty((0, 3)), np.empty((0, 3))), {}, "source holds no sample"),
         ("swing", {"j2s_m": (9, 4, 165)}, "longer than 10 m; it must be in metres"),
+        ("swing", {"j2s_m": (0, 0, 0)}, 'the joint\'s centre; if J2S is unknown, give "auto"'),
         ("swing", {"j2s_m": (0, 0, "a")}, "it must be three finite numbers"),
     ],
 )

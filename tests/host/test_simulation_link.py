@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from linkpose.errors import LinkposeError
 from linkpose.sensors.bmp180 import compensate
+from linkpose.sensors.health import HealthMonitor
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY, accel_scale, gyro_scale
 from linkpose.simulation import baro
 from linkpose.simulation.link import PAPER_J2S_M, TESTS, LinkRun, simulate
@@ -52,11 +54,29 @@ def test_truth_obeys_mechanics():
     assert np.allclose(now.height_m, now.tilt @ D)
 
 
-def test_counts_without_errors_are_the_truth_rounded():
+def test_counts_without_errors_and_noise_are_the_truth_rounded():
     run = LinkRun(1, 0, 20.0, errors="none")
+    run.imu_errors = replace(run.imu_errors, accel_noise_m_s2=0.0, gyro_noise_rad_s=0.0)
     block, truth = run.block(0, 2000), run.truth()
     assert np.abs(block.accel * accel_scale(8) - truth.specific_force_m_s2).max() <= accel_scale(8) / 2 + 1e-9
     assert np.abs(block.gyro * gyro_scale(1000) - truth.rate_rad_s).max() <= gyro_scale(1000) / 2 + 1e-9
+
+
+@pytest.mark.parametrize("accel_range_g", [2, 16])
+def test_sensors_without_errors_have_a_converters_noise_and_are_not_taken_for_frozen(accel_range_g):
+    run = LinkRun(1, 0, 60.0, errors="none", motion="rest", imu2=True, mag=True, accel_range_g=accel_range_g)
+    block = run.measurements()
+    monitor = HealthMonitor(run.rate_hz, {"imu": "ok", "imu2": "ok", "baro": "ok", "mag": "ok"})
+    _, changes = monitor.check(block)
+    assert not changes and all(not sensor.invalid for sensor in monitor.sensors.values())
+    truth = run.truth()
+    for readings, true, scale in (
+        (block.accel_m_s2, truth.specific_force_m_s2, accel_scale(accel_range_g)),
+        (block.gyro_rad_s, truth.rate_rad_s, gyro_scale(1000)),
+    ):
+        errors = (readings - true) / scale
+        assert errors.std(axis=0) == pytest.approx(np.full(3, 0.76), rel=0.05)  # 0.7, and the rounding's 1/√12
+        assert np.abs(errors.mean(axis=0)).max() < 0.05
 
 
 def test_calibrated_errors_have_the_stated_size():

@@ -170,12 +170,14 @@ def rig_to_write(what: str) -> Callable[[Function], Function]:
 
 
 def joint_from(joint: Joint | None, j2s_std_m: float | None) -> Joint | None:
-    """The joint that --j2s and --j2s-std describe. Raises UsageError for --j2s-std without a vector."""
-    if j2s_std_m is None:
-        return joint
-    if joint is None or joint is UNKNOWN_JOINT:
-        raise click.UsageError("--j2s-std is the uncertainty of --j2s X,Y,Z: add --j2s X,Y,Z")
-    return replace(joint, j2s_std_m=j2s_std_m)
+    """The joint that --j2s and --j2s-std describe. Raises UsageError for --j2s-std alone, and for no link."""
+    if j2s_std_m is not None:
+        if joint is None or joint is UNKNOWN_JOINT:
+            raise click.UsageError("--j2s-std is the uncertainty of --j2s X,Y,Z: add --j2s X,Y,Z")
+        joint = replace(joint, j2s_std_m=j2s_std_m)
+    if joint is not None and joint.is_too_short:
+        raise click.UsageError("--j2s places the sensor in the joint's centre; if J2S is unknown, type --j2s auto")
+    return joint
 
 
 def sensor_errors(function: Function) -> Function:
@@ -184,7 +186,7 @@ def sensor_errors(function: Function) -> Function:
         type=click.Choice(ERROR_LEVELS),
         default="calibrated",
         show_default=True,
-        help="What the sensors get wrong.",
+        help="What the sensors get wrong; none: the noise of a converter.",
     )(function)
 
 
@@ -207,7 +209,8 @@ def sensor_errors_or_rig(function: Function) -> Function:
         type=ErrorsType(),
         default="calibrated",
         show_default=True,
-        help="Errors of the simulated sensors: a level, or a rig file with the noise that `calibrate noise` measured.",
+        help="Errors of the simulated sensors: a level (none: the noise of a converter), or a rig file with the noise "
+        "that `calibrate noise` measured.",
     )(function)
 
 

@@ -38,6 +38,7 @@ _SHORTEST_AXIS = 1e-6  # whose direction a vector still gives
 # J2S do not run.
 _GUESS_M = 0.1
 LONGEST_LINK_M = 10.0  # of a J2S that a user gives: a longer one is in centimetres or millimetres
+SHORTEST_LINK_M = 0.001  # of a known J2S: nobody measures a shorter one; it was left at 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,11 @@ class Joint:
     def largest_std_m(self) -> float:
         """Standard deviation along the axis that is known least (m)."""
         return max(self.std_of_axes_m)
+
+    @property
+    def is_too_short(self) -> bool:
+        """Whether J2S is said to be known, and places the sensor in the joint's centre."""
+        return self.known_j2s_m is not None and math.hypot(*self.known_j2s_m) < SHORTEST_LINK_M
 
     @property
     def std_of_axes_m(self) -> Vector:
@@ -317,12 +323,15 @@ def _read_table(cls: type[Any], table: Any, origin: str, name: str) -> Any:
     if _are_parallel(values.get("long_axis"), values.get("flexion_axis")):
         raise FileFormatError(origin, f"{origin}: {name}.long_axis and {name}.flexion_axis are parallel")
     try:
-        return cls(**values)
+        made = cls(**values)
     except TypeError:
         missing = [k for k in ("x_m", "y_m") if k in known and k not in values]
         raise FileFormatError(
             origin, f"{origin}: [[{name}]] lacks {' and '.join(missing)}: where it sits in the robot's frame"
         ) from None
+    if isinstance(made, Joint) and made.is_too_short:
+        raise FileFormatError(origin, f"{origin}: joint.j2s_m is zero, the joint's centre; delete it if it is unknown")
+    return made
 
 
 def _are_parallel(one: Vector | None, other: Vector | None) -> bool:

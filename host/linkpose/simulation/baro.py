@@ -115,9 +115,14 @@ def raw_temperature(temp_degC: Floats, words: Bmp180Calibration = DATASHEET_WORD
 
 
 def raw_pressure(
-    pressure_Pa: Floats, temp_degC: Floats, oversampling: int, words: Bmp180Calibration = DATASHEET_WORDS
+    pressure_Pa: Floats,
+    temp_degC: Floats,
+    oversampling: int,
+    words: Bmp180Calibration = DATASHEET_WORDS,
+    *,
+    noise_counts: Floats | float = 0.0,
 ) -> NDArray[np.int64]:
-    """UP whose compensated pressure is `pressure_Pa` at `temp_degC`."""
+    """UP whose compensated pressure is `pressure_Pa` at `temp_degC`, with this noise added before it is rounded."""
     ac1, ac2, ac3, ac4, b1, b2 = words.ac1, words.ac2, words.ac3, words.ac4, words.b1, words.b2
     b6 = temp_degC * 160 - 8 - 4000
     b3 = ((ac1 * 4 + (b2 * (b6**2 / 2**12) + ac2 * b6) / 2**11) * 2**oversampling + 2) / 4
@@ -125,4 +130,4 @@ def raw_pressure(
     # p = q + ((q/2^8)² 3038/2^16 − 7357 q/2^16 + 3791) / 2^4, solved for q
     square, linear = 3038 / 2**36, 1 - 7357 / 2**20
     q = (-linear + np.sqrt(linear**2 - 4 * square * (3791 / 16 - pressure_Pa))) / (2 * square)
-    return np.asarray(np.rint(q * b4 / 2 / (50000 >> oversampling) + b3), dtype=np.int64)
+    return np.asarray(np.rint(q * b4 / 2 / (50000 >> oversampling) + b3 + noise_counts), dtype=np.int64)

@@ -28,6 +28,10 @@ _FLICKER_S = (1.0, 4.0, 16.0, 64.0, 256.0)  # time constants of its parts
 _FLICKER_STD = 0.664 / 0.97
 _REFERENCE_DEGC = 25.0  # at which the drift with temperature is zero
 LEVELS = ("calibrated", "datasheet", "none")
+# Noise of a converter (counts, 1σ) where nothing else errs, below any sensor's. Without it an axis at rest repeats, as
+# no real one does, and is taken for frozen; with half of it, 25 readings repeat by chance once in hours. Doubled, it
+# exceeds the gyro's noise at 1000 °/s.
+CONVERTER_NOISE = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +46,19 @@ class ImuErrors:
     accel_noise_m_s2: float | Floats
 
     @staticmethod
-    def draw(level: str, rng: np.random.Generator) -> ImuErrors:
-        """Errors of one specimen.
+    def draw(level: str, rng: np.random.Generator, accel_range_g: int = 8, gyro_range_deg_s: int = 1000) -> ImuErrors:
+        """Errors of one specimen, with these ranges.
 
         "calibrated": what a calibration leaves: gyro bias σ 0.05 °/s, accelerometer bias σ 0.03 m/s², scale σ 0.2 %.
         "datasheet": an uncalibrated part within the data sheet: ±20 °/s, ±50 mg, 3 % scale, 2 % cross-axis.
-        "none": the pure signals.
+        "none": the noise of the converter alone.
         """
         if level == "none":
-            return ImuErrors(np.eye(3), np.zeros(3), 0.0, np.eye(3), np.zeros(3), 0.0)
+            accel_noise, gyro_noise = accel_scale(accel_range_g), gyro_scale(gyro_range_deg_s)
+            return ImuErrors(
+                *(np.eye(3), np.zeros(3), CONVERTER_NOISE * gyro_noise),
+                *(np.eye(3), np.zeros(3), CONVERTER_NOISE * accel_noise),
+            )
         if level == "calibrated":
             gyro_matrix, gyro_bias = np.eye(3), np.radians(0.05) * rng.standard_normal(3)
             accel_matrix = np.diag(1 + 0.002 * rng.standard_normal(3))

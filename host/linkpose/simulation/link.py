@@ -171,7 +171,8 @@ class LinkRun:
             self._motion = swung
         rngs = [np.random.default_rng([seed, stream, test]) for stream in (_ERRORS, _IMU2_ERRORS)]
         if noise_of is None:
-            self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw(errors, rng) for rng in rngs)
+            ranges = accel_range_g, gyro_range_deg_s
+            self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw(errors, rng, *ranges) for rng in rngs)
         else:
             self.imu_errors, self.imu2_errors = (imu.ImuErrors.draw_from(noise_of, rng, rate_hz) for rng in rngs)
         noise = noise_of.noise if noise_of is not None else Noise()
@@ -264,7 +265,7 @@ class LinkRun:
     def mag_field(self, time_s: Floats, first: int) -> Floats:
         """Field that the magnetometer measures (N, 3), µT, in the link's axes; `first` as for `imu_counts`."""
         noise = imu.white((self.seed, _MAG_NOISE, self.test), first, len(time_s), 3)
-        noise = mag_model.NOISE_UT * (self.errors != "none") * noise
+        noise = mag_model.noise_uT(self.errors) * noise
         moving = self._motion.at(time_s)
         field = mag_model.field(moving) + self._hard_iron_uT + noise
         if self._mag_disturbance is not None:
@@ -304,10 +305,10 @@ class LinkRun:
         moving = self._motion.at(time_s)
         speed = np.linalg.norm(np.cross(moving.rate_rad_s, self._d), axis=1)
         pressure = self._weather.pressure(time_s, moving.tilt @ self._d, speed)
-        if self.errors != "none":
-            noise = imu.white((self.seed, _BARO_NOISE, self.test), first, len(time_s), 1)[:, 0]
-            pressure = pressure + baro.PRESSURE_NOISE_PA * noise
-        return baro.raw_pressure(pressure, _temperature(time_s), self.oversampling)
+        noise = imu.white((self.seed, _BARO_NOISE, self.test), first, len(time_s), 1)[:, 0]
+        noise_Pa, noise_counts = (0.0, imu.CONVERTER_NOISE) if self.errors == "none" else (baro.PRESSURE_NOISE_PA, 0.0)
+        pressure = pressure + noise_Pa * noise
+        return baro.raw_pressure(pressure, _temperature(time_s), self.oversampling, noise_counts=noise_counts * noise)
 
     def block(self, first: int, count: int) -> RawBlock:
         """The SAMPLEs of ticks first … first + count − 1."""

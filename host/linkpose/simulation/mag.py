@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from linkpose.sensors.magnetometer import scale
 from linkpose.sensors.rig import Mag
-from linkpose.simulation.imu import to_counts
+from linkpose.simulation.imu import CONVERTER_NOISE, to_counts
 from linkpose.simulation.motion import Kinematics
 from linkpose.wire.messages import DeviceFamily
 
@@ -20,6 +20,11 @@ NORTH_UT, UP_UT = 30.0, -42.0
 NOISE_UT = 0.2  # QMC5883L, 13-52-04, table 2: 2 mG RMS at 8 G
 # Hard iron of the board: ±20 µT uncalibrated (GY-87 boards with steel screws); 2.5 % of that after a calibration.
 _HARD_IRON_UT = {"none": 0.0, "calibrated": 0.5, "datasheet": 20.0}
+
+
+def noise_uT(level: str) -> float:
+    """Noise of a reading, µT."""
+    return CONVERTER_NOISE * scale(DeviceFamily.QMC5883L) if level == "none" else NOISE_UT
 
 
 def hard_iron(level: str, rng: np.random.Generator) -> Floats:

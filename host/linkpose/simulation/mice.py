@@ -147,7 +147,9 @@ class MiceRun:
         self._ticks_per_reading = math.ceil(round(_POLL_S * rate_hz, 9))
         self._drive = drive or _drive(path, seed, duration_s, length_m)
         self._track = DrivenPath(self._drive)
-        self._imu_errors = imu.ImuErrors.draw(errors, np.random.default_rng([seed, _ERRORS]))
+        self._imu_errors = imu.ImuErrors.draw(
+            errors, np.random.default_rng([seed, _ERRORS]), accel_range_g, gyro_range_deg_s
+        )
         self._place = np.array([(mouse.x_m, mouse.y_m) for mouse in mice])
         off = np.random.default_rng([seed, _MOUNTING]).standard_normal((MAX_MICE, 2))[: len(mice)]
         self.true_counts_per_m = np.array([m.counts_per_m for m in mice]) * (1 + self._mouse_errors.scale * off[:, 0])
