@@ -26,7 +26,7 @@ class Shown(NamedTuple):
     decimals: int = 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)  # each exists once: dictionaries find it by identity, without its fields
 class Quantity:
     """One quantity: its column, how it is shown, and how it is scored."""
 

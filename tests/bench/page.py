@@ -4,9 +4,10 @@
 
 CPU: of the sender (the server's thread and `Page.show`), as a share of one core; its budget is 1 %. The filters run
 between the samples, as they do live, so that no cache is as warm as in a loop that does nothing else.
-Latency: of every sample, from `Page.show` to the first frame of a headless Chromium that shows it or a newer one; its
-bound is 100 ms. The heights are numbered, so that each text belongs to one sample. A machine without a graphics card
-renders the scene with its CPU, which delays the browser.
+Latency: of every sample, from `Page.show` until a headless Chromium presents the first frame with it or a newer one;
+its bound is 100 ms. It is measured up to the end of the browser's work on that frame; the mean time from there to the
+screen, which the browser reports of some frames, is added. The heights are numbered, so that each text belongs to one
+sample. A machine without a graphics card renders the scene with its CPU, which delays the browser.
 """
 
 from __future__ import annotations
@@ -29,16 +30,34 @@ WARM_UP_S, MEASURED_S, INTERVAL_S = 5.0, 20.0, 0.01
 BUDGET = 0.01  # of a core
 BOUND_S = 0.1
 STEP_M, STD_M = 0.0001, 0.0004  # of the height from one sample to the next, and its σ: the text ends at the step
-# Each height that the headline shows, with the time after the first frame in which the document had it.
+# Each height that the headline shows, with the time at which the browser has finished the frame that shows it: a task
+# that is posted during a frame runs after it. When the compositor presents it is known of some frames only.
 WATCH = """
-  window.seen = [];
-  let last = "";
+  window.seen = []; window.presented = [];
+  const now = () => performance.timeOrigin + performance.now();
+  const afterFrame = new MessageChannel(), request = window.requestAnimationFrame.bind(window);
+  let last = "", isInFrame = false, changed = [];
+  afterFrame.port1.onmessage = () => {
+    isInFrame = false;
+    window.seen.push(...changed.map(height => [height, now()]));
+    changed = [];
+  };
+  window.requestAnimationFrame = draw => request(time => {
+    if (!isInFrame) { isInFrame = true; afterFrame.port2.postMessage(0); }
+    draw(time);
+  });
+  new PerformanceObserver(list => window.presented.push(...list.getEntries().map(
+    entry => [Number(entry.identifier), performance.timeOrigin + entry.presentationTime]
+  ))).observe({type: "element"});
   new MutationObserver(() => {
-    const found = document.body.innerText.match(/(\\d\\.\\d{4}) m ±/);
-    if (!found || found[1] === last) return;
-    last = found[1];
-    requestAnimationFrame(() => setTimeout(
-      () => window.seen.push([Number(found[1]), performance.timeOrigin + performance.now()])));
+    const shows = [...document.querySelectorAll("div:not(:has(div))")]
+      .find(e => /^\\d\\.\\d{4} m ±/.test(e.innerText));
+    const height = shows && shows.innerText.slice(0, 6);
+    if (!height || height === last) return;
+    last = height;
+    shows.setAttribute("elementtiming", height);
+    changed.push(Number(height));
+    if (!isInFrame) window.requestAnimationFrame(() => {});
   }).observe(document, {subtree: true, childList: true, characterData: true});
 """
 
@@ -80,7 +99,8 @@ def latencies(shown: Floats, first: int, seen: Floats) -> Floats:
     newest = np.maximum.accumulate(np.round((seen[:, 0] - 1.0) / STEP_M))
     frame = np.searchsorted(newest, first + np.arange(len(shown)))
     is_seen = frame < len(newest)  # the last samples may come after the last frame that was noted
-    return seen[frame[is_seen], 1] / 1e3 - shown[is_seen]
+    waits: Floats = seen[frame[is_seen], 1] / 1e3 - shown[is_seen]
+    return waits
 
 
 def measure() -> tuple[float, Floats]:
@@ -98,8 +118,10 @@ def measure() -> tuple[float, Floats]:
         took_s, after = time.perf_counter() - began, thread_seconds()
         main = str(min(map(int, after)))
         busy_s += sum(after[name] - before.get(name, 0.0) for name in after if name != main)
-        seen = json.loads(browser.evaluate("JSON.stringify(window.seen)"))
-    return busy_s / took_s, latencies(shown, warm_up, np.array(seen))
+        seen, presented = json.loads(browser.evaluate("JSON.stringify([window.seen, window.presented])"))
+    finished = dict(seen)
+    later_ms = [time_ms - finished[height] for height, time_ms in presented if height in finished]
+    return busy_s / took_s, latencies(shown, warm_up, np.array(seen)) + 1e-3 * float(np.mean(later_ms))
 
 
 def main() -> None:

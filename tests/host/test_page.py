@@ -13,6 +13,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,9 @@ import pytest
 import zstandard
 from browser import Browser
 from websockets.exceptions import InvalidStatus
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.streams import StreamReader
 from websockets.sync.client import connect
 from websockets.typing import Origin, Subprotocol
 
@@ -30,8 +34,8 @@ from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
 from linkpose.page import Page, PageStatus, geometry
-from linkpose.page.changes import Changes, uncompressed_frame
-from linkpose.page.history import PATH_POINTS, SPAN_S, History
+from linkpose.page.changes import Changes, uncompressed_frame, websocket_frame
+from linkpose.page.history import PATH_POINTS, POINT_INTERVAL_S, SPAN_S, History
 from linkpose.page.origin import is_own
 from linkpose.page.page import j2s_text
 from linkpose.page.panel import with_gap_rows
@@ -318,22 +322,31 @@ def test_without_a_browser_nothing_waits_and_old_blocks_are_dropped() -> None:
         assert page.url.startswith("http://127.0.0.1:")
 
 
-def test_a_browser_that_reads_nothing_gets_no_more_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    sent: list[list[Any]] = []
-    monkeypatch.setattr("websockets.asyncio.server.broadcast", lambda connections, _: sent.append(connections))
-    waiting = {1: 0, 2: 1_000_000}  # bytes that each browser has not read
+def connection(waiting: Callable[[], int], write: Callable[[bytes], None], state: State = State.OPEN) -> Any:
+    """A browser that has not read `waiting()` bytes yet."""
+    transport = SimpleNamespace(get_write_buffer_size=waiting, write=write)
+    return SimpleNamespace(transport=transport, protocol=SimpleNamespace(state=state))
 
-    def connection(client: int) -> Any:
-        return SimpleNamespace(transport=SimpleNamespace(get_write_buffer_size=lambda: waiting[client]))
 
-    connections = {client: connection(client) for client in waiting}
+def test_a_browser_that_reads_nothing_gets_no_more_until_it_does() -> None:
+    sent: list[int] = []
+    waiting = {1: 0, 2: 1_000_000, 3: 0}  # bytes that each browser has not read
+    connections = {
+        client: connection(
+            partial(waiting.__getitem__, client),
+            lambda _, client=client: sent.append(client),  # type: ignore[misc]
+            State.CLOSING if client == 3 else State.OPEN,
+        )
+        for client in waiting
+    }
     server: Any = SimpleNamespace(_websock_server=SimpleNamespace(_live_connections=connections))
-    changes, element = Changes(server), SimpleNamespace(_impl=SimpleNamespace(uuid="text"))
+    element: Any = SimpleNamespace(_impl=SimpleNamespace(uuid="text"))
+    changes = Changes(server)
     for left in (1_000_000, 0):
         waiting[2] = left
         changes.write(element, "1.5 m")
-        changes.broadcast({1, 2})
-    assert sent == [[connections[1]], list(connections.values())]
+        changes.broadcast({1, 2, 3})
+    assert sent == [1, 1, 2]
 
 
 @pytest.mark.parametrize("size", [1, 735, 1 << 17, (1 << 17) + 1, 300_000])
@@ -342,6 +355,18 @@ def test_messages_travel_as_zstd_frames_without_compression(size: int) -> None:
     frame = uncompressed_frame(data)
     assert zstandard.ZstdDecompressor().decompress(frame) == data
     assert zstandard.frame_content_size(frame) == size
+
+
+@pytest.mark.parametrize("size", [1, 125, 126, 65_535, 65_536, 300_000])
+def test_messages_travel_in_frames_of_a_server(size: int) -> None:
+    data = np.random.default_rng(1).bytes(size)
+    reader = StreamReader()
+    reader.feed_data(websocket_frame(data))
+    parsing = Frame.parse(reader.read_exact, mask=False)
+    with pytest.raises(StopIteration) as parsed:
+        next(parsing)
+    assert parsed.value.value == Frame(Opcode.BINARY, data)
+    assert len(reader.buffer) == 0
 
 
 def decoded(message: bytes) -> tuple[list[dict[str, Any]], Callable[[dict[str, Any]], list[float]]]:
@@ -367,25 +392,25 @@ def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
     """A sample waits for one update on its way to the screen; charts, which are large, may be later."""
     rows, sent = link_rows(), []
     with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
-        page._is_closed = True  # the updates are made here
-        page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, assignment, dict-item, return-value]
-        transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
-        page._changes._socket._live_connections = {7: SimpleNamespace(transport=transport)}  # type: ignore[dict-item]
-        page._changes._broadcast = lambda _, message: sent.append(decoded(message))  # type: ignore[assignment]
-        for row in rows[:14]:
+        page._is_closed = True  # the updates are made here, from a full one on
+        page._redraw()
+        page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, dict-item]
+        browser = connection(lambda: 0, lambda frame: sent.append(decoded(frame[4 if frame[1] == 126 else 10 :])))
+        page._changes._socket._live_connections = {7: browser}
+        for row in rows[:20]:
             page.show(row, status())
             page._update()
-    assert len(sent) == 14
+    assert len(sent) == 20
     for row, (messages, _) in zip(rows, sent, strict=False):
         assert any(f"{row[1]:.3f} m ±2.0 cm" in str(m.get("updates")) for m in messages)
         turn = next(m["wxyz"] for m in messages if m.get("name") == "/link" and "wxyz" in m)
         assert turn == pytest.approx(geometry.attitude(row[3], row[5], 0.0))
     charts = [(array, m["updates"]["data"]) for messages, array in sent for m in messages if "data" in str(m)]
-    assert len(charts) == 3 * 3  # with the first, the seventh and the thirteenth row
+    assert len(charts) == 3 * 3  # with the first, the tenth and the nineteenth row
     array, (time, low, high, height) = charts[6]
-    assert array(time) == pytest.approx(rows[:13, 0])
-    assert array(height) == pytest.approx(rows[:13, 1])
-    assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(13), rel=1e-4)
+    assert array(time) == pytest.approx(rows[:19, 0])
+    assert array(height) == pytest.approx(rows[:19, 1])
+    assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(19), rel=1e-4)
 
 
 def test_an_error_of_the_sender_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -464,8 +489,8 @@ def test_view_options_go_with_what_they_need(refused: Callable[..., str], tmp_pa
 
 def test_the_drawn_sensor_has_the_estimated_height() -> None:
     roll, pitch = 22.0, 13.0
-    w, *v = geometry.attitude(roll, pitch, 40.0)
-    d, v = np.array(J2S_M), np.array(v)
+    w, *part = geometry.attitude(roll, pitch, 40.0)
+    d, v = np.array(J2S_M), np.array(part)
     turned = d + 2 * w * np.cross(v, d) + 2 * np.cross(v, np.cross(v, d))
     r, p = np.radians(roll), np.radians(pitch)
     vertical = np.array([-np.sin(p), np.cos(p) * np.sin(r), np.cos(p) * np.cos(r)])  # host/docs/files.md
@@ -488,9 +513,38 @@ def test_history_keeps_the_newest_row_and_stays_small() -> None:
     assert path[0, 1] == 0 and len(path) <= PATH_POINTS + 2
 
 
+def test_rows_that_share_a_pixel_are_replaced_however_they_arrive() -> None:
+    """The newest row stands for those less than 0.05 s after the row before."""
+    time_s = np.cumsum(np.random.default_rng(2).choice([0.01, 0.01, 0.01, 0.07], 300))
+    rows = np.column_stack([time_s, np.arange(300.0)])
+    expected: list[np.ndarray] = []
+    for row in rows:
+        if len(expected) > 1 and row[0] - expected[-2][0] < POINT_INTERVAL_S:
+            expected[-1] = row
+        else:
+            expected.append(row)
+    for size in (1, 7, 300):
+        history = History(["time_s", "x_m"])
+        for at in range(0, 300, size):
+            history.add(rows[at : at + size])
+        assert history.window().tolist() == np.array(expected).tolist()
+
+
+def test_a_connection_that_a_browser_leaves_unused_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    with Page(LINK, Rig(), "sim://link") as page:
+        host, port = page.url.removeprefix("http://").split(":")
+        for sent in (b"", b"no request\r\n\r\n"):
+            with socket.create_connection((host, int(port)), timeout=30) as unused:
+                unused.sendall(sent)
+                unused.shutdown(socket.SHUT_WR)
+                while unused.recv(4096):  # until the server has given up
+                    pass
+    assert capfd.readouterr() == ("", "")
+
+
 def test_turns_follow_each_other_as_their_product() -> None:
-    first, second = geometry.attitude(10.0, 0.0, 30.0), geometry.attitude(-20.0, 40.0, 5.0)
+    first, second = (np.array(geometry.attitude(*angles)) for angles in ((10.0, 0.0, 30.0), (-20.0, 40.0, 5.0)))
     vector = np.array([0.3, -1.0, 2.0])
     one_by_one = geometry.turned(first, geometry.turned(second, vector))
     assert geometry.turned(product(first, second), vector) == pytest.approx(one_by_one)
-    assert geometry.turned(geometry.attitude(0.0, 0.0, 90.0), np.eye(3)[0]) == pytest.approx(np.eye(3)[1])
+    assert geometry.turned(np.array(geometry.attitude(0.0, 0.0, 90.0)), np.eye(3)[0]) == pytest.approx(np.eye(3)[1])

@@ -67,9 +67,10 @@ def _recorded(columns: Sequence[str], values: Floats, rig: Rig, surroundings: Su
         recorded = server.get_scene_serializer()
         for at, time_s in enumerate(np.linspace(start, end, frames)):
             replay.seek(float(time_s))
-            name = drawing.best(replay.newest)
+            newest = replay.newest.tolist()
+            name = drawing.best(newest)
             if name is not None:
-                row = drawing.draw(replay.newest, name)
+                row = drawing.draw(newest, name)
                 if at % _SLOW_INTERVAL == 0:
                     drawing.draw_slow(row, name, replay)
                 changes.queue()

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.sensors.measurements import Floats
-
 if TYPE_CHECKING:
     import viser
 
@@ -19,6 +17,8 @@ ChartData = dict[str, Any] | list[float | None]  # an array, as `Changes.array` 
 
 _ZSTD_START = b"\x28\xb5\x2f\xfd\xa0"  # magic number; then: one segment, its size in four bytes
 _ZSTD_BLOCK = 1 << 17  # bytes of a block, at most
+_SIZES = struct.Struct("<QQ")
+_BINARY = 0x82  # first byte of a WebSocket frame: the whole of a binary message
 
 
 class Changes:
@@ -32,20 +32,29 @@ class Changes:
     def __init__(self, server: viser.ViserServer) -> None:
         from msgspec.msgpack import Encoder
         from viser.infra._infra import _append_aligned_buffers
-        from websockets.asyncio.server import broadcast
+        from websockets.protocol import State
 
         self._socket = server._websock_server
-        self._encode, self._append_arrays, self._broadcast = Encoder().encode, _append_aligned_buffers, broadcast
+        self._encode, self._append_arrays, self._open = Encoder().encode, _append_aligned_buffers, State.OPEN
         self._messages: list[dict[str, Any]] = []  # in viser's format, without arrays
         self._arrays: list[memoryview] = []  # of the charts
+        self._is_visible: dict[str, bool] = {}  # nodes of the scene
 
-    def turn(self, node: viser.SceneNodeHandle, wxyz: Floats) -> None:
+    def show(self, node: viser.SceneNodeHandle, is_visible: bool) -> None:
+        """Shows or hides a node of the scene, which is visible or not only by this method.
+
+        It goes through viser's queue, which is slow, even to see that nothing has changed.
+        """
+        if self._is_visible.get(node.name) is not is_visible:
+            self._is_visible[node.name] = node.visible = is_visible
+
+    def turn(self, node: viser.SceneNodeHandle, wxyz: Sequence[float]) -> None:
         """Gives a node of the scene this quaternion (4,)."""
-        self._add("SetOrientationMessage", {"name": node.name, "wxyz": wxyz.tolist()})
+        self._add("SetOrientationMessage", {"name": node.name, "wxyz": wxyz})
 
-    def move(self, node: viser.SceneNodeHandle, place_m: Floats) -> None:
+    def move(self, node: viser.SceneNodeHandle, place_m: Sequence[float]) -> None:
         """Gives a node of the scene this position (3,), m."""
-        self._add("SetPositionMessage", {"name": node.name, "position": place_m.tolist()})
+        self._add("SetPositionMessage", {"name": node.name, "position": place_m})
 
     def scale(self, node: viser.SceneNodeHandle, factors: tuple[float, float, float]) -> None:
         """Scales a node of the scene along its axes."""
@@ -83,13 +92,17 @@ class Changes:
 
         A browser that has not read all of what was sent before gets none of them: it would show old values.
         """
-        connections = [
-            connection
+        transports = [
+            connection.transport
             for client, connection in self._socket._live_connections.items()
-            if client in clients and not connection.transport.get_write_buffer_size()
+            if client in clients
+            and connection.protocol.state is self._open
+            and not connection.transport.get_write_buffer_size()
         ]
-        if self._messages and connections:
-            self._broadcast(connections, self._encoded())
+        if self._messages and transports:
+            frame = websocket_frame(self._encoded())
+            for transport in transports:
+                transport.write(frame)
         self._messages, self._arrays = [], []
 
     def _encoded(self) -> bytes:
@@ -106,7 +119,7 @@ class Changes:
             }
         )
         frame = uncompressed_frame(text)
-        parts: list[bytes | memoryview] = [struct.pack("<QQ", len(text), len(frame)), frame]
+        parts: list[bytes | memoryview] = [_SIZES.pack(len(text), len(frame)), frame]
         if self._arrays:
             self._append_arrays(parts, self._arrays, 16 + len(frame))
         return b"".join(parts)
@@ -114,9 +127,21 @@ class Changes:
 
 def uncompressed_frame(data: bytes) -> bytes:
     """Data (at least one byte) in zstd's format (RFC 8878, section 3.1.1), as blocks that are not compressed."""
-    parts = [_ZSTD_START, struct.pack("<I", len(data))]
+    parts = [_ZSTD_START, len(data).to_bytes(4, "little")]
     for at in range(0, len(data), _ZSTD_BLOCK):
         block = data[at : at + _ZSTD_BLOCK]
         is_last = at + _ZSTD_BLOCK >= len(data)
         parts += [(len(block) << 3 | is_last).to_bytes(3, "little"), block]
     return b"".join(parts)
+
+
+def websocket_frame(message: bytes) -> bytes:
+    """A binary message of a server in WebSocket's format (RFC 6455, section 5.2)."""
+    size = len(message)
+    if size < 126:
+        head = bytes((_BINARY, size))
+    elif size < 1 << 16:
+        head = bytes((_BINARY, 126)) + size.to_bytes(2, "big")
+    else:
+        head = bytes((_BINARY, 127)) + size.to_bytes(8, "big")
+    return head + message

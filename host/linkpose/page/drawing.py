@@ -59,19 +59,19 @@ class Drawing:
         """The quantities that belong to what the scene shows."""
         return self._scene.charted
 
-    def best(self, newest: Floats) -> str | None:
+    def best(self, newest: Sequence[float]) -> str | None:
         """The best filter with a value in this row (columns,); without any value, the best filter at all."""
         for at, name in self._candidates:
             if math.isfinite(newest[at]):
                 return name
         return self._candidates[0][1] if self._candidates else None
 
-    def draw(self, newest: Floats, name: str) -> Row:
+    def draw(self, newest: Sequence[float], name: str) -> Row:
         """Draws the newest row (columns,) as the filter `name` estimates it.
 
         Returns the values of this filter at least, by filter and quantity.
         """
-        row = self._rows.read(newest.tolist(), None if self._scene.combines_filters else (name,))
+        row = self._rows.read(newest, None if self._scene.combines_filters else (name,))
         self._scene.draw(row, name, self._reference(newest))
         return row
 
@@ -90,8 +90,8 @@ class Drawing:
         places = np.vstack([np.empty((0, 2)), *(path[np.isfinite(path).all(axis=1)] for path in paths)])
         return np.array([places.min(axis=0), places.max(axis=0)]) if len(places) else places
 
-    def _reference(self, newest: Floats) -> dict[Quantity, float]:
-        return {quantity: float(newest[at]) for quantity, at in self._reference_at}
+    def _reference(self, newest: Sequence[float]) -> dict[Quantity, float]:
+        return {quantity: newest[at] for quantity, at in self._reference_at}
 
     def _path(self, name: str, history: History | Replay) -> Floats | None:
         """x, y, heading, σ of x and of y, their covariance, and the reference's x and y (N, 8) along the path.

@@ -14,8 +14,8 @@ _SEGMENTS = 48  # of a circle
 _WIDEST_RAD = math.radians(80.0)  # half the opening of a cone: wider ones cannot be drawn
 
 
-def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
-    """The quaternion (4,) that turns the sensor's axes into n (z upwards): Rz(yaw)·Ry(pitch)·Rx(roll).
+def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> list[float]:
+    """The quaternion (4 numbers) that turns the sensor's axes into n (z upwards): Rz(yaw)·Ry(pitch)·Rx(roll).
 
     NaN where roll or pitch is NaN; an unknown yaw is drawn as 0.
     """
@@ -24,12 +24,12 @@ def attitude(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Floats:
     cr, sr, cp, sp, cy, sy = (
         math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch), math.cos(yaw), math.sin(yaw)
     )  # fmt: skip
-    return np.array([
+    return [
         cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
-    ])  # fmt: skip
+    ]
 
 
 def turned(q: Floats, vector: Floats) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -27,11 +28,21 @@ class History:
 
     def add(self, rows: Floats) -> None:
         """Adds rows (N, columns). A row replaces the one before when they are close in time."""
-        for row, time_s in zip(rows, rows[:, 0].tolist(), strict=True):
-            if self._end - self._start > 1 and time_s - self._rows[self._end - 2, 0] < POINT_INTERVAL_S:
-                self._rows[self._end - 1] = row
+        kept: list[int] = []  # of these rows
+        last = self._rows[max(self._start, self._end - 2) : self._end, 0].tolist()  # times of the last two
+        before, newest = last if len(last) == 2 else (-math.inf, *(last or [-math.inf]))
+        for at, time_s in enumerate(rows[:, 0].tolist()):
+            if time_s - before < POINT_INTERVAL_S:
+                newest = time_s
+                if kept:
+                    kept[-1] = at
+                else:
+                    self._rows[self._end - 1] = rows[at]
             else:
-                self._append(row)
+                before, newest = newest, time_s
+                kept.append(at)
+        for at in kept:
+            self._append(rows[at])
 
     def _append(self, row: Floats) -> None:
         if self._end == len(self._rows):

@@ -9,11 +9,17 @@ from __future__ import annotations
 import contextlib
 import inspect
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
+
+# Browsers open connections in advance and close them unused, which websockets logs as an error with a traceback. It is
+# printed only where the program that uses linkpose has asked for logs.
+_LOG = logging.getLogger("linkpose.page")
+_LOG.addHandler(logging.NullHandler())
 
 
 def is_own(headers: Mapping[str, str], host: str) -> bool:
@@ -68,7 +74,7 @@ def own_requests_only(host: str) -> Iterator[None]:
             answer = process_request(connection, request) if process_request is not None else None
             return _with_title(await answer if inspect.isawaitable(answer) else answer)
 
-        return serve(*args, process_request=process, **options)
+        return serve(*args, process_request=process, logger=_LOG, **options)
 
     setattr(websockets, "serve", checked_serve)  # noqa: B010  # viser has no parameter for it
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import socket
 import threading
 from collections import deque
@@ -28,15 +29,15 @@ from linkpose.sensors.rig import Rig
 if TYPE_CHECKING:
     import viser
 
-    from linkpose.device.session import Health
     from linkpose.estimation import FoundJ2s
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT = 8080
-# Seconds between two updates of the page. A sample waits that long at most, a browser needs up to 30 ms more for a
-# frame, and the sum is to stay below 0.1 s. An update costs about half a millisecond of CPU (tests/bench/page.py).
-UPDATE_INTERVAL_S = 0.07
-CHART_INTERVAL = 6  # updates between two of the charts and of a path, which are the largest messages
+# Seconds between two updates of the page. A sample waits that long at most, a browser needs up to 45 ms more for the
+# frame that it draws and the next one, and the sum is to stay below 0.1 s. An update costs about half a millisecond of
+# CPU (tests/bench/page.py).
+UPDATE_INTERVAL_S = 0.055
+CHART_INTERVAL = 9  # updates between two of the charts and of a path, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
 J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
@@ -82,6 +83,7 @@ class Page:
         self._history: History | Replay = replay or History(columns)
         self._replay = replay
         self._of_filter = quantities.by_filter(columns)
+        self._needed = {name: required_sensors(name) for name in self._of_filter}
         self._lost_at: list[int] = []  # columns whose values are not shown
         self._exclusions = Exclusions(self._columns)
         self._queue: deque[tuple[Floats, bool]] = deque(maxlen=QUEUE_BLOCKS)  # rows, and whether they replace all
@@ -200,15 +202,15 @@ class Page:
             self._loop.call_later(UPDATE_INTERVAL_S, self._send)
 
     def _update(self) -> None:
-        clients = self._server.get_clients().keys()
-        if clients != self._clients:
-            self._clients = set(clients)
-            self._redraw()
         is_full = self._updates % CHART_INTERVAL == 0
         self._updates += 1
         if is_full:
             self._take()
-        if not clients:
+            clients = self._server.get_clients().keys()
+            if clients != self._clients:
+                self._clients = set(clients)
+                self._is_changed = self._is_status_changed = True
+        if not self._clients:
             return
         if self._replay is not None:
             self._advance(self._replay)
@@ -218,14 +220,18 @@ class Page:
 
     def _take(self) -> None:
         """Takes the rows that wait into the history."""
-        blocks = [self._queue.popleft() for _ in range(len(self._queue))]
-        if not blocks or not isinstance(self._history, History):
+        if not isinstance(self._history, History):
             return
-        last_restart = max((at for at, (_, is_restart) in enumerate(blocks) if is_restart), default=None)
-        if last_restart is not None:
-            del blocks[:last_restart]
-            self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
-        rows = np.concatenate([rows.reshape(-1, len(self._columns)) for rows, _ in blocks])
+        blocks: list[Floats] = []
+        for _ in range(len(self._queue)):
+            rows, is_restart = self._queue.popleft()
+            if is_restart:
+                blocks = []
+                self._history, self._exclusions = History(self._columns), Exclusions(self._columns)
+            blocks.append(rows.ravel())
+        if not blocks:
+            return
+        rows = np.concatenate(blocks).reshape(-1, len(self._columns))
         self._history.add(rows)
         self._exclusions.follow(rows)
 
@@ -250,21 +256,18 @@ class Page:
 
     def _draw(self, is_full: bool) -> None:
         """Draws the newest row; `is_full` also draws what is large and may be late."""
-        newest, status = self._newest(), self._status
+        newest = self._newest()
+        values = [] if newest is None else newest.tolist()
         if self._replay is not None:
             self._exclusions.follow(self._replay.newest[np.newaxis])
-        if self._is_status_changed:
+        if is_full and self._is_status_changed:
             self._is_status_changed = False
-            self._draw_health(newest, status)
-            self._lost_at = self._lost_columns(status.health)
-        if newest is not None and self._lost_at:
-            newest = newest.copy()
-            newest[self._lost_at] = np.nan
-        name = None if newest is None else self._panel.chosen or self._drawing.best(newest)
-        if newest is not None and name is not None:
-            if status.j2s is not None:
-                self._drawing.set_j2s(status.j2s.mean_m)
-            row = self._drawing.draw(newest, name)
+            self._draw_status(values[0] if values else None, self._status)
+        for at in self._lost_at:
+            values[at] = math.nan
+        name = self._panel.chosen or self._drawing.best(values) if values else None
+        if name is not None:
+            row = self._drawing.draw(values, name)
             self._panel.draw_headline(row[name], name)
             if is_full:
                 self._panel.draw_details(row[name])
@@ -272,18 +275,17 @@ class Page:
                 self._drawing.draw_slow(row, name, self._history)
         self._changes.broadcast(self._clients)
 
-    def _lost_columns(self, health: Health | None) -> list[int]:
-        """The columns of filters that have lost what they need."""
-        lost = lost_filters(self._of_filter, health, required_sensors) if health is not None else ()
-        return [self._columns.index(column) for name in lost for column in self._of_filter[name].values()]
-
-    def _draw_health(self, newest: Floats | None, status: PageStatus) -> None:
+    def _draw_status(self, time_s: float | None, status: PageStatus) -> None:
+        """Draws what changes with the health, at the time (s) of the newest row, if there is one."""
         health, words = status.health, []
-        if newest is not None:
-            words.append(f"{newest[0]:.1f} s")
+        lost = lost_filters(self._of_filter, health, self._needed.__getitem__) if health is not None else ()
+        self._lost_at = [self._columns.index(column) for name in lost for column in self._of_filter[name].values()]
+        if time_s is not None:
+            words.append(f"{time_s:.1f} s")
         if health is not None:
             words.append(f"{health.rate_hz:.0f} Hz   {health.lost} lost")
         if status.j2s is not None:
+            self._drawing.set_j2s(status.j2s.mean_m)
             words.append(j2s_text(status.j2s))
         if self._marks:
             words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")

@@ -61,7 +61,8 @@ class Panel:
         able = {quantity for of in self._of_filter.values() for quantity in of}
         self._choice = gui.add_dropdown("filter", [BEST, *self._of_filter]) if len(self._of_filter) > 1 else None
         if self._choice is not None:
-            self._choice.on_update(lambda _: on_choice())
+            self._choice.on_update(lambda _: self._choose(on_choice))
+        self.chosen: str | None = None  # the filter that the user has chosen; None: the best one
         self._shown = [quantity for quantity in charted if quantity in able]
         self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
         self._curves: dict[str, _Curves] = {}
@@ -71,10 +72,10 @@ class Panel:
         """Adds the charts below what the panel has already."""
         self._charts = {quantity: self._chart(self._gui, quantity) for quantity in self._shown}
 
-    @property
-    def chosen(self) -> str | None:
-        """The filter that the user has chosen; None: the best one."""
-        return None if self._choice is None or self._choice.value == BEST else self._choice.value
+    def _choose(self, on_choice: Callable[[], None]) -> None:
+        assert self._choice is not None
+        self.chosen = None if self._choice.value == BEST else self._choice.value
+        on_choice()
 
     def _chart(self, gui: viser.GuiApi, quantity: Quantity) -> viser.GuiUplotHandle:
         from viser import uplot

@@ -113,15 +113,16 @@ class LinkScene:
         self._sensor.position = self._axes.position = j2s_m
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
-        values = row.get(name, {})
-        roll, pitch, yaw = (values.get(q, _UNKNOWN)[0] for q in (ROLL, PITCH, YAW))
-        self._link.visible = is_known = math.isfinite(roll + pitch)
+        (roll, _), (pitch, _), (yaw, _) = (row[name].get(q, _UNKNOWN) for q in (ROLL, PITCH, YAW))
+        is_known = math.isfinite(roll + pitch)
+        self._changes.show(self._link, is_known)
         if is_known:
             self._changes.turn(self._link, geometry.attitude(roll, pitch, yaw))
         if not reference:
             return
         roll, pitch = (reference.get(q, math.nan) for q in (ROLL, PITCH))
-        self._reference.visible = is_known = math.isfinite(roll + pitch)
+        is_known = math.isfinite(roll + pitch)
+        self._changes.show(self._reference, is_known)
         if is_known:
             # A yaw that starts at 0 with the estimate is comparable with the reference's only up to a constant.
             self._changes.turn(self._reference, geometry.attitude(roll, pitch, yaw))
@@ -161,9 +162,10 @@ class RobotScene:
     def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         values = row.get(name, {})
         x, y, heading = (values.get(q, _UNKNOWN)[0] for q in (X, Y, HEADING))
-        self._robot.visible = is_known = math.isfinite(x + y + heading)
+        is_known = math.isfinite(x + y + heading)
+        self._changes.show(self._robot, is_known)
         if is_known:
-            self._changes.move(self._robot, np.array([x, y, 0.0]))
+            self._changes.move(self._robot, (x, y, 0.0))
             self._changes.turn(self._robot, geometry.attitude(0.0, 0.0, math.degrees(heading)))
 
     def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
@@ -252,18 +254,20 @@ class ChainScene:
     def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         first = best_filter(row, row, ROLL)
         angles = [row[first].get(q, _UNKNOWN)[0] if first is not None else math.nan for q in (ROLL, PITCH, YAW)]
-        attitude = geometry.attitude(*angles)
+        attitude = np.array(geometry.attitude(*angles))
         if not np.isfinite(attitude).all():
             attitude = np.array([1.0, 0.0, 0.0, 0.0])
         chain = best_filter(row, row, QW)
         values = row[chain] if chain is not None else {}
         rotation = np.array([values.get(q, _UNKNOWN)[0] for q in CHAIN_ROTATION])
-        self._changes.turn(self._links[0], attitude)
+        self._changes.turn(self._links[0], attitude.tolist())
         if self._fixed_m is not None:
-            self._changes.move(self._joint, self._base_m - geometry.turned(attitude, self._fixed_m))
-        self._links[1].visible = is_known = bool(np.isfinite(rotation).all())
+            place = self._base_m - geometry.turned(attitude, self._fixed_m)
+            self._changes.move(self._joint, place.tolist())
+        is_known = bool(np.isfinite(rotation).all())
+        self._changes.show(self._links[1], is_known)
         if is_known:
-            self._changes.turn(self._links[1], product(attitude, rotation / np.linalg.norm(rotation)))
+            self._changes.turn(self._links[1], product(attitude, rotation / np.linalg.norm(rotation)).tolist())
 
     def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
         chain = best_filter(row, row, QW)
@@ -288,7 +292,7 @@ class Cone:
     def draw(self, std_deg: float) -> None:
         """Opens the cone to ±2σ; NaN hides it."""
         radius = geometry.cone_radius(self._length_m, std_deg)
-        self._mesh.visible = radius > 0.0
+        self._changes.show(self._mesh, radius > 0.0)
         if radius > 0.0:
             self._changes.scale(self._mesh, (radius, radius, self._length_m))
 
