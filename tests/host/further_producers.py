@@ -371,6 +371,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "another board answers at … now; record it into a file of its own": "test_device.py::test_a_barometer_with_other_words_is_another_board",
         "another board answers at … now (a sensor has the id … instead of …); record it into a file of its own": "test_device.py::test_another_board_behind_the_same_port_ends_the_recording",
         "… is gone (…); check the cable and try again": "test_device.py::test_a_port_that_goes_during_the_handshake_is_a_sentence",
+        "… is gone (…); close other programs that use it, and check the network and try again": "test_device.py::test_a_serial_server_that_serves_another_program_is_a_sentence",
         "… is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link": raises(
             lambda: open_port("nonsense://x")
         ),

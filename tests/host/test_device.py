@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import random
 import re
+import select
+import socket
 import subprocess
 import sys
 import threading
@@ -132,7 +135,7 @@ def test_a_board_that_streams_already_is_taken_over(tmp_path):
     assert seqs == list(range(30))
 
 
-def record_through(port: Path, out: Path, *happenings, after: int = 50) -> tuple[list[str], Session]:
+def record_through(port: Path | str, out: Path, *happenings, after: int = 50) -> tuple[list[str], Session]:
     """Records until `after` samples have come behind a gap.
 
     Each happening (condition on the messages and the number of samples, what) is done in its turn. Nothing depends on
@@ -328,6 +331,62 @@ def test_a_port_that_goes_during_the_handshake_is_a_sentence(refused, tmp_path):
         output = refused("info", "--port", tmp_path / "port")
         pull.join()
     assert "is gone" in output and "check the cable" in output
+
+
+@contextlib.contextmanager
+def serial_server(serves):
+    """The port of a server on this computer; `serves` gets each connection in turn, and the one before or None."""
+    stop = threading.Event()
+
+    def serve() -> None:
+        before = None
+        while not stop.is_set():
+            if select.select([listener], [], [], 0.05)[0]:
+                before = serves(listener.accept()[0], before)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield listener.getsockname()[1]
+        stop.set()
+        thread.join()
+
+
+def test_a_serial_server_that_serves_another_program_is_a_sentence(refused):
+    def refuse(connection: socket.socket, _before: None) -> None:
+        connection.close()
+
+    with serial_server(refuse) as port:
+        output = refused("info", "--port", f"socket://127.0.0.1:{port}")
+    assert "is gone" in output and "close other programs that use it, and check the network and try again" in output
+
+
+def test_another_program_that_takes_the_connection_to_a_serial_server_is_suspected(tmp_path):
+    def serve_the_newest(connection: socket.socket, before: socket.socket | None) -> socket.socket:
+        if before is not None:
+            with contextlib.suppress(OSError):  # it has ended
+                before.shutdown(socket.SHUT_RDWR)
+        threading.Thread(target=board, args=(connection,), daemon=True).start()
+        return connection
+
+    def board(connection: socket.socket) -> None:
+        simulated, began = SimulatedBoard(link_run), time.perf_counter()
+        with connection, contextlib.suppress(OSError):
+            while True:
+                arrived = connection.recv(4096) if select.select([connection], [], [], 0.004)[0] else None
+                if arrived == b"":
+                    return
+                now_us = int((time.perf_counter() - began) * 1e6)
+                connection.sendall(simulated.advance(now_us) + simulated.receive(arrived or b"", now_us))
+
+    with serial_server(serve_the_newest) as port:
+        name = f"socket://127.0.0.1:{port}"
+        take = lambda: socket.create_connection(("127.0.0.1", port)).close()  # noqa: E731
+        messages, _ = record_through(name, tmp_path / "r.csv", (samples(50), take))
+    assert messages[0].startswith(f"{name} disappeared")
+    assert messages[0].endswith("; if another program uses it, close that one; waiting for the board, Ctrl-C ends")
+    assert "is back" in messages[1]
+    check_one_gap(tmp_path / "r.csv", "cable")
 
 
 def test_a_board_that_returns_silent_is_waited_for_to_the_end(impatient, monkeypatch, tmp_path, linkpose):

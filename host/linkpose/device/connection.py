@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import serial
 
-from linkpose.device.ports import open_port
+from linkpose.device.ports import is_network, open_port
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Rig
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
@@ -25,7 +25,8 @@ class Disconnected(LinkposeError):
     """The port is gone: the cable was unplugged, or the program behind the port has ended."""
 
     def __init__(self, port: str, reason: Exception) -> None:
-        super().__init__(f"{port} is gone ({reason}); check the cable and try again")
+        check = "close other programs that use it, and check the network" if is_network(port) else "check the cable"
+        super().__init__(f"{port} is gone ({reason}); {check} and try again")
         self.reason = reason
 
 

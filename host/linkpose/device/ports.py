@@ -193,6 +193,11 @@ def find_again(name: str, identity: UsbIdentity | None) -> str | None:
     return same[0] if same else None
 
 
+def is_network(name: str) -> bool:
+    """Whether a serial server is behind the name: nothing locks its port, and another program may take it away."""
+    return name.startswith(("socket://", "rfc2217://"))
+
+
 def open_port(name: str, baud: int = BAUD) -> serial.Serial:
     """Opens a device, a pyserial URL, or a URL of a registered scheme, at a bit rate.
 

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 from linkpose.device.answers import other_protocol, other_schema, refusal_reason, reset_causes, why_no_hello
 from linkpose.device.clock import WRAP_US, DeviceClock
 from linkpose.device.connection import Arrival, Connection, Disconnected
-from linkpose.device.ports import find_again, usb_identity
+from linkpose.device.ports import find_again, is_network, usb_identity
 from linkpose.errors import BoardError, LinkposeError, NoFirmware, PortNotFound, WrongFirmware
 from linkpose.sensors.conversion import BoardSettings, Placed
 from linkpose.sensors.devices import Sensors, check_hello, found, mouse_remarks
@@ -354,7 +354,8 @@ class Session:
             except Disconnected as error:
                 reset = isinstance(error, NotResumed)
                 event = f"{error.reason}" if reset else f"{self.port} disappeared ({error.reason})"
-                self.notify(f"{event}; waiting for the board, Ctrl-C ends")
+                shared = "; if another program uses it, close that one" if is_network(self.port) else ""
+                self.notify(f"{event}{shared}; waiting for the board, Ctrl-C ends")
                 timeline.interrupted("reset" if reset else "cable")
                 yield []
                 yield from self._reconnect(timeline)
