@@ -14,7 +14,7 @@ from linkpose.cli.localize import command
 from linkpose.errors import AmbiguousStart, MissingStart
 from linkpose.localization.events import Event, Log, format_event, write_lines
 from linkpose.localization.likelihood import run_filter
-from linkpose.localization.localizer import estimate_track
+from linkpose.localization.localizer import Method, estimate_track
 from linkpose.localization.noise import RangeNoise
 from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.paths import localize
@@ -340,13 +340,15 @@ def walk(seed: int, fixes: int, every_s: float, at_once: bool = True) -> tuple[L
     return log, Truth(times, np.array(path), None)
 
 
-@pytest.mark.parametrize("smooth", [False, True])
-def test_a_tag_is_placed_by_a_fix_every_ten_seconds(smooth: bool) -> None:
-    """The tag may be anywhere in the area by then, where one extended filter was 2 to 7 m off and stated 0.5 m."""
+@pytest.mark.parametrize(("name", "smooth"), [("ekf", False), ("ekf", True), ("ukf", False), ("ukf", True)])
+def test_a_tag_is_placed_by_a_fix_every_ten_seconds(name: Method, smooth: bool) -> None:
+    """The tag may be anywhere in the area by then, where one extended filter was 2 to 7 m off and stated 0.5 m, and one
+    unscented filter ended hundreds of metres away.
+    """
     errors, shares = [], []
     for seed in range(4):
         log, truth = walk(seed, 60, 10.0)
-        track = estimate_track(log, "ekf", settings(estimate=("scale", "bias"), smooth=smooth), None, BEACONS)
+        track = estimate_track(log, name, settings(estimate=("scale", "bias"), smooth=smooth), None, BEACONS)
         score = score_track(track, truth)
         errors.append(score.position_rmse_m)
         shares.append(score.within_2_sigma or 0.0)
@@ -368,6 +370,20 @@ def test_a_tag_that_ranges_to_one_beacon_every_three_seconds_needs_no_start() ->
     near_line = {name: (x, 0.01 * y, 0.0) for name, (x, y, _) in BEACONS.items()}
     with pytest.raises(MissingStart):
         estimate_track(log, "ekf", noises, None, near_line)
+
+
+def test_a_stream_of_a_tag_that_ranges_to_one_beacon_every_three_seconds_needs_no_start() -> None:
+    """Its first pose comes with the range to the third beacon: until then, the whole plane fits."""
+    log, truth = walk(1, 25, 12.0, at_once=False)
+    lines = ["time_s,kind,a,b,c\n", *(format_event(event) + "\n" for event in log if isinstance(event, Event))]
+    options = LocalizationOptions(range_std_m=0.1, range_growth=0.0, acceleration_std_m_s2=0.3, drift_std_m=0.0)
+    stream = Stream("ekf", options, BEACONS, lambda line: None)
+    rows = list(stream.rows(lines))
+    assert stream.run is not None and len(rows) == len(log)
+    score = score_track(stream.run.track(rows), truth)
+    assert score.within_2_sigma is not None and score.within_2_sigma > 0.9
+    with pytest.raises(MissingStart):
+        list(Stream("ekf", options, BEACONS, lambda line: None).rows(lines[:3]))
 
 
 def test_a_range_of_metres_too_much_counts_as_an_outlier_between_slow_fixes() -> None:

@@ -179,7 +179,7 @@ class Localizer:
             grid or no_map(),
             drifts_of(settings, motion),
         )
-        if self.vehicle is CONSTANT_VELOCITY and name == "ekf":
+        if self.vehicle is CONSTANT_VELOCITY:
             self.filter: KalmanFilter = GaussianSumFilter(*arguments, outlier_density(beacons))
         else:
             self.filter = KalmanFilter(*arguments)
@@ -434,7 +434,7 @@ def _check_start(log: Log, name: Method, settings: Settings, beacons: Beacons, k
         return
     is_tag = vehicle_of(kinds) is CONSTANT_VELOCITY
     places = places_from_ranges(log, beacons) if is_tag else []
-    if not places and (not is_tag or name != "ekf" or area_of(log, beacons) is None):
+    if not places and (not is_tag or area_of(log, beacons) is None):
         raise MissingStart
     if len(places) > 1:
         raise AmbiguousStart(places[0][:2], places[1][:2])

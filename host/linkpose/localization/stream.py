@@ -32,8 +32,9 @@ from linkpose.presentation import counted
 
 ORIGIN = "standard input"
 # The beginning of the stream from which the motion model and the start follow (s of the log, and rows at the most).
-# Longer delays the first pose; shorter may miss a slow sensor.
-HEAD_S, HEAD_ROWS = 1.0, 500
+# Longer delays the first pose; shorter may miss a slow sensor. Rows that are ranges alone are a tag's: the head then
+# ends with the range to the last of PLACING beacons, which place the tag or bound the area.
+HEAD_S, HEAD_ROWS, PLACING = 1.0, 500, 3
 # After this many ranges and bearings the noises are estimated from the rows so far, and in use this much later: a fixed
 # number, so that the same rows give the same poses however fast they come. The estimate takes up to 8 s.
 TUNED_AFTER, USED_AFTER = (100, 300, 1200), 1.5
@@ -91,7 +92,7 @@ class Stream:
         head: list[Event] = []
         for event in events:
             head.append(event)
-            if event.time_s >= head[0].time_s + HEAD_S or len(head) >= HEAD_ROWS:
+            if len(head) >= HEAD_ROWS or (event.time_s >= head[0].time_s + HEAD_S and self._can_start(head)):
                 break
         if not head:
             raise LinkposeError(f"{ORIGIN} holds no measurements; send the header time_s,kind,a,b,c and rows")
@@ -140,6 +141,11 @@ class Stream:
             if not ended.within_a_line:
                 raise
             self.is_cut = True
+
+    def _can_start(self, head: list[Event]) -> bool:
+        """Whether the start is given, or the rows are not those of a tag that few beacons have placed."""
+        is_tag = all(event.kind == "range" for event in head)
+        return not is_tag or self.settings.start is not None or len({event.beacon for event in head}) >= PLACING
 
     def _start(self, head: Log) -> Localizer:
         kinds = kinds_of(head)

@@ -1,4 +1,4 @@
-"""The extended Kalman filter of a tag without odometry: a sum of Gaussians while its position is not known well."""
+"""The Kalman filter of a tag without odometry: a sum of Gaussians while its position is not known well."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class GaussianSumFilter(KalmanFilter):
         self._collapse()
 
     def _collapse(self) -> None:
-        """State and covariance of the sum. One Gaussian that is left goes on as an extended Kalman filter."""
+        """State and covariance of the sum. One Gaussian that is left goes on as the filter by name."""
         if self.mixture is None:
             return
         collapse(self.mixture, self.state, self.covariance)
