@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from linkpose.errors import LinkposeError, MapMismatch
 from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at, seen_distance
+from linkpose.localization.doubts import scan_doubts
 from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.localizer import estimate_track
@@ -18,6 +20,7 @@ from linkpose.localization.map_check import check_map
 from linkpose.localization.paths import localize
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
+from linkpose.localization.track import Track
 from linkpose.simulation.indoor import IndoorErrors, office_map, simulate_indoor
 
 
@@ -224,3 +227,47 @@ def test_a_map_of_another_place_and_an_odometry_that_contradicts_the_scans_are_n
         for i in range(2)
     ]
     assert "check whether the map is of this place" in check_map(elsewhere, grid, 0.2, "a.log")
+
+
+def winding(late_s: float, speed: float, turn: float) -> tuple[Log, Track]:
+    """Half a minute of a path that winds, and 5 scans/s that err by 0.01 m and 0.3 degrees. They are stamped so much
+    later than the odometry, at 20 Hz, whose columns are multiplied by `speed` and `turn`.
+    """
+    rng = np.random.default_rng(8)
+    fine = np.arange(0.0, 30.0, 0.01)
+    rates = 0.8 * np.sin(0.9 * fine) * np.sin(0.23 * fine)
+    heading = np.cumsum(0.01 * rates)
+    x, y = np.cumsum(0.005 * np.cos(heading)), np.cumsum(0.005 * np.sin(heading))
+    log: Log = [
+        Event(t, "odometry", (speed * 0.5, turn * rate))
+        for t, rate in zip(fine[::5], rates.reshape(-1, 5).mean(axis=1), strict=True)
+    ]
+    times = np.arange(1.0, 29.0, 0.2)
+    log += [Scan(float(t), np.ones(9), np.linspace(-1.0, 1.0, 9), (0.0, 0.0, 0.0), 80.0) for t in times]
+    poses = np.column_stack([np.interp(times - late_s, fine, column) for column in (x, y, heading)])
+    state = poses + rng.normal(0.0, (0.01, 0.01, 0.005), poses.shape)
+    covariance = np.tile(np.diag((1e-4, 1e-4, 2e-5)), (len(times), 1, 1))
+    track = Track(("x_m", "y_m", "heading_rad"), times, state, covariance, 1, 0, frozenset(), 0)
+    return sorted(log, key=lambda event: event.time_s), track
+
+
+@pytest.mark.parametrize(
+    ("late_s", "speed", "turn", "sentence"),
+    [
+        (0.0, 1.0, 1.0, ""),
+        (0.0, 1.15, 0.85, ""),
+        (0.2, 1.0, 1.0, "the scans are stamped about 0.(19|20|21) s later"),
+        (-0.1, 1.0, 1.0, "the odometry is stamped about 0.(09|10|11) s later"),
+        (0.0, -1.0, 1.0, "drives the other way"),
+        (0.0, 1.0, -1.0, "turns the other way"),
+        (0.0, 1 / 0.3048, 1.0, "drives 3.[23]. times as far"),
+        (0.0, 1.0, 180.0 / math.pi, "turns 5[5-9].* times as far"),
+    ],
+)
+def test_a_clock_a_sign_and_a_unit_of_the_odometry_that_the_scans_contradict_are_named(
+    late_s: float, speed: float, turn: float, sentence: str
+) -> None:
+    """The filter follows the scans, so that all of them passed in silence; a late scan moves the path."""
+    found = scan_doubts(*winding(late_s, speed, turn))
+    assert len(found) == (1 if sentence else 0), found
+    assert all(re.search(sentence, remark) for remark in found)

@@ -6,11 +6,16 @@ odometry with another sign a noise as large as the motion. The path is then wron
 
 from __future__ import annotations
 
-import numpy as np
+from typing import NamedTuple
 
-from linkpose.localization.events import NAMED, Event, Log
+import numpy as np
+from numpy.typing import NDArray
+
+from linkpose.localization.events import NAMED, Event, Log, Scan
+from linkpose.localization.linalg import Floats
 from linkpose.localization.settings import Settings
 from linkpose.localization.track import Track
+from linkpose.rotations import wrapped
 
 # Error that the odometry accumulates in a second, as a share of its motion in a second (rms): Plaza 1 has 0.03 of speed
 # and turn, the slow robot of MRCLAM 7 has 0.9 and 0.2. With a wrong sign, unit or column in its odometry, Plaza 1 has
@@ -19,6 +24,14 @@ _SPEED_SHARE, _TURN_SHARE, _LEAST_RAD = 2.0, 0.5, 0.05
 # Scale error of the ranges: Plaza 1 has 0.07, a wrong speed of sound gives 0.05. Feet for metres give more than 0.3.
 _LARGEST_SCALE = 0.2
 _LARGEST_DRIFT = 0.2  # of the median range; Plaza 1 with wrong units or ids has 0.2 and more, as it is less than 0.01
+
+# The path of the scans is compared with the odometry over steps of at least STEP_S (s), in which a robot moves by more
+# than scans err. Clocks may differ by LAGS_S at most; a lag is named from LEAST_LAG_S on (a scan of a 25 Hz scanner),
+# where it takes the mean difference of the turns to CLEARER of what it is without.
+_STEP_S, _LAGS_S, _LEAST_LAG_S, _CLEARER, _FEWEST_STEPS = 0.2, np.arange(-50, 51) / 100.0, 0.04, 0.75, 30
+# The odometry contradicts the scans where its motion is less than _LEAST_FACTOR or more than 1 / _LEAST_FACTOR of
+# theirs, and both belong together (correlation beyond _RELATED): wheels slip and floors differ by a few tenths.
+_LEAST_FACTOR, _RELATED = 0.6, 0.5
 
 
 def doubts(log: Log, settings: Settings, track: Track, free: tuple[str, ...]) -> list[str]:
@@ -54,3 +67,93 @@ def _on_odometry(name: str, unit: str, error: float, size: float) -> str:
         f"the {name} of the odometry is {size:.2g} {unit}/s (rms) and errs by {error:.2g} {unit} in a second: the "
         "measurements contradict it. Check its unit, its sign, its column and its times, unless the robot was carried"
     )
+
+
+class _Steps(NamedTuple):
+    """The motion between scans whose pose is known, and the odometry's own.
+
+    `ahead` (m) and `turned` (rad) (n,) are those between the times `time_s` (n + 1,), where `is_whole` (n,): no gap, no
+    jump. `way` (m) and `heading` (rad) (m,) are what the odometry has driven and turned until the times `odometry_s`.
+    """
+
+    time_s: Floats
+    ahead: Floats
+    turned: Floats
+    is_whole: NDArray[np.bool_]
+    odometry_s: Floats
+    way: Floats
+    heading: Floats
+
+    def differences(self, lag_s: float) -> float:
+        """Mean difference (rad) of the turns, where the scans are stamped `lag_s` later than the odometry."""
+        turned = np.diff(np.interp(self.time_s - lag_s, self.odometry_s, self.heading))
+        return float(np.mean(np.abs(self.turned - turned)[self.is_whole]))
+
+
+def scan_doubts(log: Log, track: Track) -> list[str]:
+    """A sentence on the clock, on the signs and on the units of an odometry that the path of the scans contradicts."""
+    steps = _steps(log, track)
+    if steps is None:
+        return []
+    lag = _lag(steps)
+    found = []
+    if lag:
+        late, other = ("scans are", "the odometry") if lag > 0.0 else ("odometry is", "the scans")
+        found.append(
+            f"the {late} stamped about {abs(lag):.2f} s later than {other}: correct those that are wrong (with wrong "
+            "times of the scans, the path is off by as much as the robot moves in that time)"
+        )
+    times = steps.time_s - lag
+    for verb, scans, total in (("drives", steps.ahead, steps.way), ("turns", steps.turned, steps.heading)):
+        odometry = np.diff(np.interp(times, steps.odometry_s, total))
+        found += _on_scale(verb, scans[steps.is_whole], odometry[steps.is_whole])
+    return found
+
+
+def _steps(log: Log, track: Track) -> _Steps | None:
+    """None where the log has too few of them, or another odometry than speed and turn rate."""
+    driven = [event for event in log if isinstance(event, Event) and event.kind == "odometry"]
+    scanned = {event.time_s for event in log if isinstance(event, Scan)}
+    rows = [i for i in np.flatnonzero(track.known).tolist() if track.time_s[i] in scanned]
+    if track.heading_rad is None or len(driven) < _FEWEST_STEPS or len(rows) < _FEWEST_STEPS:
+        return None
+    chosen = rows[:1]
+    for row in rows[1:]:
+        if track.time_s[row] >= track.time_s[chosen[-1]] + _STEP_S - 1e-6:
+            chosen.append(row)
+    times, heading = track.time_s[chosen], track.heading_rad[chosen]
+    moved, turned = np.diff(track.position_m[chosen, :2], axis=0), wrapped(np.diff(heading))
+    middle = heading[:-1] + 0.5 * turned
+    ahead = moved[:, 0] * np.cos(middle) + moved[:, 1] * np.sin(middle)
+    gaps = np.diff(times)
+    is_whole = (gaps < 2.0 * np.median(gaps) + 1e-6) & (np.abs(turned) < 1.0)
+    odometry_s = np.array([event.time_s for event in driven])
+    rates = np.array([event.values[:2] for event in driven])[:-1] * np.diff(odometry_s)[:, np.newaxis]
+    way, angle = np.concatenate((np.zeros((1, 2)), np.cumsum(rates, axis=0))).T
+    reach = _LAGS_S[-1]
+    is_whole &= (times[:-1] > odometry_s[0] + reach) & (times[1:] < odometry_s[-1] - reach)
+    if is_whole.sum() < _FEWEST_STEPS:
+        return None
+    return _Steps(times, ahead, turned, is_whole, odometry_s, way, angle)
+
+
+def _lag(steps: _Steps) -> float:
+    """By how much (s) the scans are stamped later than the odometry; 0 where that is not clear."""
+    differences = [steps.differences(lag) for lag in _LAGS_S]
+    best = float(_LAGS_S[int(np.argmin(differences))])
+    is_clear = min(differences) < _CLEARER * steps.differences(0.0)
+    return best if is_clear and abs(best) >= _LEAST_LAG_S else 0.0
+
+
+def _on_scale(verb: str, scans: Floats, odometry: Floats) -> list[str]:
+    """What is wrong with the sign or the unit of an odometry that `verb` by so much in each step, unlike the scans."""
+    size = float(np.sqrt(np.sum(scans**2) * np.sum(odometry**2)))
+    related = float(np.sum(scans * odometry)) / size if size > 0.0 else 0.0
+    if abs(related) < _RELATED:
+        return []
+    if related < 0.0:
+        return [f"the odometry {verb} the other way than the scans: check the sign of that column"]
+    factor = float(np.sum(odometry**2) / np.sum(scans * odometry))
+    if _LEAST_FACTOR < factor < 1.0 / _LEAST_FACTOR:
+        return []
+    return [f"the odometry {verb} {factor:.3g} times as far as the scans: check the unit of that column"]

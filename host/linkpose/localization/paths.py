@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from linkpose.errors import InvalidValue
-from linkpose.localization.doubts import doubts
+from linkpose.localization.doubts import doubts, scan_doubts
 from linkpose.localization.events import Event, Log, LogFile, beacon_name, in_order
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import CONSTANT_VELOCITY
@@ -198,6 +198,7 @@ class PreparedLog:
                 share = track.applied / max(track.applied + track.rejected, 1)
                 if remark := check_map(self.log, self.grid, share, str(self.origin)):
                     remarks += (remark,)
+                remarks += tuple(scan_doubts(self.log, track))
             track.check_applied(str(self.origin), method)
             if is_tuned and not tracks:
                 remarks += tuple(doubts(self.log, chosen, track, self.free))
