@@ -33,6 +33,7 @@ from websockets.typing import Origin, Subprotocol
 from linkpose.cli.page import is_loopback
 from linkpose.errors import LinkposeError
 from linkpose.estimation import FoundJ2s
+from linkpose.localization.surroundings import Surroundings
 from linkpose.page import Page, PageStatus, geometry
 from linkpose.page.changes import Changes, uncompressed_frame, websocket_frame
 from linkpose.page.history import PATH_POINTS, POINT_INTERVAL_S, SPAN_S, History
@@ -108,6 +109,14 @@ def chart_data(title: str) -> str:
     )
 
 
+# Pixels that a long label of a chart's y axis takes, and those that it has.
+LABEL_SPACE = """(() => {
+  const chart = Object.values(window.__viserTestpoints.uplots)[0].chart, axis = chart.axes[1];
+  chart.ctx.font = axis.font[0];
+  return [chart.ctx.measureText("-0.0025").width / window.devicePixelRatio, axis._size - axis.ticks.size - axis.gap];
+})()"""
+
+
 def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_path: Path) -> None:
     rows = link_rows()
     rows = np.delete(rows, slice(100, 140), axis=0)  # a pulled cable: 2 s without samples
@@ -179,6 +188,7 @@ def test_a_recording_is_watched_marked_and_stopped(browser: Browser, tmp_path: P
         browser.wait_for_text("marks: 1")
         browser.evaluate(f"{button('stop')}.click()")
         assert process.wait(60) == 0
+        browser.wait_for_text("measurement ended")
     closing = json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))
     assert len(closing["marks"]) == 1 and closing["ended"] == "interrupted"
     browser.open("about:blank")
@@ -249,6 +259,12 @@ def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
         browser.wait_for_text("mouse 2 LEFT OUT since 3.1 s")
         browser.wait_for(f"{chart_data('heading (°)')}[3].length == 50")
         browser.wait_for("document.querySelectorAll('.uplot canvas').length == 3")
+        label, space = browser.evaluate(LABEL_SPACE)
+        assert label <= space  # of a label in hundredths of a degree, whose sign would be cut
+        rows[-1, 8] = 0.0
+        page.show(rows[-1], status())
+        page.close()  # the last row is drawn everywhere
+        browser.wait_for_text("measurement ended")
         leave_without_error(browser)
     angle = np.radians(30.0)
     chain = np.array([[0.0, 20.0, 10.0, np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0, 1.5, 30.0, 1.2]])
@@ -257,6 +273,43 @@ def test_a_robot_and_its_excluded_mouse_and_a_chain(browser: Browser) -> None:
         browser.open(page.url)
         browser.wait_for_text("+30.0° ±1.2°")
         leave_without_error(browser)
+
+
+def scene_node(page: Page, name: str) -> Any:
+    return page._server.scene._handle_from_node_name[name]
+
+
+def test_the_view_widens_for_a_robot_that_leaves_it() -> None:
+    """A browser's camera goes along unless the user has moved it."""
+    columns = ["time_s", "mice_x_m", "mice_y_m", "mice_heading_rad"]
+    with Page(columns, Rig(), "sim://mice") as page:
+        page._has_ended = True  # the updates are made here
+        start = page._server.initial_camera.position
+        following, moved = (
+            SimpleNamespace(camera=SimpleNamespace(position=place, look_at=page._server.initial_camera.look_at))
+            for place in (start, start + 1.0)
+        )
+        page._server.get_clients = lambda: {1: following, 2: moved}  # type: ignore[method-assign, dict-item]
+        for x in (1.0, 2.9, 9.0):
+            page._redraw()
+            page.show(np.array([x, x, 0.5, 0.0]), status())
+            page._update()
+            if x < 3.0:
+                assert np.array_equal(following.camera.position, start)
+        x, y, height = following.camera.position
+        assert x == pytest.approx(5.0) and y < 0.0 and height == pytest.approx(0.75 * 1.5 * 8.0)
+        assert np.allclose(following.camera.look_at, [5.0, 0.5, 0.0])
+        assert np.allclose(page._server.initial_camera.position, following.camera.position)
+        assert np.array_equal(moved.camera.position, start + 1.0)
+        assert scene_node(page, "/ground").width == pytest.approx(1.5 * 1.5 * 8.0)
+
+
+def test_beacons_below_the_path_are_drawn_on_the_ground() -> None:
+    around = Surroundings(beacons={"A": [1.0, 2.0, -18.0], "B": [3.0, 4.0, 2.5]})
+    columns = ["time_s", "ekf_x_m", "ekf_y_m", "ekf_heading_rad"]
+    with Page(columns, Rig(), "sea.csv", surroundings=around) as page:
+        assert scene_node(page, "/beacon/A").position.tolist() == [1.0, 2.0, 0.0]
+        assert scene_node(page, "/beacon/B").position.tolist() == [3.0, 4.0, 2.5]
 
 
 def test_an_estimate_becomes_a_file_that_plays_it(browser: Browser, tmp_path: Path, linkpose: Any) -> None:
@@ -392,7 +445,7 @@ def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
     """A sample waits for one update on its way to the screen; charts, which are large, may be later."""
     rows, sent = link_rows(), []
     with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
-        page._is_closed = True  # the updates are made here, from a full one on
+        page._has_ended = True  # the updates are made here, from a full one on
         page._redraw()
         page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, dict-item]
         browser = connection(lambda: 0, lambda frame: sent.append(decoded(frame[4 if frame[1] == 126 else 10 :])))

@@ -40,6 +40,7 @@ UPDATE_INTERVAL_S = 0.055
 CHART_INTERVAL = 9  # updates between two of the charts and of a path, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
 J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
+FAREWELL_S = 1.0  # that the end of a run waits for the last update of the page, at most
 QUEUE_BLOCKS = 256  # that wait for the page; more than a second of them, older ones are dropped
 _PORTS_TRIED = 100
 
@@ -95,7 +96,7 @@ class Page:
         self._server = serve(host, port or free_port(host), is_named=port is not None)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._build(rig, surroundings or Surroundings())
-        self._is_closed = False
+        self._is_ending = self._has_ended = False
         self._error: Exception | None = None
         self._loop = self._server.get_event_loop()
         self._loop.call_soon_threadsafe(self._send)
@@ -128,8 +129,12 @@ class Page:
             raise self._error
 
     def close(self) -> None:
-        """Ends the server."""
-        self._is_closed = True
+        """Draws the last row everywhere, and ends the server."""
+        if self._is_ending:
+            return
+        is_drawn = threading.Event()
+        self._loop.call_soon_threadsafe(self._finish, is_drawn)
+        is_drawn.wait(FAREWELL_S)
         # viser waits up to 6 s for the farewell of browsers; the end of a measurement does not.
         threading.Thread(target=self._server.stop, name="linkpose page stop", daemon=True).start()
 
@@ -192,7 +197,7 @@ class Page:
         It runs on the server's event loop: with a thread of its own, each update would wake two threads, which wait for
         each other.
         """
-        if self._is_closed:
+        if self._has_ended:
             return
         try:
             self._update()
@@ -200,6 +205,15 @@ class Page:
             self._error = error
         else:
             self._loop.call_later(UPDATE_INTERVAL_S, self._send)
+
+    def _finish(self, is_drawn: threading.Event) -> None:
+        """Sends the last update, after which browsers keep numbers, link and charts of the same row."""
+        self._is_ending = True
+        self._redraw()
+        if self._error is None:
+            self._send()
+        self._has_ended = True
+        is_drawn.set()
 
     def _update(self) -> None:
         is_full = self._updates % CHART_INTERVAL == 0
@@ -291,6 +305,8 @@ class Page:
             words.append(f"marks: {len(self._marks)}, last at {self._marks[-1]:.1f} s")
         if status.line:
             words.append(status.line)
+        if self._is_ending and self._replay is None:
+            words.append("measurement ended")
         faults = fault_lines(health, self._exclusions) if health is not None else self._exclusions.lines()
         working = working_sensors(health) if health is not None else []
         self._panel.draw_health(self._title, "   ".join(words), working, faults)

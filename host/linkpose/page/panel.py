@@ -32,6 +32,7 @@ _CHART_HEIGHT = {HEIGHT: 150}  # pixels; the height is the largest
 _OTHER_HEIGHT = 105
 _CHART_PADDING = (10, 14, 0, 0)  # pixels above, right, below, left: the outermost labels are not cut
 _LABEL_SPACE = 18  # pixels between two labels of the y axis, at least; with uPlot's 30 a low chart has a single label
+_LABEL_WIDTH = 66  # pixels of the y axis: uPlot cuts a longer label at its start, where the sign is; -0.0025 fits
 _NOWHERE = 0  # in place of a column that is missing: that of the time
 _OK, _FAULT = "#2b8a3e", "#c92a2a"
 
@@ -96,7 +97,7 @@ class Panel:
             title=quantity.axis_label,
             bands=(uplot.Band(series=(2, 1), fill=_BAND),),
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
-            axes=(uplot.Axis(size=26), uplot.Axis(size=48, space=_LABEL_SPACE)),
+            axes=(uplot.Axis(size=26), uplot.Axis(size=_LABEL_WIDTH, space=_LABEL_SPACE)),
             legend=uplot.Legend(show=False),
             height=_CHART_HEIGHT.get(quantity, _OTHER_HEIGHT),
             padding=_CHART_PADDING,

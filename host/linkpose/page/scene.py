@@ -42,6 +42,9 @@ _UNKNOWN = (math.nan, math.nan)  # a value and its σ
 _ELLIPSES = 12  # along a path
 _UNKNOWN_R1_M, _UNKNOWN_R2_M = (0.0, 0.0, 0.25), (0.0, 0.0, -0.25)  # of a chain, as drawn
 _BEYOND_SENSOR = 1.7  # length of a link, as drawn, over the distance of its sensor from the joint
+_SHOWN = 0.55  # of a scene's size to each side of its centre: a robot there is in view yet
+_WIDER = 1.5  # the view of a path that leaves it, over the path's size, so that it does not change all the time
+_MOVED_M = 0.01  # a camera within this distance of where it was put has not been moved by the user
 _ROBOT_SHARE = 10.0  # m: the size of a scene from which on the robot is drawn larger than it is
 _SKY, _GROUND = (255, 255, 255), (200, 200, 205)
 _SKY_INTENSITY = 3.5  # of light from everywhere, in viser's unit; colours look as they are stated
@@ -140,10 +143,11 @@ class RobotScene:
     combines_filters: ClassVar[bool] = False
 
     def __init__(self, server: viser.ViserServer, changes: Changes, surroundings: Surroundings, places: Floats) -> None:
-        self._scene, self._changes = server.scene, changes
-        (x, y), size = _extent(np.vstack([surroundings.corners_m(), places]))
+        self._server, self._scene, self._changes = server, server.scene, changes
+        self._corners_m = surroundings.corners_m()
+        centre, size = _extent(np.vstack([self._corners_m, places]))
         self._floor_m = max(_FLOOR_M, 0.001 * size)
-        _ground(self._scene, 1.5 * size, (x, y, -2 * self._floor_m))
+        self._look_at(centre, size)
         self._draw_surroundings(surroundings, size)
         scale = max(1.0, size / _ROBOT_SHARE)  # a robot of 24 cm would be a dot on a floor of 100 m
         self._robot = self._scene.add_frame(
@@ -156,8 +160,32 @@ class RobotScene:
             self._scene.add_box(
                 f"/robot/{name}", colour, tuple(scale * np.array(dimensions)), position=scale * np.array(at)
             )
-        server.initial_camera.position = (x, y - 0.5 * size, 0.75 * size)
-        server.initial_camera.look_at = (x, y, 0.0)
+
+    def _look_at(self, centre_m: Floats, size_m: float) -> None:
+        """Points new browsers' cameras at an area, and lays the ground under it."""
+        half = _SHOWN * size_m
+        (x, y), self._area_m = centre_m.tolist(), np.array([centre_m - half, centre_m + half])
+        self._eye_m, self._target_m = (x, y - 0.5 * size_m, 0.75 * size_m), (x, y, 0.0)
+        _ground(self._scene, 1.5 * size_m, (x, y, -2 * self._floor_m))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = self._eye_m, self._target_m
+
+    def _keep_in_view(self, places_m: Floats) -> None:
+        """Widens the view if the path (N, 2) has left the area. A camera that the user has moved stays where it is."""
+        low, high = self._area_m
+        if not len(places_m) or ((places_m[-1] >= low) & (places_m[-1] <= high)).all():
+            return
+        following = [
+            client.camera
+            for client in self._server.get_clients().values()
+            if np.allclose(client.camera.position, self._eye_m, atol=_MOVED_M)
+            and np.allclose(client.camera.look_at, self._target_m, atol=_MOVED_M)
+        ]
+        centre, size = _extent(np.vstack([self._corners_m, places_m]))
+        self._look_at(centre, _WIDER * size)
+        for camera in following:
+            camera.position = self._eye_m
+            camera.look_at = self._target_m
 
     def draw(self, row: Row, name: str, reference: dict[Quantity, float]) -> None:
         values = row.get(name, {})
@@ -171,11 +199,13 @@ class RobotScene:
     def draw_slow(self, row: Row, name: str, path: Floats | None) -> None:
         if path is not None:
             self._draw_path(path)
+            self._keep_in_view(path[np.isfinite(path[:, :2]).all(axis=1), :2])
 
     def _draw_surroundings(self, around: Surroundings, size: float) -> None:
         """Draws beacons, in proportion to the size (m) of the scene, and the map."""
         for name, place in around.beacons.items():
-            position = (place[0], place[1], place[2] if len(place) > 2 else 0.0)
+            height = place[2] if len(place) > 2 else 0.0
+            position = (place[0], place[1], max(height, 0.0))  # the ground would hide what lies below the path
             self._scene.add_icosphere(f"/beacon/{name}", max(0.03, 0.012 * size), _ORANGE, position=position)
             self._scene.add_label(f"/beacon/{name}/label", name)
         if around.grid is None:
