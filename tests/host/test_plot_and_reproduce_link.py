@@ -21,7 +21,7 @@ from linkpose.localization.grid import GridMap
 from linkpose.localization.surroundings import Surroundings
 from linkpose.localization.tables import PathScore
 from linkpose.plotting import lines
-from linkpose.plotting.canvas import COLOURS, WIDTH_INCHES, label_time, legend_above
+from linkpose.plotting.canvas import COLOURS, WIDTH_INCHES, label_time, legend_above, wrapped
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -478,6 +478,46 @@ def test_panels_below_each_other_share_their_left_edge_and_a_square_path_their_t
     assert path.get_position().y1 > over_time[-1].get_position().y1 and path.get_anchor() == "N"
     mice = over_time[-1]
     assert [label.get_text() for label in mice.get_yticklabels()] == ["mouse 1", "mouse 2"]
+
+
+def test_an_arrow_at_the_edge_of_a_path_is_whole(tmp_path):
+    t = np.arange(200) / 100
+    columns = {"time_s": t, "mice_x_m": -2.5 * t**2, "mice_y_m": 4.55 * t, "mice_heading_rad": np.full(200, np.pi)}
+    figure, _ = plotting.plot_tables([read_table(Path(write(tmp_path / "m.csv", columns)))])
+    figure.draw_without_rendering()
+    path = figure.axes[0]
+    (arrows,) = (part for part in path.collections if type(part).__name__ == "Quiver")
+    left = path.transData.inverted().transform([0.0, 0.0])[0] - path.transData.inverted().transform([1.0, 0.0])[0]
+    tips = arrows.X + left * 0.22 * figure.dpi  # 0.22 inches to the left
+    assert path.get_xlim()[0] < tips.min() < -10.0
+
+
+def test_a_legend_is_not_wider_than_its_axes(tmp_path):
+    t = np.arange(400) / 100
+    pose = {"x_m": 3 * t, "y_m": 0.1 * t, "heading_rad": 0 * t}
+    columns = {"time_s": t}
+    for name, error in (("planar_ekf", 0.0012), ("planar_ukf", 0.0013), ("mice", 0.0345)):
+        columns |= {f"{name}_{of}": value + error * np.sin(7 * t) for of, value in pose.items()}
+        columns |= {f"{name}_{of}_std_m": np.full(400, error) for of in "xy"}
+    paths = (write(tmp_path / "m.csv", columns), write(tmp_path / "mt.csv", {"time_s": t} | pose, "truth"))
+    figure, _ = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    figure.draw_without_rendering()
+    legends = [(axes, axes.get_legend()) for axes in figure.axes if axes.get_legend()]
+    assert len(legends) == 3
+    for axes, legend in legends:
+        assert legend.get_window_extent().width <= 1.08 * axes.bbox.width, axes.get_ylabel()
+    shown = [text.get_text().split(" ")[0] for text in legends[2][1].get_texts()]
+    assert shown == ["planar-ekf", "2σ", "planar-ukf", "mice"]  # column by column; 2σ begins the second row
+
+
+def test_the_unit_of_a_label_stays_with_its_quantity():
+    assert wrapped("position error (m)\nall filters", 0.95, 9.0) == "position\nerror (m)\nall filters"
+
+
+def test_a_table_s_negative_numbers_have_a_minus_sign(tmp_path):
+    figure = plotting.evaluation(evaluate(*link_files(tmp_path)), "e.csv", "t.csv")
+    cells = [cell.get_text().get_text() for cell in figure.axes[-1].tables[0].get_celld().values()]
+    assert any(text.startswith("−") for text in cells) and not any(text.startswith("-") for text in cells)
 
 
 def test_of_two_panels_of_errors_each_states_its_filters(tmp_path):

@@ -10,7 +10,7 @@ import textwrap
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from linkpose.errors import CannotWrite, UnknownPicture
 from linkpose.outputs import STDOUT, check_outputs, new_file
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+Entry = TypeVar("Entry")  # of a legend: its label, or its number
 FORMATS = (".png", ".svg", ".pdf")
 # Every picture is as wide as the two columns of a journal's page (183 mm), where its lettering is printed as it is. In
 # one column (88 mm), 9 and 8 points become 4.3 and 3.9; a picture of 10 inches had 3.5 and 2.8 there.
@@ -60,6 +61,14 @@ def _without_warnings_of_matplotlib() -> Iterator[None]:
         logger.setLevel(before)
 
 
+@contextlib.contextmanager
+def _without_warnings_of_glyphs() -> Iterator[None]:
+    """While a figure is drawn: without a font for it, a file's name has boxes."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")
+        yield
+
+
 def new_figure(height_inches: float, title: str = "") -> Figure:
     """An empty figure of WIDTH_INCHES with a title at its left edge."""
     with _without_warnings_of_matplotlib():
@@ -73,13 +82,15 @@ def new_figure(height_inches: float, title: str = "") -> Figure:
 
 # Mean width of a character of matplotlib's font, as a share of its size, measured over labels of these plots.
 _CHARACTER = 0.5
+_NO_BREAK = "\N{NO-BREAK SPACE}"
 
 
 def wrapped(text: str, inches: float, size: float) -> str:
     """The text in lines that are not longer than `inches` at a size in points, as far as its words allow."""
     characters = max(8, int(72 * inches / (_CHARACTER * size)))
-    lines = text.split("\n")
-    return "\n".join(textwrap.fill(line, characters, break_long_words=False, break_on_hyphens=False) for line in lines)
+    lines = text.replace(" (", f"{_NO_BREAK}(").split("\n")  # a unit stays with its quantity
+    filled = (textwrap.fill(line, characters, break_long_words=False, break_on_hyphens=False) for line in lines)
+    return "\n".join(filled).replace(f"{_NO_BREAK}(", " (")
 
 
 def line_style(name: str, file: int = 0) -> dict[str, Any]:
@@ -150,12 +161,46 @@ def legend_above(axes: Axes, best_first: Sequence[str] = (), title: str = "") ->
     once = {label: handle for handle, label in order}
     if once:
         columns = _columns_that_fit(list(once), _MORE * axes.get_window_extent().width / axes.figure.dpi)
-        labels = _by_rows(list(once), columns)
-        axes.legend(
-            [once[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
-            frameon=False, fontsize=SMALL_LETTERING, borderaxespad=0.2, borderpad=0.2, handlelength=_HANDLE - 0.8,
-            columnspacing=1.0, title=title or None, title_fontsize=LETTERING, alignment="left",
-        )  # fmt: skip
+        _fill_legend(axes, once, columns, title)
+
+
+def _fill_legend(axes: Axes, handles: dict[str, Any], columns: int, title: str) -> None:
+    """A legend above the axes with these labels row by row, in so many columns."""
+    labels = _by_rows(list(handles), columns)
+    legend = axes.legend(
+        [handles[label] for label in labels], labels, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns,
+        frameon=False, fontsize=SMALL_LETTERING, borderaxespad=0.2, borderpad=0.2, handlelength=_HANDLE - 0.8,
+        columnspacing=1.0, title=title or None, title_fontsize=LETTERING, alignment="left",
+    )  # fmt: skip
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+_OVERHANG = 1.08  # of a legend's width over that of its axes: into the space between two panels, not beyond
+
+
+def fit_legends(figure: Figure) -> Figure:
+    """The figure, whose legends have fewer columns where they are wider than their axes.
+
+    The layout, which comes last, makes axes so narrow that the widest legend has its place in the picture.
+    """
+    with _without_warnings_of_glyphs():
+        legends = [(axes, legend) for axes in figure.axes if (legend := axes.get_legend()) is not None]
+        if all(legend.get_window_extent().width <= axes.bbox.width for axes, legend in legends):
+            return figure  # the layout, which takes a quarter of a second, leaves the axes at least this width
+        figure.draw_without_rendering()
+    for axes in figure.axes:
+        while (legend := axes.get_legend()) is not None:
+            columns = int(legend._ncols)  # type: ignore[attr-defined]  # matplotlib has no reader for it
+            if columns == 1 or legend.get_window_extent().width <= _OVERHANG * axes.bbox.width:
+                break
+            texts = [text.get_text() for text in legend.get_texts()]
+            by_place = dict(zip(_by_rows(list(range(len(texts))), columns), texts, strict=True))
+            handles, labels = axes.get_legend_handles_labels()
+            handle_of = dict(zip(labels, handles, strict=True))
+            in_rows = {by_place[place]: handle_of[by_place[place]] for place in range(len(texts))}
+            _fill_legend(axes, in_rows, columns - 1, legend.get_title().get_text())
+    return figure
 
 
 _HANDLE = 2.4  # of an entry of a legend, with its distance from the label: in sizes of the lettering
@@ -171,8 +216,8 @@ def _columns_that_fit(labels: Sequence[str], inches: float) -> int:
     return 1
 
 
-def _by_rows(labels: list[str], columns: int) -> list[str]:
-    """Labels in the order in which matplotlib, which fills a legend column by column, shows them row by row."""
+def _by_rows(labels: list[Entry], columns: int) -> list[Entry]:
+    """Entries in the order in which matplotlib, which fills a legend column by column, shows them row by row."""
     return [label for column in range(columns) for label in labels[column::columns]]
 
 
@@ -224,8 +269,7 @@ def save(figure: Figure, path: Path, force: bool) -> None:
     metadata = {"pdf": {"CreationDate": datetime.datetime(1970, 1, 1)}, "svg": {"Date": None}}
     _add_fonts(figure)
     # The file is made when the picture is whole: matplotlib seeks in files, and a pipe has no place to seek.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from")  # without a font, a file's name has boxes
+    with _without_warnings_of_glyphs():
         figure.savefig(picture := io.BytesIO(), dpi=DPI, format=ending, metadata=metadata.get(ending))
     with new_file(path, force) as file:
         file.write(picture.getvalue())

@@ -8,11 +8,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from linkpose.evaluation.statistics import normalised_errors
-from linkpose.plotting.canvas import finish, label_time, legend_above, line_style, new_figure, without_formulas
+from linkpose.plotting.canvas import (
+    finish,
+    fit_legends,
+    label_time,
+    legend_above,
+    line_style,
+    new_figure,
+    without_formulas,
+)
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.panels import bound_view, is_signed, others_hide_best, which_filters
 from linkpose.plotting.sources import is_barometric, shortened
-from linkpose.presentation import same_digits, with_unit
+from linkpose.presentation import minus, same_digits, with_unit
 from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
 from linkpose.sensors.measurements import Floats
 
@@ -66,7 +74,7 @@ def evaluation(found: Evaluation, estimate: str, reference: str) -> Figure:
             _histogram(figure.add_subplot(grid[row, 1]), scores, name, name == last)
     figure.align_ylabels()
     _table(figure.add_subplot(grid[-1, :]), found.scores)
-    return without_formulas(figure)
+    return fit_legends(without_formulas(figure))
 
 
 def _has_sigma(score: Score, name: str) -> bool:
@@ -175,7 +183,7 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
     for score in scores:
         for name, value in score.statistics().items():
             unit = unit_text(score.errors[name].unit)
-            figures = same_digits(value.rmse, value.mean, value.worst, value.p95)
+            figures = map(minus, same_digits(value.rmse, value.mean, value.worst, value.p95))
             sigma = ["", ""]
             if value.nees is not None and value.within_2sigma is not None:
                 sigma = [f"{value.nees:.3g}", f"{100 * value.within_2sigma:.0f} %"]

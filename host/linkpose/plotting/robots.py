@@ -138,9 +138,11 @@ def _mark(axes: Axes, track: DrawnTrack, colour: str) -> None:
     if not track.name:
         return
     at = known[np.linspace(0, len(known) - 1, min(_MARKS, len(known))).astype(int)]
-    at = at[_apart(np.column_stack([x[at], y[at]]), _TICKS_APART * _TICK_INCHES * _metres_an_inch(axes))]
+    tick_m = _TICK_INCHES * _metres_an_inch(axes)
+    at = at[_apart(np.column_stack([x[at], y[at]]), _TICKS_APART * tick_m)]
     if HEADING in track.values:
         angle = np.radians(track.values[HEADING][at])
+        axes.update_datalim(np.column_stack([x[at] + tick_m * np.cos(angle), y[at] + tick_m * np.sin(angle)]))
         axes.quiver(
             x[at],
             y[at],

@@ -14,6 +14,7 @@ from linkpose.plotting import panels, readings, robots
 from linkpose.plotting.canvas import (
     SMALL_LETTERING,
     WIDTH_INCHES,
+    fit_legends,
     label_time,
     new_figure,
     without_formulas,
@@ -94,7 +95,7 @@ def plot_tables(
     if note:
         lines = wrapped(note, WIDTH_INCHES, SMALL_LETTERING)
         figure.supxlabel(lines, fontsize=SMALL_LETTERING, x=0.01, ha="left", color="#555555")
-    return without_formulas(figure), [*sources.remarks, *([note] if note else [])]
+    return fit_legends(without_formulas(figure)), [*sources.remarks, *([note] if note else [])]
 
 
 def _lay_out(part: SubFigure, section: Section) -> None:
