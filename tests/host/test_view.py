@@ -302,6 +302,20 @@ def test_the_lines_after_the_view_break_between_words() -> None:
     assert "1.0 s, 100 samples, 100.0 Hz,\n0 lost, 0 corrupt" in terminal.text
 
 
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        ("info a-recording-of-another-day-that-nobody-kept.csv", "linkpose: "),
+        ("estimate --rate 100", "Error: name a RECORDING, or add --live to estimate\nfrom the board"),
+    ],
+)
+def test_failures_break_between_words(command: str, sentence: str) -> None:
+    with Terminal(*command.split(), columns=52) as terminal:
+        assert terminal.wait() in (1, 2)
+    assert sentence in terminal.text
+    assert all(word in terminal.text for word in command.split()[1:] if word.endswith(".csv"))
+
+
 def test_a_mark_before_the_first_sample_is_set_at_it() -> None:
     marks: list[float] = []
     marker, block = Marker(marks.append), LinkRun(1, 0, 1.0).measurements()
@@ -377,6 +391,10 @@ def test_the_final_table_lists_joint_angles_and_poses(monkeypatch: pytest.Monkey
     assert lines[1] == ["chain", "angle", "0.0°", "+30.0°", "1.0°"]
     assert [line[:2] for line in lines[2:]] == [["mice", name] for name in ("x", "y", "heading")]
     assert lines[2][-1] == "–" and lines[4][2:] == ["0.0°", f"+{math.degrees(1 + 2 * math.pi):.1f}°", "0.5°"]
+
+
+def test_the_final_table_names_quantities_in_words() -> None:
+    assert "chain height 1" in final_table({("chain", quantities.HEIGHT1): (-0.25, -0.16, 0.002)}, 80)[1]
 
 
 def test_the_final_table_has_the_median_deviation() -> None:

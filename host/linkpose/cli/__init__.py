@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import io
 import os
 import re
 import sys
@@ -102,25 +103,31 @@ def _run() -> int:
     except click.exceptions.Abort:
         return 130
     except click.ClickException as error:
-        error.show()
+        error.show(shown := io.StringIO())
+        _complain(shown.getvalue().rstrip("\n"))
         return error.exit_code
     except LinkposeError as error:
         from linkpose.cli.cures import WRONG_USAGE, sentence
 
-        click.echo(f"linkpose: {printable(sentence(error))}", err=True)
+        _complain(f"linkpose: {printable(sentence(error))}")
         return 2 if isinstance(error, WRONG_USAGE) else 1
     except Exception as error:
         if obstacle := _of_the_system(error):
-            click.echo(f"linkpose: {printable(obstacle)}", err=True)
+            _complain(f"linkpose: {printable(obstacle)}")
             return 1
         if os.environ.get("LINKPOSE_DEBUG"):
             raise
         what = f"{type(error).__name__}: {error}"
-        click.echo(
-            f"linkpose: unexpected {printable(what)}; please report it with what LINKPOSE_DEBUG=1 shows", err=True
-        )
+        _complain(f"linkpose: unexpected {printable(what)}; please report it with what LINKPOSE_DEBUG=1 shows")
         return 1
     return status if isinstance(status, int) else 0
+
+
+def _complain(text: str) -> None:
+    """Prints a failure; a terminal breaks it between words, not within a path."""
+    from linkpose.cli.rendering import wrapped
+
+    click.echo(wrapped(text, sys.stderr), err=True)
 
 
 def _spaced_vector(option: str, words: Sequence[str]) -> str:

@@ -293,7 +293,7 @@ def final_table(summary: Summary, width: int) -> list[str]:
     """
     rows = [("filter", "lowest", "highest", "median σ")]
     for (name, quantity), (low, high, std) in summary.items():
-        title = name if quantity == quantities.HEIGHT else f"{name} {quantity.name.replace('_', ' ')}"
+        title = name if quantity == quantities.HEIGHT else f"{name} {quantities.words(quantity.name)}"
         if quantity.is_angle:
             low, high, std = (quantity.value.scale * value for value in (low, high, std))
             lowest, _, bound = angle_with_std(low, std).partition(" ±")
