@@ -16,6 +16,7 @@ import numpy as np
 from linkpose import filters, quantities
 from linkpose.errors import CannotRun, FilterCannotRun, InvalidValue, LinkposeError, NoFilterRuns, NoMagnetometer
 from linkpose.exclusions import ExcludedMice
+from linkpose.mice_findings import mice_findings
 from linkpose.recording.csvfile import CsvFile
 from linkpose.recording.fixedpoint import format_rows
 from linkpose.recording.reader import Recording, RecordingFile, load_recording
@@ -397,7 +398,8 @@ def estimate(
 
     Warns:
         UserWarning where values contradict their unit (g in place of m/s², milliseconds), where the recording is
-        faulty, and where the measurements do not fit what a filter assumes; the sentences are in `remarks`, too.
+        faulty, where the measurements do not fit what a filter assumes, and where mice or gyro failed; the sentences
+        are in `remarks`, too.
 
     Raises:
         UnknownFilter, FilterCannotRun (a named filter), NoFilterRuns, InvalidValue, FileError; for `mag`:
@@ -417,7 +419,7 @@ def estimate(
     if mag:
         estimator.hold_heading()
     values = estimator.process(measurements)
-    remarks = list(dict.fromkeys([*remarks, *estimator.remarks]))
+    remarks = list(dict.fromkeys([*remarks, *mice_findings(estimator), *estimator.remarks]))
     for remark in remarks:
         warnings.warn(remark, stacklevel=2)
     return Estimates(

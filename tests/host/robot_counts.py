@@ -26,6 +26,18 @@ LEGS = (
 )  # fmt: skip
 
 
+def drawn_legs(seed: int) -> tuple[tuple[float, float, float], ...]:
+    """Legs for 60 s: rests, straights, arcs and turns on the spot, from a rest of 2 s on."""
+    rng = np.random.default_rng([seed, 78])
+    legs = [(2.0, 0.0, 0.0)]
+    while sum(seconds for seconds, _, _ in legs) < 62.0:
+        kind, seconds = rng.random(), rng.uniform(1.5, 3.5)
+        speed = rng.uniform(0.2, 0.5) if 0.15 < kind < 0.9 else 0.0
+        turn_rate = rng.choice([-1, 1]) * rng.uniform(0.3, 1.5) if kind > 0.5 else 0.0
+        legs.append((seconds, speed, turn_rate))
+    return tuple(legs)
+
+
 @dataclass(frozen=True)
 class Robot:
     """Speed ahead (m/s) and turn rate (rad/s) each millisecond; pose (N, 3) at the samples: x, y (m), heading (rad)."""

@@ -22,7 +22,7 @@ LEVELS = [
     {"wire", "presentation", "extremes"},
     {"sensors"},
     {"filters", "device", "recording", "localization", "flashing"},
-    {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert", "exclusions"},
+    {"precompile", "calibration", "evaluation", "recorder", "simulation", "convert", "exclusions", "mice_findings"},
     {"board"},
     {"estimation"},
     {"live_estimation", "experiments", "plotting", "streams"},

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 from linkpose.cli.cures import sentence
 from linkpose.errors import LinkposeError, MissingJ2S
+from linkpose.mice_findings import mice_findings
 
 if TYPE_CHECKING:
     from linkpose.cli.live import Console
@@ -41,7 +41,8 @@ def report_running(estimator: Estimator, joint: Joint | None, console: Console) 
 def report_findings(estimator: Estimator, console: Console) -> None:
     """What the filters found about J2S, the mice and the magnetic field, and what is wrong with the measurements."""
     _report_j2s(estimator, console)
-    _report_mice(estimator, console)
+    for text in mice_findings(estimator):
+        console.report(text)
     _report_field(estimator, console)
     for remark in estimator.remarks:
         console.report(remark)
@@ -58,61 +59,6 @@ def _report_j2s(estimator: Estimator, console: Console) -> None:
         console.report(
             f"The motion does not determine J2S along the sensor's {found.worst_axis} axis (1σ is "
             f"{found.worst_std_m:.2f} m), so the heights are rough. Swing the link longer, in all directions."
-        )
-
-
-_LONG_S = 5.0  # longer than robots slip or are carried
-_SHORTEST_S = 0.2  # of exclusions that are reported: a late packet excludes a mouse for a sample
-
-
-def _report_excluded(estimator: Estimator, console: Console) -> None:
-    """Which mice were left out, since when, and for how long."""
-    excluded = estimator.excluded
-    long = sorted(name for name, total_s in excluded.total_s.items() if total_s >= _SHORTEST_S)
-    causes = estimator.mouse_causes
-    if 0 in causes and len(long) == len(estimator.rig.mouse):  # together: each beside the others means nothing
-        causes = {0: causes[0]}
-    for name in long:
-        still = "; it is still left out" if name in excluded.now else ""
-        mouse = int(name.removeprefix("mouse"))
-        console.report(
-            f"mouse {mouse} was left out for {excluded.total_s[name]:.1f} s, first at "
-            f"{excluded.first_s[name]:.1f} s{still}: {causes.get(mouse, 'it contradicted the other sensors')}. Check "
-            "that it is on the floor, and its place and angle in the rig file"
-        )
-    mice = len(estimator.rig.mouse)
-    if mice and len(long) == mice and min(excluded.total_s.values()) > _LONG_S:
-        cause = f" ({causes[0]})" if 0 in causes else ""
-        console.report(
-            f"all mice were left out for long: together they contradict the gyro{cause}. If they were on the floor, "
-            "their counts_per_m or angle_deg in the rig file are wrong: type `linkpose calibrate mice`"
-        )
-
-
-def _report_mice(estimator: Estimator, console: Console) -> None:
-    """Excluded mice, jumps of the gyro, and the common scale of the mice where it differs from the rig file."""
-    _report_excluded(estimator, console)
-    jumps = estimator.gyro_jumps
-    if jumps:
-        times = "" if jumps.times == 1 else f" {jumps.times} times, last"
-        console.report(
-            f"the gyro's bias has jumped{times} by {math.degrees(jumps.last_rad_s):+.1f} °/s, found at "
-            f"{jumps.last_time_s:.1f} s: the mice contradicted the gyro, and the heading was corrected by the mice. "
-            "Check the mounting and the supply of the sensor"
-        )
-    for mouse in estimator.moved_mice:
-        console.report(
-            f"mouse {mouse.mouse} is {1e3 * mouse.off_m:.0f} mm from its place in the rig file: the turns show it at "
-            f"x_m = {mouse.x_m:.3f}, y_m = {mouse.y_m:.3f}"
-        )
-    for remark in estimator.mice_remarks:
-        console.report(remark)
-    if estimator.mice_scale:
-        factor, std = estimator.mice_scale
-        change = "more" if factor > 1 else "fewer"
-        console.report(
-            f"the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig file "
-            "states, compared with the gyro (another floor?): type `linkpose calibrate mice` on this floor"
         )
 
 

@@ -163,9 +163,8 @@ class _PlanarFilter:
             )
         if state.resolution.changes:
             yield (
-                f"all mice count {state.resolution.factor:.2f} times as much since a time before "
-                f"{state.resolution.time:.1f} s, compared with the gyro: their resolution was switched, and the path "
-                "since then was corrected"
+                f"in two turns in a row, all mice count {state.resolution.factor:.2f} times as much as before, found "
+                f"at {state.resolution.time:.1f} s by the gyro: their resolution was switched, or they slip in turns"
             )
         if state.turn_spread > _SPREAD**2:
             yield (
@@ -192,11 +191,11 @@ class _PlanarFilter:
 
     @property
     def scale_change(self) -> tuple[float, float]:
-        """Common factor of the mice's counts per metre relative to the rig, and its standard deviation."""
+        """Common factor of the mice's counts per metre in turns relative to the rig, and its standard deviation."""
         state, mice = self.state[0], len(self._rig.mouse)
         at = [int(MICE + OF_MOUSE * i + SCALE) for i in range(mice)]
-        mean = float(np.mean(state["mean"][at]))
-        return math.exp(-mean), math.sqrt(float(np.mean(state["covariance"][np.ix_(at, at)])))
+        factor = float(state.turn_factor * np.exp(-np.mean(state["mean"][at])))
+        return factor, math.sqrt(float(np.mean(state["covariance"][np.ix_(at, at)])))
 
     def _found(self, i: int) -> FoundMouse:
         state, mouse, at = self.state[0], self._rig.mouse[i], int(MICE + OF_MOUSE * i)

@@ -50,6 +50,9 @@ _LOST_STD, _VEERING_STD = 0.25, 5.0
 # much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
 # (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
 _RESOLVED_TURN, _RESOLVED_EQUAL, _RESOLVED_OFF, _STRAIGHT_RAD_S, _RESOLVED_STD = 0.3, 0.02, 0.2, 0.1, 0.01
+# On a straight, the velocity has jumped to this share, within so much of it: the resolution has changed there. Doubled:
+# a collision before a slip in turns may pass for another resolution.
+_JUMPED_EQUAL = 0.1
 _RESOLVED_LEAST = 0.15  # a smaller share: mice that are lifted or mounted the other way round show no jump of the gyro
 # A mouse that a jump of the gyro has excluded differs from the expected motion by less than this share, and velocity
 # (m/s). Doubled: with two mice, one that slips passes for a jump of the gyro.
@@ -135,7 +138,7 @@ def _nearly_sound(state: Record, m: Record, mice: Records) -> int:
 def _watch_resolution(state: Record, m: Record, by_mice: float) -> None:
     """Find another resolution of all mice, by the share of the gyro's turn that they show; `by_mice` is their rate."""
     seen, by_gyro = state.resolution, m.mean_rate - state.at.bias
-    if abs(by_gyro) < _STRAIGHT_RAD_S:
+    if not is_turning(state, m):
         if seen.square > _RESOLVED_TURN:
             _end_turn(state, m, seen.product / seen.square)
         seen.square = seen.product = 0.0
@@ -162,11 +165,8 @@ def _end_turn(state: Record, m: Record, share: float) -> None:
 @inner
 def _accept_resolution(state: Record, m: Record, share: float) -> None:
     """All mice count `share` times as much as before, from a time on since the last turn in which they did not."""
-    p = state.covariance
-    for a in range(MICE + SCALE, state.size, OF_MOUSE):
-        state.mean[a] -= math.log(share)
-        for b in range(MICE + SCALE, state.size, OF_MOUSE):
-            p[a, b] += _RESOLVED_STD**2
+    is_everywhere = abs(state.jumped_to - share) < _JUMPED_EQUAL * share
+    accept_share(state, share, _RESOLVED_STD, is_everywhere)
     position = complex(state.at.x, state.at.y)
     widen_way(state, 1.0 / share - 1.0, position - state.resolution.start)
     state.resolution.start = position
@@ -175,6 +175,44 @@ def _accept_resolution(state: Record, m: Record, share: float) -> None:
     state.resolution.factor, state.resolution.time = share, m.time
     restart_turns(state)
     agree(state)
+
+
+@inner
+def accept_share(state: Record, share: float, std: float, is_everywhere: bool) -> None:
+    """All mice show `share` times as much of the gyro's turns as their scale explains, with this σ of the share.
+
+    Either they count so much more everywhere (another floor, another resolution), or only in turns (they slip, or lose
+    the surface as it turns under them). Turns do not tell which. In turns, the whole share is corrected. On straights,
+    the scale is the mean of both causes, so that neither makes the path worse than without a correction, and half of
+    their difference is its σ. Where it `is_everywhere`, because it has shown on a straight too, the scale is corrected.
+    """
+    before = state.turn_factor
+    shown = share * shown_in_turns(state)
+    widen_way(state, state.straight_std, state.straight_way)
+    state.straight_way = 0j
+    if not is_everywhere:
+        state.turn_factor = 2.0 * shown / (1.0 + shown)
+        state.straight_std = abs(1.0 - shown) / (1.0 + shown)
+    for a in range(MICE + SCALE, state.size, OF_MOUSE):
+        state.mean[a] -= math.log(share * before / state.turn_factor)
+        for b in range(MICE + SCALE, state.size, OF_MOUSE):
+            state.covariance[a, b] += std * std
+
+
+@inner
+def shown_in_turns(state: Record) -> float:
+    """Counts per metre of all mice in turns, relative to the rig's."""
+    total, count = 0.0, 0.0
+    for a in range(MICE + SCALE, state.size, OF_MOUSE):
+        total += state.mean[a]
+        count += 1.0
+    return float(state.turn_factor * math.exp(-total / count))
+
+
+@inner
+def is_turning(state: Record, m: Record) -> bool:
+    """Whether the gyro shows a turn in the last step."""
+    return bool(abs(m.mean_rate - state.at.bias) >= _STRAIGHT_RAD_S)
 
 
 @inner
@@ -315,15 +353,22 @@ def _decide(state: Record, m: Record) -> None:
     by_mice = _cost_of_mice(dispute)
     variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
     is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
-    is_jump = is_jump and state.resolution.share > _RESOLVED_LEAST
+    is_jump = is_jump and state.resolution.share > _RESOLVED_LEAST and state.straight_std == 0.0
     if is_jump and abs(jump) < _MOST_RAD_S and jump * jump > _JUMP_Z**2 * (variance + state.covariance[BIAS, BIAS]):
         _accept_jump(state, m, jump, variance)
     elif by_jump - by_mice > _BETTER or (
         dispute.blocks > _PATIENCE_BLOCKS and min(by_jump, by_mice) > _MOST_CHI2 * dispute.blocks
     ):
-        lost = dispute.turn_off / (dispute.turn_square + 1.0 / _LOST_STD**2)
-        widen_way(state, min(abs(lost), 1.0), complex(state.at.x, state.at.y) - dispute.start)
-        agree(state)
+        refute_jump(state)
+
+
+@inner
+def refute_jump(state: Record) -> None:
+    """End the dispute with the pose of the gyro: the mice have erred since it began. The way is uncertain by it."""
+    dispute = state.dispute
+    lost = dispute.turn_off / (dispute.turn_square + 1.0 / _LOST_STD**2)
+    widen_way(state, min(abs(lost), 1.0), complex(state.at.x, state.at.y) - dispute.start)
+    agree(state)
 
 
 @inner

@@ -13,7 +13,15 @@ from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean
 from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.acceleration import forget, watch_acceleration
-from linkpose.filters.planar.gyro import agree, is_undecided, restart_turns, watch_gyro, widen_way
+from linkpose.filters.planar.gyro import (
+    accept_share,
+    agree,
+    is_turning,
+    is_undecided,
+    restart_turns,
+    watch_gyro,
+    widen_way,
+)
 from linkpose.filters.planar.limit import watch_limit
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
@@ -113,7 +121,7 @@ def _collect(state: Record, m: Record, mice: Records, rig: Records, sample: Reco
     state.always = state.rows
     if not m.step > 0.0:
         return
-    velocity, per_s = complex(state.at.vx, state.at.vy), 1.0 / m.step
+    velocity, per_s = complex(state.at.vx, state.at.vy), 1.0 / (m.step * state.grip)
     for i in range(m.count):
         if m.used >> i & 1:
             seen, place, mouse = state.seen[i], rig[i], mice[i]
@@ -160,10 +168,9 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
     varies = abs(latest - before) > _FLOOR_EQUAL * abs(off) or state.turn_spread > off * off
     if varies or not latest / off > 0.5 or _spread_of_turns(state, m, mice) > 0.5 * abs(off):
         return
-    for a in range(MICE + SCALE, state.size, OF_MOUSE):
-        for b in range(MICE + SCALE, state.size, OF_MOUSE):
-            state.covariance[a, b] += p.floor_scale**2
-        _restart(state, a + POSITION, a + OF_MOUSE, 0.0)
+    for at in range(MICE, state.size, OF_MOUSE):
+        _restart(state, at + POSITION, at + OF_MOUSE, 0.0)
+    accept_share(state, 1.0 + off, p.floor_scale, False)
     _correct_way(state, off)
     restart_turns(state)
     state.floors += 1
@@ -303,10 +310,13 @@ def _compare_turns(state: Record, off: float, by_scales: float) -> None:
 
 @inner
 def _correct_way(state: Record, off: float) -> None:
-    """The mice count by the share `off` too much; probably since the last turn in which they did not."""
+    """The mice count by the share `off` too much; probably since the last turn in which they did not.
+
+    On straights they may have counted right: half of it is corrected, as in `accept_share`.
+    """
     way = complex(state.at.x, state.at.y) - state.floor_start
-    state.at.x -= off * way.real
-    state.at.y -= off * way.imag
+    state.at.x -= 0.5 * off * way.real
+    state.at.y -= 0.5 * off * way.imag
     widen_way(state, off, way)
     state.floor_start = complex(state.at.x, state.at.y)
 
@@ -373,10 +383,11 @@ def _restart_spoilt(state: Record, excluded: int) -> None:
 @inner
 def _calibrate(state: Record, m: Record, mice: Records, rig: Records) -> None:
     """Give the fault tests the placement and the gyro bias as the filter has estimated them."""
+    state.grip = state.turn_factor if is_turning(state, m) else 1.0
     for i in range(m.count):
         error, place, mouse = state.at.mice[i], rig[i], mice[i]
         mouse.arm = arm(error, place)
-        scale = math.exp(error.scale)
+        scale = math.exp(error.scale) / state.grip
         mouse.axis = scaled(scale, turned(unit(error.angle), place.axis))
         mouse.metres_per_count = scale * place.metres_per_count
     m.bias = state.at.bias
@@ -427,9 +438,12 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
     state.shown = shown
     is_jump = square(shown - last) > limit * limit
     if state.unconfirmed_s > 0.0:
+        if state.unconfirmed_s < _SPREAD_S and not is_turning(state, m):
+            state.jumped_to = math.sqrt(square(shown) / square(state.held))
         state.unconfirmed_s += dt
         is_back = is_jump and square(state.held - shown) < square(state.held - last)
         if is_back:
+            state.jumped_to = 1.0
             _restore_way(state, shown)
         if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
             state.unconfirmed_s = -_SPREAD_S
@@ -506,7 +520,7 @@ def _add_systematic(state: Record, way: complex, before_m: float) -> float:
 
 
 @inner
-def _scatter_way(state: Record, p: Record, q: Record, dt: float, missed: float) -> None:
+def _scatter_way(state: Record, m: Record, p: Record, q: Record, dt: float, missed: float) -> None:
     """Noise that mice do not show: common to all of them, light slips, and what a robot does while samples are lost."""
     speed2 = state.at.vx**2 + state.at.vy**2
     unseen = 0.25 * _ACCEL_M_S2 * missed * missed
@@ -517,6 +531,8 @@ def _scatter_way(state: Record, p: Record, q: Record, dt: float, missed: float) 
         length = dt * math.sqrt(speed2)
         way = scaled(dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
         widen_way(state, q.slip * math.sqrt(q.slip_m / length), way)
+        if not is_turning(state, m):
+            state.straight_way += way
 
 
 @inner
@@ -570,7 +586,7 @@ def _step(
         state.restarts += 1
         _restart(state, X, state.size, 1.0)
         agree(state)
-    _scatter_way(state, p, q, dt, m.missed if m.step > 0.0 else 0.0)
+    _scatter_way(state, m, p, q, dt, m.missed if m.step > 0.0 else 0.0)
     _add_unconfirmed_way(state, m, dt)
     _add_saturated_way(state, m, dt)
     watch_limit(state, m, mice)
@@ -606,9 +622,12 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     lag = since + (0.5 * m.interval if math.isfinite(m.interval) else 0.0)
     by_scale, by_angle = _common_errors(state, m, mice)
     other = state.dispute.position - complex(at.x, at.y)
+    straight = scaled(state.straight_std, state.straight_way)
     spread, last = state.turn_spread, complex(at.x, at.y) - state.turn_end
-    x_variance = by_scale * out.x**2 + by_angle * out.y**2 + other.real**2 + spread * last.real**2
-    y_variance = by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2 + spread * last.imag**2
+    x_variance = by_scale * out.x**2 + by_angle * out.y**2 + other.real**2 + straight.real**2
+    x_variance += spread * last.real**2
+    y_variance = by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2 + straight.imag**2
+    y_variance += spread * last.imag**2
     out.x_std, out.y_std = _std(state, X, since, math.sqrt(x_variance)), _std(state, Y, since, math.sqrt(y_variance))
     out.heading_std = _std(state, HEADING, since, state.dispute.heading - at.heading)
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)

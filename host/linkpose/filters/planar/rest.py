@@ -12,7 +12,7 @@ import math
 
 from linkpose.compiling import inner
 from linkpose.filters.mice.state import Record
-from linkpose.filters.planar.gyro import explains, take_other_pose
+from linkpose.filters.planar.gyro import explains, refute_jump, take_other_pose
 from linkpose.filters.planar.measure import update
 from linkpose.filters.planar.state import BIAS, HEADING, QUEUE
 
@@ -186,6 +186,8 @@ def _use_oldest(state: Record) -> None:
             state.since_rest_s = _BLOCK_S
         _widen_heading(state, off)
         variance += off * off
+    else:
+        refute_jump(state)
     state.innovation[0, 0] = variance
     for k in range(state.size):
         state.cross[0, k] = state.covariance[BIAS, k]

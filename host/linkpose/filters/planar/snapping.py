@@ -13,6 +13,7 @@ from __future__ import annotations
 from linkpose.compiling import inner
 from linkpose.filters.mice.plane import scaled, square, turned
 from linkpose.filters.mice.state import Record, Records
+from linkpose.filters.planar.gyro import is_turning
 
 # Directions within this tangent of an axis may be snapped (drivers snap within 3 to 8°), with this σ as a share of the
 # motion along it. Doubled: a snapping mouse is found later, as fewer of its readings without counts are snapped.
@@ -31,7 +32,7 @@ _CERTAIN = 20.0
 def watch_snapping(state: Record, m: Record, mice: Records, sample: Record) -> None:
     """Find mice that snap, and replace what they lost in this step by the motion that is expected."""
     state.snapped = 0
-    if not (m.step > 0.0 and m.mean_rate == m.mean_rate) or state.at_rest:
+    if not (m.step > 0.0 and is_turning(state, m)) or state.at_rest:
         return
     velocity, turn_rate = complex(state.at.vx, state.at.vy), m.mean_rate - state.at.bias
     if m.turn_rate * turn_rate < _SHOWN_SHARE * turn_rate * turn_rate:  # the gyro's turn may be a jump of its bias

@@ -168,6 +168,11 @@ _FIELDS = [
     ("jump_time", "f8"),  # and when it was found (s)
     ("floor_start", "c16"),  # position after the last turn in which the mice showed the gyro's turn, in n (m)
     ("floors", "i8"),  # how often the floor has changed
+    # Turns in which all mice show another share of the gyro's turn than their calibration explains, see `gyro`.
+    ("turn_factor", "f8"),  # counts per metre in turns over those on straights
+    ("grip", "f8"),  # the same in the current step: 1 on a straight
+    ("straight_std", "f8"),  # of the scale on straights, as a share, by what the turns do not show of it
+    ("straight_way", "c16"),  # way on straights at this scale, in n (m)
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
     ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
@@ -178,6 +183,7 @@ _FIELDS = [
     ("held", "c16"),  # velocity before it, in the robot's axes (m/s)
     ("shown", "c16"),  # velocity of the last reading (m/s)
     ("earlier", "c16"),  # the filter's velocity before the last reading (m/s)
+    ("jumped_to", "f8"),  # speed after the last such change on a straight, as a share of that before it
     ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
     ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
     ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
@@ -302,7 +308,7 @@ def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
     state.gyro_variance, state.gyro_samples = p.noise_factor**2 * gyro_variance, 20.0
-    state.resolution.share = 1.0
+    state.resolution.share = state.turn_factor = state.grip = state.jumped_to = 1.0
     covariance = state.covariance
     for index, std in (
         *((k, 1e-6) for k in (X, Y, HEADING)),
