@@ -200,6 +200,15 @@ MORE: dict[str, dict[str, Producer]] = {
         "… line …: … needs …; complete or delete the row": events("0,odometry,1,,\n"),
         "… line …: … is not a number; correct or delete the row": events("0,odometry,fast,0,\n"),
         "… line …: the clock jumps back from … to … s; split the log at this line": events(TWICE),
+        "… line …: the beams reach from … to … rad, as if in degrees; multiply start angle, field of view and step by 0.0174533 to give radians": carmen(
+            "ROBOTLASER1 0 -90 180 1 80 0 0 3 1 1 1 0 0 0 0 0 0 0 0 0 0 0 0 1 a 1\n"
+        ),
+        "…: the ranges cannot be metres (median …); divide millimetres by 1000, or centimetres by 100": carmen(
+            "FLASER 3 2500 2600 2700 0 0 0 0 0 0 1 a 1\n"
+        ),
+        "…: the heading of the odometry …": carmen(
+            "".join(f"ODOM {math.cos(i / 9)} {math.sin(i / 9)} {-i / 9} 0 0 0 {i + 1} a 1\n" for i in range(60))
+        ),
         "standard input line …: the clock jumps back from … to … s; restart the stream": raises(
             lambda: list(Stream("ekf", LocalizationOptions(), BEACONS, print).rows([EVENTS, *TWICE.splitlines(True)]))
         ),

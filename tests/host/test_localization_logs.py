@@ -389,3 +389,44 @@ def test_a_clock_that_was_set_back_is_named_with_its_line(tmp_path):
     lines = "\n".join(map(format_reading, [*readings, *readings]))
     with pytest.raises(LinkposeError, match=r"line 31: the clock jumps back from 3.9 to 1 s"):
         read_log(written(tmp_path, lines + "\n", "a.log"))
+
+
+def winding_log(change, unit=1.0, angles="-1.5708 3.1416 0.0349066"):
+    """A minute along an S at 0.3 m/s, with 91 beams: `change` is of the odometry's pose, `unit` of the ranges."""
+    lines, x, y = [], 0.0, 0.0
+    for i in range(120):
+        heading = math.sin(0.1 * i)
+        x, y = x + 0.15 * math.cos(heading), y + 0.15 * math.sin(heading)
+        pose = " ".join(f"{value:.4f}" for value in change(x, y, heading))
+        ranges = " ".join(f"{unit * (1.0 + 0.02 * j):.3f}" for j in range(91))
+        lines.append(f"ODOM {pose} 0 0 0 {0.5 * i + 1} a 1")
+        lines.append(f"ROBOTLASER1 0 {angles} 80 0 0 91 {ranges} 0 {pose} {pose} 0 0 0 0 0 {0.5 * i + 1} a 1")
+        lines.append(f"FLASER 91 {ranges} {pose} {pose} {0.5 * i + 1.2} a 1")
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "reason"),
+    [
+        (lambda x, y, h: (x, y, h), {}, None),
+        (lambda x, y, h: (-x, -y, h), {}, None),  # drives backwards
+        (lambda x, y, h: (x, y, h + 40 * math.pi), {}, None),
+        (lambda x, y, h: (x, y, h), {"unit": 15.0}, None),
+        (lambda x, y, h: (x, y, h), {"unit": 1000.0}, "cannot be metres"),
+        (lambda x, y, h: (x, y, h), {"unit": 100.0}, "cannot be metres"),
+        (lambda x, y, h: (x, y, h), {"angles": "-90 180 2"}, "as if in degrees"),
+        (lambda x, y, h: (x, y, h), {"angles": "-1.5708 3.1416 2"}, "as if in degrees"),
+        (lambda x, y, h: (x, y, math.degrees(h)), {}, "is in degrees"),
+        (lambda x, y, h: (x, y, -h), {}, "has the other sign"),
+        (lambda x, y, h: (x, -y, h), {}, "has the other sign"),
+        (lambda x, y, h: (y, x, h), {}, "exchange"),
+    ],
+)
+def test_carmen_logs_in_other_units_and_axes_are_named(tmp_path, change, options, reason):
+    """They were searched for in the map scan by scan, for minutes, and failed with a sentence on the map."""
+    path = written(tmp_path, winding_log(change, **options), "a.log")
+    if reason is None:
+        assert len(read_log(path).events) == 480
+        return
+    with pytest.raises(LinkposeError, match=reason):
+        read_log(path)

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.localization.carmen_units import check_beam_angles, check_headings, check_ranges
 from linkpose.localization.events import Event, Log, LogFile, Scan, check_clock, in_order, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
@@ -67,7 +68,7 @@ def read_carmen(path: Path, lines: Sequence[str]) -> LogFile:
 
     Lines of other sensors are passed over. Lines that are not in order of time are sorted, lines without a time (0) and
     a last line that is cut short are left out; `remarks` has the counts. Raises LinkposeError with file, line and cure
-    for a damaged line.
+    for a damaged line, and for a log in other units or axes.
     """
     readings: list[Reading] = []
     remarks: list[str] = []
@@ -90,6 +91,8 @@ def read_carmen(path: Path, lines: Sequence[str]) -> LogFile:
     scans = [reading for reading in timed if reading.ranges_m is not None]
     check_clock([scans, [reading for reading in timed if reading.ranges_m is None]], path)
     ordered, moved = in_order(timed)
+    check_ranges([reading.ranges_m for reading in ordered if reading.ranges_m is not None], path)
+    check_headings(np.array([reading.odometry for reading in ordered]), path)
     if moved:
         remarks.append(f"{path}: {counted(moved, 'line')} moved into the order of time")
     return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks), is_carmen=True)
@@ -171,6 +174,7 @@ def _read_line(path: Path, number: int, words: list[str]) -> Reading:
     n = line.count(8)
     after = 10 + n + line.count(9 + n)
     line.require(after + 12)
+    check_beam_angles(line.number(2), line.number(4), n, path, number)
     angles = line.number(2) + line.number(4) * np.arange(n, dtype=np.float64)
     ranges, longest = line.ranges(9, n), line.number(5)
     return Reading(line.number(after + 11), line.pose(after + 3), ranges, angles, line.pose(after), longest, number)
