@@ -1,15 +1,16 @@
 """Peers of `linkpose localize` among beacons: filterpy's extended Kalman filter, and GTSAM's batch optimum.
 
 Both get the log, the positions of the beacons and the noises that linkpose uses, and estimate scale and bias of the
-ranges where linkpose does; a drift of the ranges, which linkpose estimates, is a part of their white noise here. The
-batch optimum has Cauchy's loss against outliers.
+ranges where linkpose does. A drift of the ranges, which linkpose estimates, is a part of their white noise in the
+peers, and in a second batch optimum a Gauss-Markov process of each beacon, as in linkpose. The batch optimum has
+Cauchy's loss against outliers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 GATE = 3.0  # standard deviations: a usual choice of a user of filterpy
 CAUCHY = 2.0  # standard deviations
 ITERATIONS = 60
+SMALLEST_DRIFT_M = 1e-6  # standard deviation of a step of a drift between two ranges of one instant
 EXACT_M = 1e-4  # standard deviation of a place that is known
 
 
@@ -172,9 +174,16 @@ def filterpy_path(problem: Problem) -> tuple[Floats, Floats]:
     return np.array([step.time_s for step in problem.steps]), np.array(path)
 
 
-def gtsam_path(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
-    """Times (N,) and positions (N, 2) of the batch optimum (Levenberg-Marquardt), from states `guess` (N, n)."""
-    if problem.form == "odometry" and not problem.constants:
+def gtsam_path(problem: Problem, guess: Floats, with_drift: bool = False) -> tuple[Floats, Floats]:
+    """Times (N,) and positions (N, 2) of the batch optimum (Levenberg-Marquardt), from states `guess` (N, n).
+
+    With `with_drift`, the drift of the ranges is estimated, and no part of their white noise.
+    """
+    drifts: _Drifts | None = None
+    if with_drift:
+        drifts = _Drifts(problem.settings)
+        problem = replace(problem, settings=replace(problem.settings, drift_std_m=0.0))
+    elif problem.form == "odometry" and not problem.constants:
         return _gtsam_native(problem, guess)
     import gtsam
 
@@ -197,9 +206,37 @@ def gtsam_path(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
             robust = gtsam.noiseModel.Robust.Create(
                 gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY), gtsam.noiseModel.Diagonal.Sigmas(std)
             )
-            graph.add(gtsam.CustomFactor(robust, [keys[i], shared] if k else [keys[i]], _range_error(problem, event)))
+            seen = [keys[i], *([shared] if k else []), *([drifts.of(event, graph, values)] if drifts else [])]
+            graph.add(gtsam.CustomFactor(robust, seen, _range_error(problem, event)))
     best = _optimum(graph, values)
     return np.array([step.time_s for step in problem.steps]), np.array([best.atVector(key)[:2] for key in keys])
+
+
+class _Drifts:
+    """The drifts of the ranges in a graph: a variable for each range, a Gauss-Markov process for each beacon."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.std_m, self.rate = settings.drift_std_m, 1.0 / settings.drift_time_s
+        self.last: dict[str, tuple[int, float]] = {}
+        self.count = 0
+
+    def of(self, event: Event, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> int:
+        """Adds the variable of this range, and returns its key."""
+        import gtsam
+
+        key = gtsam.symbol("d", self.count)
+        self.count += 1
+        values.insert(key, np.zeros(1))
+        before = self.last.get(event.beacon)
+        if before is None:
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, self.std_m)))
+        else:
+            left = math.exp(-self.rate * (event.time_s - before[1]))
+            std = self.std_m * math.sqrt(1.0 - left * left) + SMALLEST_DRIFT_M
+            noise = gtsam.noiseModel.Isotropic.Sigma(1, std)
+            graph.add(gtsam.CustomFactor(noise, [before[0], key], _drift_error(left)))
+        self.last[event.beacon] = key, event.time_s
+        return int(key)
 
 
 def _gtsam_native(problem: Problem, guess: Floats) -> tuple[Floats, Floats]:
@@ -262,14 +299,30 @@ def _motion_error(problem: Problem, step: Step) -> Error:
     return error
 
 
-def _range_error(problem: Problem, event: Event) -> Error:
+def _drift_error(left: float) -> Error:
     def error(factor: object, values: object, slopes: list[Floats] | None) -> Floats:
-        state, *constants = (values.atVector(key) for key in factor.keys())  # type: ignore[attr-defined]  # noqa: SIM118 (a list, not a mapping)
-        residual, by_state, by_constants, _ = problem.sighting(event, state, constants[0] if constants else np.zeros(0))
+        before, after = (values.atVector(key) for key in factor.keys())  # type: ignore[attr-defined]  # noqa: SIM118 (a list, not a mapping)
         if slopes is not None:
-            slopes[0] = -by_state
-            if constants:
-                slopes[1] = -by_constants
+            slopes[0], slopes[1] = np.array([[-left]]), np.eye(1)
+        return np.asarray(after - left * before)
+
+    return error
+
+
+def _range_error(problem: Problem, event: Event) -> Error:
+    """The error by the state, the constants where there are any, and the drift where it is estimated."""
+    k = len(problem.constants)
+
+    def error(factor: object, values: object, slopes: list[Floats] | None) -> Floats:
+        state, *others = (values.atVector(key) for key in factor.keys())  # type: ignore[attr-defined]  # noqa: SIM118 (a list, not a mapping)
+        constants = others.pop(0) if k else np.zeros(0)
+        residual, by_state, by_constants, _ = problem.sighting(event, state, constants)
+        if slopes is not None:
+            found = [-by_state, *([-by_constants] if k else []), *(-np.eye(len(residual), 1) for _ in others)]
+            for i, slope in enumerate(found):
+                slopes[i] = slope
+        for drift in others:
+            residual[0] -= drift[0]
         return residual
 
     return error

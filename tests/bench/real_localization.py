@@ -288,9 +288,11 @@ def peers(case: Case, batch: bool) -> Iterable[dict[str, object]]:
     elif problem.form == "none":
         columns += [np.gradient(column, time_s) for column in columns]
     ours = score(time_s, np.column_stack(columns[:2]), None, truth).position_rmse_m
-    time_s, path = gtsam_path(problem, np.column_stack(columns))
-    optimum = score(time_s, path, None, truth).position_rmse_m
-    yield {"filter": "gtsam batch optimum", "position_rmse_m": optimum, "smoothed_over_optimum": ours / optimum}
+    for with_drift in (False, True) if settings.drift_std_m else (False,):
+        time_s, path = gtsam_path(problem, np.column_stack(columns), with_drift)
+        optimum = score(time_s, path, None, truth).position_rmse_m
+        name = "gtsam batch optimum" + (" with the drift" if with_drift else "")
+        yield {"filter": name, "position_rmse_m": optimum, "smoothed_over_optimum": ours / optimum}
 
 
 def main() -> None:

@@ -209,6 +209,7 @@ def test_a_map_that_the_scans_fit_only_mirrored_or_at_another_scale_is_named():
     mirrored: Log = [replace(scan, ranges_m=scan.ranges_m[::-1]) for scan in scans]
     for log, wrong, words in (
         (mirrored, grid, "mirrored"),
+        ([replace(scan, ranges_m=scan.ranges_m / 0.3048) for scan in scans], grid, "3.28 times as large, unless"),
         (list[Event | Scan](scans[:1]), of_half_the_size(grid), "twice as large"),
     ):
         with pytest.raises(MapMismatch, match=f"if the map is {words}") as raised:
@@ -229,9 +230,9 @@ def test_a_map_of_another_place_and_an_odometry_that_contradicts_the_scans_are_n
     assert "check whether the map is of this place" in check_map(elsewhere, grid, 0.2, "a.log")
 
 
-def winding(late_s: float, speed: float, turn: float) -> tuple[Log, Track]:
+def winding(late_s: float, speed: float, turn: float, beside_deg: float = 0.0) -> tuple[Log, Track]:
     """Half a minute of a path that winds, and 5 scans/s that err by 0.01 m and 0.3 degrees. They are stamped so much
-    later than the odometry, at 20 Hz, whose columns are multiplied by `speed` and `turn`.
+    later than the odometry, at 20 Hz, whose columns are multiplied by `speed` and `turn`, and lead beside the heading.
     """
     rng = np.random.default_rng(8)
     fine = np.arange(0.0, 30.0, 0.01)
@@ -245,6 +246,7 @@ def winding(late_s: float, speed: float, turn: float) -> tuple[Log, Track]:
     times = np.arange(1.0, 29.0, 0.2)
     log += [Scan(float(t), np.ones(9), np.linspace(-1.0, 1.0, 9), (0.0, 0.0, 0.0), 80.0) for t in times]
     poses = np.column_stack([np.interp(times - late_s, fine, column) for column in (x, y, heading)])
+    poses[:, 2] -= math.radians(beside_deg)
     state = poses + rng.normal(0.0, (0.01, 0.01, 0.005), poses.shape)
     covariance = np.tile(np.diag((1e-4, 1e-4, 2e-5)), (len(times), 1, 1))
     track = Track(("x_m", "y_m", "heading_rad"), times, state, covariance, 1, 0, frozenset(), 0)
@@ -269,5 +271,15 @@ def test_a_clock_a_sign_and_a_unit_of_the_odometry_that_the_scans_contradict_are
 ) -> None:
     """The filter follows the scans, so that all of them passed in silence; a late scan moves the path."""
     found = scan_doubts(*winding(late_s, speed, turn))
+    assert len(found) == (1 if sentence else 0), found
+    assert all(re.search(sentence, remark) for remark in found)
+
+
+@pytest.mark.parametrize(
+    ("beside_deg", "sentence"), [(3.0, ""), (10.0, "10 degrees to the left"), (-90.0, "90 .* right")]
+)
+def test_a_laser_whose_direction_is_not_the_stated_one_is_named(beside_deg: float, sentence: str) -> None:
+    """Its path fitted the map with a wrong heading, in silence."""
+    found = scan_doubts(*winding(0.0, 1.0, 1.0, beside_deg))
     assert len(found) == (1 if sentence else 0), found
     assert all(re.search(sentence, remark) for remark in found)

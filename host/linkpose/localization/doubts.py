@@ -32,6 +32,7 @@ _STEP_S, _LAGS_S, _LEAST_LAG_S, _CLEARER, _FEWEST_STEPS = 0.2, np.arange(-50, 51
 # The odometry contradicts the scans where its motion is less than _LEAST_FACTOR or more than 1 / _LEAST_FACTOR of
 # theirs, and both belong together (correlation beyond _RELATED): wheels slip and floors differ by a few tenths.
 _LEAST_FACTOR, _RELATED = 0.6, 0.5
+_LEAST_DEG = 5.0  # between motion and heading, which wheels do not have; less may be a laser that was put on by hand
 
 
 def doubts(log: Log, settings: Settings, track: Track, free: tuple[str, ...]) -> list[str]:
@@ -72,12 +73,14 @@ def _on_odometry(name: str, unit: str, error: float, size: float) -> str:
 class _Steps(NamedTuple):
     """The motion between scans whose pose is known, and the odometry's own.
 
-    `ahead` (m) and `turned` (rad) (n,) are those between the times `time_s` (n + 1,), where `is_whole` (n,): no gap, no
-    jump. `way` (m) and `heading` (rad) (m,) are what the odometry has driven and turned until the times `odometry_s`.
+    `ahead`, `left` (m) and `turned` (rad) (n,) are those between the times `time_s` (n + 1,), where `is_whole` (n,): no
+    gap, no jump. `way` (m) and `heading` (rad) (m,) are what the odometry has driven and turned until the times
+    `odometry_s`.
     """
 
     time_s: Floats
     ahead: Floats
+    left: Floats
     turned: Floats
     is_whole: NDArray[np.bool_]
     odometry_s: Floats
@@ -104,6 +107,7 @@ def scan_doubts(log: Log, track: Track) -> list[str]:
             "times of the scans, the path is off by as much as the robot moves in that time)"
         )
     times = steps.time_s - lag
+    found += _on_direction(steps, np.diff(np.interp(times, steps.odometry_s, steps.way)))
     for verb, scans, total in (("drives", steps.ahead, steps.way), ("turns", steps.turned, steps.heading)):
         odometry = np.diff(np.interp(times, steps.odometry_s, total))
         found += _on_scale(verb, scans[steps.is_whole], odometry[steps.is_whole])
@@ -125,6 +129,7 @@ def _steps(log: Log, track: Track) -> _Steps | None:
     moved, turned = np.diff(track.position_m[chosen, :2], axis=0), wrapped(np.diff(heading))
     middle = heading[:-1] + 0.5 * turned
     ahead = moved[:, 0] * np.cos(middle) + moved[:, 1] * np.sin(middle)
+    left = moved[:, 1] * np.cos(middle) - moved[:, 0] * np.sin(middle)
     gaps = np.diff(times)
     is_whole = (gaps < 2.0 * np.median(gaps) + 1e-6) & (np.abs(turned) < 1.0)
     odometry_s = np.array([event.time_s for event in driven])
@@ -134,7 +139,7 @@ def _steps(log: Log, track: Track) -> _Steps | None:
     is_whole &= (times[:-1] > odometry_s[0] + reach) & (times[1:] < odometry_s[-1] - reach)
     if is_whole.sum() < _FEWEST_STEPS:
         return None
-    return _Steps(times, ahead, turned, is_whole, odometry_s, way, angle)
+    return _Steps(times, ahead, left, turned, is_whole, odometry_s, way, angle)
 
 
 def _lag(steps: _Steps) -> float:
@@ -145,6 +150,20 @@ def _lag(steps: _Steps) -> float:
     return best if is_clear and abs(best) >= _LEAST_LAG_S else 0.0
 
 
+def _on_direction(steps: _Steps, driven: Floats) -> list[str]:
+    """What is wrong with the direction of a laser whose path leads beside the heading; wheels have `driven` (n,)."""
+    whole = steps.is_whole
+    ahead, left = float(np.sum((steps.ahead * driven)[whole])), float(np.sum((steps.left * driven)[whole]))
+    size = float(np.sqrt(np.sum((steps.ahead**2 + steps.left**2)[whole]) * np.sum(driven[whole] ** 2)))
+    angle = np.degrees(np.arctan2(left, ahead))
+    if np.hypot(ahead, left) < _RELATED * size or not _LEAST_DEG < abs(angle) < 180.0 - _LEAST_DEG:
+        return []
+    return [
+        f"the robot moves {abs(angle):.0f} degrees to the {'left' if angle > 0.0 else 'right'} of its heading: the "
+        "beams' start angle, or the laser's direction on the robot, is wrong by as much"
+    ]
+
+
 def _on_scale(verb: str, scans: Floats, odometry: Floats) -> list[str]:
     """What is wrong with the sign or the unit of an odometry that `verb` by so much in each step, unlike the scans."""
     size = float(np.sqrt(np.sum(scans**2) * np.sum(odometry**2)))
@@ -152,7 +171,10 @@ def _on_scale(verb: str, scans: Floats, odometry: Floats) -> list[str]:
     if abs(related) < _RELATED:
         return []
     if related < 0.0:
-        return [f"the odometry {verb} the other way than the scans: check the sign of that column"]
+        return [
+            f"the odometry {verb} the other way than the scans: check the sign of that column, and the direction "
+            "of the laser and the order of its beams"
+        ]
     factor = float(np.sum(odometry**2) / np.sum(scans * odometry))
     if _LEAST_FACTOR < factor < 1.0 / _LEAST_FACTOR:
         return []

@@ -35,6 +35,10 @@ UNCHANGED = (1.0, 1.0, 1.0, 1.0, 1.0)
 CHANGES = (
     _Change("mirrored; flip the map's image, or reverse the order of the laser's beams", (1.0, -1.0, 1.0, -1.0, 1.0)),
     _Change("half as large; correct the resolution in its YAML file", (2.0, 2.0, 1.0, 1.0, 2.0)),
+    _Change(
+        "3.28 times as large, unless the ranges are in feet; correct the resolution in its YAML file",
+        (0.3048, 0.3048, 1.0, 1.0, 0.3048),
+    ),
     _Change("twice as large; correct the resolution in its YAML file", (0.5, 0.5, 1.0, 1.0, 0.5)),
 )
 
