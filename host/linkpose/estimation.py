@@ -120,7 +120,7 @@ class Estimator:
     def _set_columns(self) -> None:
         self.columns = ["time_s", *(column for f in self.filters for column in f.columns)]
         self._decimals = np.array([_decimals(name) for name in self.columns], dtype=np.int64)
-        self.excluded = ExcludedMice(self.columns)
+        self._excluded = ExcludedMice(self.columns)
 
     @property
     def rig(self) -> Rig:
@@ -175,8 +175,21 @@ class Estimator:
             with ThreadPoolExecutor(workers) as pool:
                 parts = list(pool.map(lambda f: f.process(block), self.filters))
         estimates = side_by_side(block.time_s, parts)
-        self.excluded.count(block, estimates)
+        self.count_excluded(block, estimates)
         return estimates
+
+    def count_excluded(self, block: Measurements, estimates: Floats) -> None:
+        """Counts the mice that the filters exclude in the estimates (N, columns) of a block of N samples."""
+        self._excluded.count(block, estimates)
+
+    @property
+    def excluded(self) -> ExcludedMice:
+        """The mice that were excluded so far, by the columns that show it, or else by the first filter that does it."""
+        if not self._excluded.columns:
+            for f in self.filters:
+                if isinstance(f, filters.ExcludesMice):
+                    return f.excluded_mice
+        return self._excluded
 
     @property
     def found_j2s(self) -> FoundJ2s | None:

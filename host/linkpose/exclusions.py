@@ -7,6 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from linkpose import quantities
 from linkpose.sensors.health import LEFT_OUT
@@ -56,8 +57,9 @@ class ExcludedMice:
     For each: samples, time of the first one and total time (s), and whether it is excluded at the last sample.
     """
 
-    def __init__(self, estimator_columns: Sequence[str]) -> None:
-        self._columns = [
+    def __init__(self, estimator_columns: Sequence[str] = ()) -> None:
+        """`estimator_columns` are those of the estimates that `count` takes."""
+        self.columns = [
             at for at, name in enumerate(estimator_columns) if name.endswith(f"_{quantities.EXCLUDED.name}")
         ]
         self.samples: dict[str, int] = {}  # "mouse1", ... -> samples
@@ -68,10 +70,15 @@ class ExcludedMice:
 
     def count(self, block: Measurements, estimates: Floats) -> None:
         """Count the exclusions in the estimates (N, columns) of a block of N samples."""
-        if not self._columns or not len(block):
+        if self.columns:
+            masks = np.nan_to_num(estimates[:, self.columns]).astype(np.int64)
+            self.add(block, np.bitwise_or.reduce(masks, axis=1))
+
+    def add(self, block: Measurements, masks: NDArray[np.int64]) -> None:
+        """Count the exclusions in bit masks (N,) of the samples of a block; bit 0 is mouse 1."""
+        if not len(block):
             return
         last_s, self._last_s = self._last_s, float(block.time_s[-1])
-        masks = np.bitwise_or.reduce(np.nan_to_num(estimates[:, self._columns]).astype(np.int64), axis=1)
         self.now = set()
         if not masks.any():
             return

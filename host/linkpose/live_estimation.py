@@ -68,7 +68,7 @@ class LiveEstimator:
             return self._rows(0, 0)
         rows, first = self._rows(0, count), 0
         for block in self._blocks[:count]:
-            self._estimator.excluded.count(block, rows[first : first + len(block)])
+            self._estimator.count_excluded(block, rows[first : first + len(block)])
             first += len(block)
         del self._blocks[:count]
         for results in self._results:

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from linkpose.cli.cures import cure
 from linkpose.cli.evaluate import command
 from linkpose.errors import LinkposeError, TooFewRows
+from linkpose.evaluation.mismatches import mismatches
 from linkpose.evaluation.scores import evaluate
 from linkpose.evaluation.statistics import Statistics
 from linkpose.recording.table import Table
@@ -208,6 +209,8 @@ def test_the_command_prints_figures_verdicts_and_rows(tmp_path):
 
 SWAY = 0.3 * np.sin(2 * T) + 0.1 * np.sin(0.7 * T)
 SCALED = {
+    "feet": ("height_m", lambda v: v / 0.3048, "height_m moves like the estimate of joint in", "times 3.281"),
+    "yaw in radians": ("yaw_deg", np.radians, "yaw_deg moves like", "times 0.01745"),
     "millimetres": ("height_m", lambda v: 1000 * v, "height_m moves like the estimate of joint in", "times 1000"),
     "twice": ("height_m", lambda v: 2 * v, "height_m moves like", "times 2:"),
     "radians": ("roll_deg", np.radians, "roll_deg moves like", "times 0.01745"),
@@ -221,7 +224,8 @@ SCALED = {
 def test_a_column_in_another_unit_is_named(name):
     column, change, *words = SCALED[name]
     yaw = np.radians(40)  # the reference counts the yaw from elsewhere
-    motion = {"height_m": SWAY, "roll_deg": 20 * SWAY, "pitch_deg": 3 * np.cos(T), "yaw_deg": 5 * np.sin(T)}
+    turning = (180 + 40 * np.sin(T)) % 360 - 180  # beyond half a turn and back
+    motion = {"height_m": SWAY, "roll_deg": 20 * SWAY, "pitch_deg": 3 * np.cos(T), "yaw_deg": turning}
     paths = {"x_m": SWAY, "y_m": 0.2 * np.cos(3 * T)}
     turned = {
         "x_m": np.cos(yaw) * paths["x_m"] - np.sin(yaw) * paths["y_m"],
@@ -233,7 +237,7 @@ def test_a_column_in_another_unit_is_named(name):
     columns = ("x_m", "y_m") if column == "x_m" else (column,)
     theirs |= {key: change(theirs[key]) for key in columns}
     found = " ".join(evaluate(ours, table("truth", **theirs)).remarks)
-    assert all(word in found for word in words), found
+    assert all(word in found for word in words) and "are they of the same run" not in found, found
 
 
 def test_a_negative_sigma_is_refused():
@@ -270,6 +274,51 @@ def test_odometry_and_a_truth_with_other_times_are_named(seconds):
     found = evaluate(ours, theirs).remarks
     assert any("hardly any motion in common" in remark for remark in found) == (seconds == 2)
     assert seconds == 2 or not found
+
+
+@pytest.mark.parametrize("factor", [1, 1e3, 1e6])
+@pytest.mark.parametrize("is_ours", [True, False])
+def test_times_in_another_unit_are_named(factor, is_ours):
+    """Seven instants were compared, and their errors reported, in silence."""
+    right, wrong = (
+        Table(Path("file.csv"), kind, {"time_s": t}, {}, None, 2)
+        for kind, t in (("truth", T), ("truth", factor * (T + 1.7)))
+    )
+    ours, theirs = (wrong, right) if is_ours else (right, wrong)
+    ours.columns["joint_height_m"] = theirs.columns["height_m"] = motion()
+    named = [remark for remark in mismatches(ours, theirs, {}, 0.0, np.inf) if "time_s spans" in remark]
+    assert len(named) == (factor > 1)
+    assert all(f"divide it by {factor:.0f}" in remark for remark in named)
+
+
+PATH = {"x_m": np.sin(T) + 0.1 * T, "y_m": np.cos(1.7 * T)}
+
+
+@pytest.mark.parametrize(
+    ("theirs", "is_mirrored"),
+    [
+        (PATH, False),
+        ({"x_m": -PATH["y_m"], "y_m": PATH["x_m"]}, False),
+        ({"x_m": PATH["y_m"], "y_m": PATH["x_m"]}, True),
+        ({"x_m": -PATH["x_m"], "y_m": PATH["y_m"]}, True),
+        ({"x_m": PATH["x_m"], "y_m": 0 * T}, False),
+    ],
+    ids=["right", "turned", "exchanged", "reversed", "a line"],
+)
+def test_a_mirrored_path_is_named(theirs, is_mirrored):
+    ours = table(**{f"joint_{name}": value + 1e-3 * NOISE for name, value in PATH.items()}, joint_height_m=motion())
+    found = evaluate(ours, table("truth", height_m=motion(), **theirs)).remarks
+    assert any("the path is the mirror image of that of joint" in remark for remark in found) == is_mirrored
+
+
+@pytest.mark.parametrize(
+    ("name", "named"), [("roll_rad", True), ("roll_deg", False), ("roll", False), ("troll_rad", False)]
+)
+def test_a_column_with_the_name_of_another_unit_is_named(name, named):
+    """It was passed over in silence."""
+    ours = table(joint_height_m=motion(), joint_roll_deg=20 * SWAY)
+    found = evaluate(ours, table("truth", height_m=motion(), **{name: 20 * SWAY})).remarks
+    assert found == ["truth.csv: roll_rad is not compared: state it in °, in a column roll_deg"] * named
 
 
 def test_a_heading_in_degrees_is_named():

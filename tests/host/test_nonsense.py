@@ -124,6 +124,8 @@ FAST = [
         lambda table: table.update({f"accel_{a}_m_s2": 0 * table["time_s"] + 3 for a in "xyz"}),
         "is the same in all rows while",
     ),
+    (scale(0.0, "accel_x"), "accel_x is 0 in all rows: the accelerometer gives no reading there"),
+    (scale(0.0, "accel_z"), "accel_z is 0 in all rows: the accelerometer gives no reading there"),
 ]
 
 
@@ -136,6 +138,7 @@ FAST = [
         "one axis twice", "one axis half", "one axis of the gyro twice", "one axis of the gyro half",
         "one axis in km/s²", "one axis of the gyro in krad/s", "one axis in g",
         "one axis of the gyro ten times", "one axis of the gyro a tenth", "one axis in degrees", "no accel",
+        "no accel_x", "no accel_z",
     ],
 )  # fmt: skip
 def test_a_fast_swing_shows_whether_gyro_and_accelerometer_agree(change, sentence: str | None) -> None:
@@ -209,6 +212,10 @@ WRONG = [
     (scale(10.0, "time"), "multiply time_s by 0.1"),
     (scale(1 / 133.322, "pressure"), "is it in mmHg? multiply it by 133.322"),
     (scale(0.01, "pressure"), "is it in hPa? multiply it by 100"),
+    (scale(1 / 6894.757, "pressure"), "is it in psi? multiply it by 6894.757"),
+    (scale(1 / 3386.389, "pressure"), "is it in inHg? multiply it by 3386.389"),
+    (scale(1e-5, "pressure"), "is it in bar? multiply it by 100000"),
+    (scale(100.0, "pressure"), "is it in hundredths of Pa? multiply it by 0.01"),
     (scale(0.5, "pressure"), "pressure_Pa is 50650 (median), as above 5100 m of altitude"),
     (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
 ]
@@ -231,6 +238,10 @@ WRONG = [
         "time",
         "mmHg",
         "hPa",
+        "psi",
+        "inHg",
+        "bar",
+        "hundredths",
         "half the pressure",
         "thousands",
     ],

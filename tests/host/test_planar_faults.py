@@ -12,10 +12,12 @@ import pytest
 from robot_counts import DEG, LEGS, TRIANGLE, Robot, counts, drawn_legs, forces, gyro, measurements, rig, robot
 
 from linkpose import estimate
+from linkpose.estimation import Estimator
 from linkpose.experiments.planar import PlanarRun, baseline, pose_error
 from linkpose.filters.mice import MiceFilter
 from linkpose.filters.planar import PlanarEkf
 from linkpose.rotations import wrapped
+from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
 
@@ -399,6 +401,24 @@ def test_remarks_of_an_estimate_name_a_mouse_that_is_left_out():
     with pytest.warns(UserWarning, match=r"mouse 2 was left out for .* counted nothing"):
         found = estimate(measurements(run, wrong, gyro(run)), filters=["mice", "planar-ekf"], rig=rig())
     assert any("mouse 2 was left out" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("block", [1, 7, 4000])
+def test_a_planar_filter_alone_counts_the_mice_that_it_leaves_out(block):
+    """Only the filter `mice` has a column for them: without it, `estimate` said nothing."""
+    run = robot(4)
+    wrong = counts(run)
+    wrong[:, 1] = 2.0 * wrong[:, 1]
+    measured = measurements(run, wrong, gyro(run))
+    alone, both = (Estimator(names, rig(), Sensors.MPU6050, 3) for names in (["planar-ekf"], ["planar-ekf", "mice"]))
+    for first in range(0, len(measured), block):
+        alone.process(measured[first : first + block])
+    both.process(measured)
+    found, of_column = alone.excluded, both.excluded
+    assert list(found.samples) == list(of_column.samples) == ["mouse2"] and found.now == {"mouse2"}
+    assert found.total_s["mouse2"] == pytest.approx(of_column.total_s["mouse2"], rel=0.1)
+    assert found.first_s["mouse2"] == pytest.approx(of_column.first_s["mouse2"], abs=2.0)
+    assert alone.outcome["excluded_mice"] == found.samples
 
 
 def test_a_mouse_elsewhere_than_the_rig_file_states_is_found_by_the_turns():

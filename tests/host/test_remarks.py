@@ -423,6 +423,9 @@ REMARKS: dict[str, str | Producer] = {
     "…: … is the same wherever the estimates move: check the column and the times": compared(
         moving("time_s,tilt_height_m"), moving("time_s,height_m", 0.0)
     ),
+    "…: time_s spans … s, and in … … s: is it in …? divide it by …": "test_evaluation_sigma.py::test_times_in_another_unit_are_named",
+    "…: the path is the mirror image of that of …: were x_m and y_m exchanged, or is the sign of one of them wrong?": "test_evaluation_sigma.py::test_a_mirrored_path_is_named",
+    "…: … is not compared: state it in …, in a column …": "test_evaluation_sigma.py::test_a_column_with_the_name_of_another_unit_is_named",
     "…: … are no rotation, whose length is 1: check these columns": "test_evaluation_sigma.py::test_a_quaternion_that_is_no_rotation_is_named",
     "…: markers left out as unlabeled: …": "test_evaluation.py::test_an_unlabeled_marker_is_left_out_and_said",
     "…: markers left out: …": take(four_markers(), "a.trc"),

@@ -7,9 +7,24 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from linkpose.evaluation.scoring import LINK, Compared
-from linkpose.evaluation.series import Pair, paired
+from linkpose.evaluation.series import Pair, interval, paired
 from linkpose.evaluation.takes import MOTION_CAPTURE
-from linkpose.quantities import ANGLE, CHAIN_ROTATION, HEADING, PITCH, ROLL, VX, VY, WZ, YAW, Quantity, X, Y
+from linkpose.quantities import (
+    ANGLE,
+    CHAIN_ROTATION,
+    HEADING,
+    PITCH,
+    ROLL,
+    VX,
+    VY,
+    WZ,
+    YAW,
+    Quantity,
+    X,
+    Y,
+    by_filter,
+    unit_text,
+)
 from linkpose.recording.table import Table
 from linkpose.sensors.measurements import Floats
 
@@ -20,8 +35,14 @@ _MIRRORED = 0.8  # correlation, negated
 # their motions is within _NEAR of one of _UNITS. Errors of estimates by a tenth change the correlation by 0.005.
 _ALIKE = 0.98
 _NEAR = 0.05
-_UNITS = (0.5, 2.0, np.pi / 180, 180 / np.pi, 0.001, 1000.0, 0.01, 100.0, -1.0)
+_FOOT, _INCH, _DEGREE = 0.3048, 0.0254, np.pi / 180
+_UNITS = (0.5, 2.0, _DEGREE, 1 / _DEGREE, 0.001, 1000.0, 0.01, 100.0, _FOOT, 1 / _FOOT, _INCH, 1 / _INCH, -1.0)
 _LENGTH, _FEW_OUTSIDE = 0.01, 0.9  # of a quaternion: files with 3 decimals are off by 0.001; share of rows within
+_TIME_UNITS = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
+# By how much the spans of a run's two files may differ, and a step that is too long for a motion: runs that are sampled
+# so seldom, and whose spans differ by a factor of 900 to 1100, are rare.
+_SAME_SPAN, _LONG_STEP_S = 0.1, 0.5
+_OTHER_UNITS = ("m", "cm", "mm", "km", "ft", "in", "deg", "rad", "cm_s", "mm_s", "km_h", "deg_s", "rad_s")
 _STILL = 1e-3  # share of the estimate's motion; errors of a still reference are far below it
 _FEWEST = 20  # instants; fewer correlate by chance
 _MOVES_RAD, _MOVES_M = 0.1, 0.05  # standard deviations (rad; m, m/s or rad/s) of estimates that are no error alone
@@ -34,17 +55,19 @@ def mismatches(
 
     `compared` has the filters by name; `offset_s` and `residual` are those of `common_offset`.
     """
-    found = _of_frames(estimate, reference, compared.values(), residual, offset_s)
-    return [
-        *found,
+    if times := _of_times(estimate, reference):
+        return times
+    units = [
         *_of_quaternions(estimate, reference, compared),
         *_of_units(estimate, reference, compared, offset_s),
     ]
+    found = [*_of_frames(estimate, reference, compared.values(), offset_s), *units]
+    if not found:  # motions in other units have little in common, too
+        found = _of_runs(estimate, reference, compared.values(), residual)
+    return [*found, *_of_reflections(reference, compared, offset_s), *_of_names(estimate, reference)]
 
 
-def _of_frames(
-    estimate: Table, reference: Table, compared: Collection[Compared], residual: float, offset_s: float
-) -> list[str]:
+def _of_frames(estimate: Table, reference: Table, compared: Collection[Compared], offset_s: float) -> list[str]:
     both_files = f"{estimate.path} and {reference.path}"
     tilts = [both.pairs for both in compared if ROLL in both.pairs and PITCH in both.pairs]
     apart = min((_tilt_apart_deg(both, offset_s) for both in tilts), default=0.0)
@@ -60,13 +83,18 @@ def _of_frames(
             f"{both_files} count the joint angle in opposite senses: the sense of an axis that a filter finds is "
             "arbitrary; negate axis1 and axis2 in the rig file and estimate again"
         ]
-    is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
-    if is_link and _UNRELATED < residual < np.inf:
-        return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
     velocities = [both.pairs[q] for both in compared for q in (VX, VY, WZ) if q in both.pairs]
     unrelated = [found for pair in velocities if (found := _is_unrelated(pair, offset_s)) is not None]
     if unrelated and all(unrelated):
         return [f"{both_files} have hardly any motion in common: are they of the same run, and their times in seconds?"]
+    return []
+
+
+def _of_runs(estimate: Table, reference: Table, compared: Collection[Compared], residual: float) -> list[str]:
+    both_files = f"{estimate.path} and {reference.path}"
+    is_link = any(quantity in LINK for both in compared for quantity in both.pairs)  # odometry may count from elsewhere
+    if is_link and _UNRELATED < residual < np.inf:
+        return [f"{both_files} have hardly any motion in common, whatever the offset: are they of the same run?"]
     return []
 
 
@@ -103,6 +131,49 @@ def _of_units(estimate: Table, reference: Table, compared: Mapping[str, Compared
             )
 
 
+def _of_times(estimate: Table, reference: Table) -> list[str]:
+    """One sentence if the two files span about the same time, but for the unit of one of them."""
+    for one, other in ((reference, estimate), (estimate, reference)):
+        spans = [float(np.ptp(table.columns["time_s"])) for table in (one, other)]
+        for unit, factor in _TIME_UNITS:
+            is_near = abs(spans[0] - factor * spans[1]) < _SAME_SPAN * factor * spans[1]
+            if is_near and interval(one.columns["time_s"]) > _LONG_STEP_S:
+                return [
+                    f"{one.path}: time_s spans {spans[0]:.4g} s, and in {other.path} {spans[1]:.4g} s: is it in "
+                    f"{unit}? divide it by {factor:.0f}"
+                ]
+    return []
+
+
+def _of_reflections(reference: Table, compared: Mapping[str, Compared], offset_s: float) -> Iterator[str]:
+    """A sentence if the reference's path is the mirror image of an estimate's: axes exchanged, or one reversed."""
+    for name, both in compared.items():
+        moved = [_moved(both.pairs[q], offset_s) for q in (X, Y) if q in both.pairs]
+        if len(moved) < 2 or moved[0] is None or moved[1] is None or len(moved[0][0]) != len(moved[1][0]):
+            continue
+        (our_x, their_x), (our_y, their_y) = moved[0], moved[1]
+        ours, theirs = our_x + 1j * our_y, their_x + 1j * their_y
+        sizes = float(np.linalg.norm(ours) * np.linalg.norm(theirs))
+        if abs(ours @ theirs) > _ALIKE * sizes > 0 and abs(np.conj(ours) @ theirs) < _UNRELATED * sizes:
+            yield (
+                f"{reference.path}: the path is the mirror image of that of {name}: were x_m and y_m exchanged, or is "
+                "the sign of one of them wrong?"
+            )
+            return
+
+
+def _of_names(estimate: Table, reference: Table) -> Iterator[str]:
+    """One sentence for each column of the reference that has the name of an estimated quantity, and another unit."""
+    for quantity in dict.fromkeys(q for of in by_filter(estimate.columns).values() for q in of):
+        for name in reference.columns:
+            base, _, unit = name.rpartition(f"{quantity.name}_")
+            if not base and unit in _OTHER_UNITS and quantity.column not in reference.columns and unit != quantity.unit:
+                yield (
+                    f"{reference.path}: {name} is not compared: state it in {unit_text(quantity.unit)}, in a column "
+                    f"{quantity.column}"
+                )
+
+
 def _of_quaternions(estimate: Table, reference: Table, compared: Mapping[str, Compared]) -> Iterator[str]:
     """One sentence for each file whose quaternions are no rotations: the error angle would be of their direction."""
     for number, table in enumerate((estimate, reference)):
@@ -128,7 +199,14 @@ def _ratio(quantity: Quantity, both: Compared, offset_s: float) -> float | None:
     moved = [found for pair in axes if (found := _moved(pair, offset_s)) is not None]
     if not moved or len({len(ours) for ours, _ in moved}) > 1:
         return None
-    ours, theirs = np.linalg.norm(moved, axis=0) if is_turned else moved[0]
+    ratio = _ratio_of(*(np.linalg.norm(moved, axis=0) if is_turned else moved[0]))
+    if ratio is None and not is_turned and axes[0][0].is_angle:  # in radians, a jump by a whole turn is no whole turn
+        ours, theirs = moved[0]
+        ratio = _ratio_of(ours, _DEGREE * np.unwrap(theirs / _DEGREE))
+    return ratio
+
+
+def _ratio_of(ours: Floats, theirs: Floats) -> float | None:
     sizes = np.linalg.norm(ours), np.linalg.norm(theirs)
     if not min(sizes) > 0 or abs(ours @ theirs) < _ALIKE * sizes[0] * sizes[1]:
         return None

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.errors import CannotRun, MissingJ2S, SensorMissing, UncertainJ2S, UnknownFilter
+from linkpose.exclusions import ExcludedMice
 from linkpose.sensors.devices import DEVICE_NAMES, DEVICES, MAX_MICE, Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Mouse, Rig
@@ -130,6 +131,13 @@ class FindsMovedMice(Protocol):
     @property
     def moved_mice(self) -> tuple[MovedMouse, ...]:
         """Mice whose places differ significantly from the rig file."""
+
+
+@runtime_checkable
+class ExcludesMice(Protocol):
+    """Further interface of a filter that excludes mice and has no column for them."""
+
+    excluded_mice: ExcludedMice
 
 
 @runtime_checkable

@@ -31,7 +31,12 @@ _MMHG = (600.0, 800.0)  # at sea level; as hPa, an altitude of 2 to 4 km
 _BLOCK_S = 0.1  # averages out noise and vibration
 _FEWEST_BLOCKS = 20
 _MOVES_M_S2 = 0.3  # rms of the motion's part of the force; less is too small beside errors of scale and offset (3 %)
-_PRESSURE_UNITS = (("hPa", "100"), ("kPa", "1000"))
+# A unit is named for 500 to 1100 hPa; psi and inHg differ by a factor of 2.04.
+_PRESSURE_UNITS = (
+    *(("hPa", "100"), ("kPa", "1000"), ("psi", "6894.757"), ("inHg", "3386.389"), ("bar", "100000")),
+    ("hundredths of Pa", "0.01"),
+)
+_HEAVIEST = 1.1
 _THIN_AIR_PA = 54_000.0  # at 5100 m, where the highest town is
 _HOTTEST_DEG_C = 200.0  # beyond the range of any of the chips
 _FASTEST_RAD_S = 36.0  # the MPU-6050 reads up to 2000 °/s, 34.9 rad/s
@@ -147,6 +152,11 @@ def _force(measurements: Measurements) -> str:
             f"accel_* is up to {sizes.max():.0f} m/s², more than the sensor reads: check the unit of each axis, which "
             "is m/s²"
         )
+    same = np.ptp(accel, axis=0) == 0
+    if same.any() and not same.all() and np.ptp(gyro, axis=0).all():  # without noise in either, a simulation of a plane
+        names = " and ".join(f"accel_{'xyz'[i]}" for i in np.flatnonzero(same))
+        values = " and ".join(dict.fromkeys(f"{accel[0, i] + 0.0:g}" for i in np.flatnonzero(same)))
+        return f"{names} is {values} in all rows: the accelerometer gives no reading there"
     force = np.linalg.norm(accel[0])
     if force > 0 and not np.ptp(accel, axis=0).any() and _rms(np.cross(gyro, accel[0] / force)) > _TILTS_RAD_S:
         return "accel_* is the same in all rows while the sensor tilts: the accelerometer gives no reading there"
@@ -202,7 +212,7 @@ def _pressure(median_pa: float) -> str:
         )
     if 0.5 * _AIR_PA < median_pa < _THIN_AIR_PA:
         return f"pressure_Pa is {median_pa:.0f} (median), as above 5100 m of altitude: check its unit and the sensor"
-    return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS)
+    return _of_usual_size("pressure_Pa", median_pa, _AIR_PA, _PRESSURE_UNITS, _HEAVIEST)
 
 
 def _repeated(flag: str, column: str, fresh: NDArray[np.bool_], values: Floats) -> str:
@@ -257,9 +267,14 @@ def _time(median_step_s: float, rate_hz: float | None) -> str:
     return ""
 
 
-def _of_usual_size(name: str, median: float, usual: float, units: Sequence[tuple[str, str]]) -> str:
-    """Names the unit, of (name, factor to the column's), that would bring the median to about its usual value."""
+def _of_usual_size(
+    name: str, median: float, usual: float, units: Sequence[tuple[str, str]], largest: float = 2.0
+) -> str:
+    """Names the unit, of (name, factor to the column's), that would bring the median to about its usual value.
+
+    That is, to between half of it and `largest` times it.
+    """
     for unit, factor in units:
-        if 0.5 < median * float(factor) / usual < 2.0:
+        if 0.5 < median * float(factor) / usual < largest:
             return f"{name} is {median:.4g} (median), not about {usual:g}: is it in {unit}? multiply it by {factor}"
     return ""

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from linkpose.exclusions import ExcludedMice
 from linkpose.filters import GyroJumps, MovedMouse
 from linkpose.filters._records import record_of, zeros
 from linkpose.filters.mice import MiceParameters, check_placement
@@ -95,6 +96,7 @@ class _PlanarFilter:
         self._mice_state = fresh_state(len(rig.mouse), BIAS_STD)
         self._tangent, self._points = zeros(int(not self._is_ukf), TANGENT), zeros(int(self._is_ukf), SIGMA)
         self.state = fresh_planar_state(len(rig.mouse), self.planar, rig.imu.gyro_noise_rad_s**2)
+        self.excluded_mice = ExcludedMice()
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -219,7 +221,8 @@ class _PlanarFilter:
             sample_records(block, self._rig.imu), self._parameters, self._planar, self._placed, self._mice,
             self._mice_state, self._tangent, self._points, self.state, out,
         )  # fmt: skip
-        return out.view(np.float64).reshape(len(block), len(self.columns))
+        self.excluded_mice.add(block, out["excluded"].astype(np.int64))
+        return out.view(np.float64).reshape(len(block), len(ESTIMATE))[:, : len(self.columns)]
 
 
 class PlanarEkf(_PlanarFilter):

@@ -619,6 +619,7 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     way = scaled(since, turned(turned(unit(at.heading), turned_mean(turn)), velocity))
     out.x, out.y, out.heading = at.x + way.real, at.y + way.imag, wrapped(at.heading + turn)
     out.vx, out.vy, out.wz = at.vx, at.vy, at.wz
+    out.excluded = float(m.excluded)
     # At rest too: the robot starts before the first count, and before its rate exceeds the noise of the gyro.
     lag = since + (0.5 * m.interval if math.isfinite(m.interval) else 0.0)
     by_scale, by_angle = _common_errors(state, m, mice)

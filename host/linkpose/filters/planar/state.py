@@ -264,6 +264,7 @@ ESTIMATE = np.dtype(
             "vx_std",
             "vy_std",
             "wz_std",
+            "excluded",  # bit mask of the mice, bit 0 is mouse 1
         )
     ]
 )
