@@ -95,6 +95,14 @@ def slowly_in_degrees(table: dict[str, np.ndarray]) -> None:
     scale(18 / np.pi, "gyro")(table)
 
 
+def later(sensor: str, rows: int) -> Callable[[dict[str, np.ndarray]], None]:
+    def change(table: dict[str, np.ndarray]) -> None:
+        for name in [name for name in table if name.startswith(sensor)]:
+            table[name] = np.concatenate([np.full(rows, table[name][0]), table[name][:-rows]])
+
+    return change
+
+
 FAST = [
     (lambda table: None, None),
     (scale(180 / np.pi, "gyro"), "is it in °/s?"),
@@ -124,6 +132,8 @@ FAST = [
         lambda table: table.update({f"accel_{a}_m_s2": 0 * table["time_s"] + 3 for a in "xyz"}),
         "is the same in all rows while",
     ),
+    (later("gyro", 30), "gyro_* comes later than accel_* by 0.3 s, by the motion that both describe"),
+    (later("accel", 10), "accel_* comes later than gyro_* by 0.1 s, by the motion that both describe"),
     (scale(0.0, "accel_x"), "accel_x is 0 in all rows: the accelerometer gives no reading there"),
     (scale(0.0, "accel_z"), "accel_z is 0 in all rows: the accelerometer gives no reading there"),
 ]
@@ -138,7 +148,7 @@ FAST = [
         "one axis twice", "one axis half", "one axis of the gyro twice", "one axis of the gyro half",
         "one axis in km/s²", "one axis of the gyro in krad/s", "one axis in g",
         "one axis of the gyro ten times", "one axis of the gyro a tenth", "one axis in degrees", "no accel",
-        "no accel_x", "no accel_z",
+        "gyro later", "accel later", "no accel_x", "no accel_z",
     ],
 )  # fmt: skip
 def test_a_fast_swing_shows_whether_gyro_and_accelerometer_agree(change, sentence: str | None) -> None:
