@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,8 +11,10 @@ import pytest
 from serial.tools import list_ports_common
 
 from linkpose.device import ports
+from linkpose.device.connection import Connection
 from linkpose.device.ports import CHIPS, UsbIdentity, choose_port, devices_without_port, find_again, find_ports
 from linkpose.errors import LinkposeError, printable
+from linkpose.wire.messages import Ping
 
 
 @pytest.fixture
@@ -95,11 +99,37 @@ def test_a_usb_description_does_not_act_on_the_terminal(
     monkeypatch: pytest.MonkeyPatch, linkpose: Callable[..., tuple]
 ) -> None:
     port = list_ports_common.ListPortInfo("COM3")
-    port.description = "UNO\x1b]0;title\x07\x9b2J\u202e"
+    port.description = "UNO\x1b]0;title\x07\x9b2J\u202e\nCOM4"
     monkeypatch.setattr(ports.list_ports, "comports", lambda: [port])
     shown = "".join(linkpose("ports")[1:])
-    assert "UNO\\x1b]0;title\\x07\\x9b2J\\u202e" in shown
+    assert "UNO\\x1b]0;title\\x07\\x9b2J\\u202e COM4" in shown
     assert not set(shown) & set("\x1b\x07\x9b\u202e")
+
+
+def vanishing(where: str) -> type:
+    """A port whose device is gone when this method is called, as pyserial reports it on POSIX."""
+    termios = pytest.importorskip("termios")
+
+    def gone(*_: object) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    quiet = {name: lambda *_: b"" for name in ("read", "write", "reset_input_buffer", "cancel_read", "close")}
+    return type("Vanishing", (), {"in_waiting": 0, **quiet, where: gone})
+
+
+@pytest.mark.parametrize(
+    ("where", "sentence"), [("__init__", "there is no port"), ("write", "is gone"), ("reset_input_buffer", None)]
+)
+def test_a_device_that_goes_while_it_is_opened_is_a_sentence(
+    monkeypatch: pytest.MonkeyPatch, where: str, sentence: str | None
+) -> None:
+    """termios.error is no OSError: the recording ended with an unexpected error."""
+    port = vanishing(where)
+    monkeypatch.setattr(ports, "_is_no_terminal", lambda name: False)
+    monkeypatch.setattr(ports.serial, "serial_for_url", lambda *_, **__: port())
+    with pytest.raises(LinkposeError, match=sentence) if sentence else contextlib.nullcontext():
+        connection = Connection("/dev/ttyX")
+        connection.send(Ping(1))
 
 
 def test_printable_keeps_text_and_bounds_it() -> None:

@@ -120,6 +120,33 @@ def test_a_sample_that_comes_twice_is_taken_once():
     assert (timeline.samples, timeline.lost) == (3, 0)
 
 
+@pytest.mark.parametrize(
+    "order",
+    [
+        (0, 1, 2, 1, 2, 3),
+        (0, 1, 2, 0, 1, 2, 3),
+        (0, 1, 2, 2, 2, 3),
+        (0, 2, 3, 2, 3, 7, 3, 7, 8),
+        (65534, 65535, 65536, 65535, 65536, 65537),
+        (*range(150), *range(60, 150), 150),
+    ],
+    ids=["two again", "all again", "one again", "with losses", "over the wrap", "most of a second"],
+)
+def test_a_part_of_the_stream_that_comes_twice_is_taken_once_live_and_in_replay(tmp_path, order):
+    """Its samples were taken for those of a board that had been reset: rows without a step of time, and no loss."""
+    samples = [sample(tick, 4_294_000_000 + 10_000 * tick) for tick in order]
+    timeline, clock = Timeline(100.0), BoardClock()
+    live = [place for each in samples if (place := timeline.place(each, clock, 0.0))]
+    first = order[0]
+    assert [place.seq for place in live] == sorted(set(order))
+    assert timeline.lost - first == max(order) - first + 1 - len(set(order))
+    capture = tmp_path / "twice.bin"
+    capture.write_bytes(b"".join(map(frames.encode, [board.hello(board.DEFAULTS), *samples])))
+    replayed = load_recording(capture).measurements
+    assert replayed.time_s == pytest.approx([place.time_s for place in live], abs=1e-6)
+    assert ((replayed.flags & GAP_BEFORE) != 0).tolist() == [bool(place.flags & GAP_BEFORE) for place in live]
+
+
 def test_samples_lost_before_the_first_one_count():
     timeline = Timeline(100)
     place = timeline.place(sample(3, 0), BoardClock(), 0.0)

@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-import serial
-
-from linkpose.device.ports import is_network, open_port
+from linkpose.device.ports import PORT_FAILURES, is_network, open_port
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Rig
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
@@ -55,7 +53,7 @@ class Connection:
         self.rig: Rig | None = getattr(self._port, "rig", None)
         self._arrived: queue.SimpleQueue[tuple[float, bytes] | Exception] = queue.SimpleQueue()
         self._closing = False
-        with contextlib.suppress(serial.SerialException, OSError):
+        with contextlib.suppress(*PORT_FAILURES):
             self._port.reset_input_buffer()
         self._thread = threading.Thread(target=self._read, name="linkpose-read", daemon=True)
         self._thread.start()
@@ -76,7 +74,7 @@ class Connection:
         sent = self.now()
         try:
             self._port.write(encode(message))
-        except (serial.SerialException, OSError) as error:
+        except PORT_FAILURES as error:
             raise Disconnected(self._name, error) from error
         return sent
 

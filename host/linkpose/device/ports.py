@@ -25,6 +25,14 @@ from linkpose.errors import (
 )
 from linkpose.wire.messages import BAUD
 
+# What the system raises where a device goes: termios.error, of pyserial's settings and flushes, is no OSError.
+PORT_FAILURES: tuple[type[Exception], ...] = (serial.SerialException, OSError)
+if sys.platform != "win32":
+    import termios
+
+    PORT_FAILURES += (termios.error,)
+_NOT_OPENED: tuple[type[Exception], ...] = (*PORT_FAILURES, ValueError)
+
 _MEMORY_DEVICES = 1  # Linux's major device number of null, zero, full, random
 
 
@@ -81,7 +89,7 @@ def find_ports() -> list[PortInfo]:
     found = []
     for port in sorted(list_ports.comports(), key=lambda p: p.device):
         chip = CHIPS.get((port.vid or 0, port.pid or 0))
-        description = port.description if port.description != "n/a" else ""
+        description = " ".join(port.description.split()) if port.description != "n/a" else ""
         busy = None if _holder_unknowable() else holder(port.device) is not None
         found.append(
             PortInfo(
@@ -214,7 +222,7 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
             options["exclusive"] = True
     try:
         port = serial.serial_for_url(name, **options)
-    except (serial.SerialException, OSError, ValueError) as error:
+    except _NOT_OPENED as error:
         raise _why_not(name, error) from error
     return port
 
@@ -231,9 +239,9 @@ def _is_no_terminal(name: str) -> bool:
 
 def _why_not(name: str, error: Exception) -> PortError:
     """The PortError for an exception that the system or pyserial raised while opening a port."""
-    code = getattr(error, "errno", None)
+    code = getattr(error, "errno", None) or next((part for part in error.args if isinstance(part, int)), None)
     text = str(error).lower()
-    if code in (errno.ENOENT, errno.ENXIO) or "filenotfound" in text or "could not find" in text:
+    if code in (errno.ENOENT, errno.ENXIO, errno.EIO) or "filenotfound" in text or "could not find" in text:
         return PortNotFound(name)
     if code in (errno.EACCES, errno.EPERM) or "permissionerror(13" in text or "access is denied" in text:
         return PortBusy(name) if os.name == "nt" else PermissionDenied(name, _group(name))

@@ -8,9 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 
-import serial
-
-from linkpose.device.ports import open_port
+from linkpose.device.ports import PORT_FAILURES, open_port
 from linkpose.errors import LinkposeError
 from linkpose.flashing.image import APPLICATION_BYTES, Image
 from linkpose.flashing.stk500 import PAGE_BYTES, SIGNATURE, Bootloader, NoAnswer, SerialPort
@@ -61,7 +59,7 @@ def upload(image: Image, port: str, report: Report, open_port: OpenPort = open_p
         except NoAnswer as error:
             if attempt == ATTEMPTS:
                 raise LinkposeError(_why_broken_off(progress, f"The board at {port} stopped answering")) from error
-        except (serial.SerialException, OSError) as error:
+        except PORT_FAILURES as error:
             raise LinkposeError(_why_broken_off(progress, f"{port} disappeared")) from error
         except KeyboardInterrupt:
             raise LinkposeError(_why_broken_off(progress, "The upload was interrupted")) from None
@@ -78,7 +76,7 @@ def _connected(name: str, open_port: OpenPort) -> Iterator[tuple[Bootloader, int
                 yield loader, baud
                 return
         finally:
-            with contextlib.suppress(serial.SerialException, OSError):
+            with contextlib.suppress(*PORT_FAILURES):
                 port.close()
     raise LinkposeError(
         f"No UNO bootloader answers at {name}; nothing was written. It is another board or another port, or the board "

@@ -67,9 +67,10 @@ class CaptureSource:
         clock = _CaptureClock(self._restarts, self.rate_hz)
         for capture in self._parts(progress):
             if len(capture.samples):
-                time_s, gap_before = clock.place(capture.samples)
-                flags = (capture.samples["flags"].astype(np.int64) & ~GAP_BEFORE) | gap_before
-                yield converter.convert(_raw_samples(capture, self._mouse_ports), time_s, flags)
+                new, time_s, gap_before = clock.place(capture.samples)
+                flags = (capture.samples["flags"][new].astype(np.int64) & ~GAP_BEFORE) | gap_before
+                if len(flags):
+                    yield converter.convert(_raw_samples(capture, self._mouse_ports, new), time_s, flags)
         self._lost, self._gaps, self._jumps = clock.lost, clock.gaps, clock.jumps
 
     def remarks(self) -> list[str]:
@@ -150,14 +151,20 @@ class _CaptureClock:
         self._last: tuple[int, int] | None = None  # t_us and seq
         self.gaps = self.lost = self.jumps = 0
 
-    def place(self, raw: NDArray[np.void]) -> tuple[Floats, NDArray[np.int64]]:
-        """Times (N,) of the next samples, s, and the flag of those after a gap."""
+    def place(self, raw: NDArray[np.void]) -> tuple[NDArray[np.bool_], Floats, NDArray[np.int64]]:
+        """Which of the next samples (N,) are new; times (M,) of these, s, and the flag of those after a gap."""
+        inside = (self._restarts >= self._placed) & (self._restarts < self._placed + len(raw))
+        restarts = self._restarts[inside] - self._placed
+        self._placed += len(raw)
         t_us, seq = raw["t_us"].astype(np.int64), raw["seq"].astype(np.int64)
+        new = self._are_new(t_us, seq, restarts)
+        restarts = (np.cumsum(new) - 1)[restarts]
+        t_us, seq = t_us[new], seq[new]
+        if not len(seq):
+            return new, np.empty(0), np.empty(0, np.int64)
         before = self._last or (int(t_us[0]), -1)
         step_us = np.diff(t_us, prepend=before[0]) % _T_WRAP
         ticks = np.diff(seq, prepend=before[1]) % _SEQ_WRAP
-        inside = (self._restarts >= self._placed) & (self._restarts < self._placed + len(raw))
-        restarts = self._restarts[inside] - self._placed
         jumped = self._jumps(step_us, ticks)
         step_us[jumped] = ticks[jumped] * self._period_us
         self.jumps += int(np.count_nonzero(jumped))
@@ -167,9 +174,23 @@ class _CaptureClock:
         self.gaps += int(np.count_nonzero(marked))
         self.lost += int(np.sum(ticks[marked] - 1))
         marked[restarts] = True
-        self._placed, self._elapsed_us = self._placed + len(raw), int(elapsed_us[-1])
-        self._last = int(t_us[-1]), int(seq[-1])
-        return np.round(elapsed_us * 1e-6, TIME_DECIMALS), np.where(marked, GAP_BEFORE, 0)
+        self._elapsed_us, self._last = int(elapsed_us[-1]), (int(t_us[-1]), int(seq[-1]))
+        return new, np.round(elapsed_us * 1e-6, TIME_DECIMALS), np.where(marked, GAP_BEFORE, 0)
+
+    def _are_new(
+        self, t_us: NDArray[np.int64], seq: NDArray[np.int64], restarts: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Which samples did not come before, as `sensors.timeline.Timeline` finds live."""
+        before = self._last or (int(t_us[0]), int(seq[0]) - 1)
+        back = -np.diff(seq, prepend=before[1]) % _SEQ_WRAP
+        off_us = np.diff(t_us, prepend=before[0]) + back * self._period_us
+        off_us = (off_us + _T_WRAP // 2) % _T_WRAP - _T_WRAP // 2
+        is_back = (back <= WINDOW_TICKS) & (np.abs(off_us) <= OFF_TICKS * self._period_us)
+        is_back[restarts] = False
+        if not is_back.any():  # as almost always
+            return np.ones(len(seq), np.bool_)
+        count = np.cumsum(np.where(is_back, -back, _SEQ_WRAP - back))
+        return np.asarray(count > np.maximum.accumulate(np.concatenate([[0], count[:-1]])))
 
     def _jumps(self, step_us: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which steps of the board's clock contradict its count of ticks, as `sensors.timeline.Stamps` finds live."""
@@ -182,12 +203,12 @@ class _CaptureClock:
         return np.asarray(jumps)
 
 
-def _raw_samples(capture: Capture, ports: int) -> RawSamples:
-    """The capture's samples, with these mouse ports."""
-    raw = capture.samples
+def _raw_samples(capture: Capture, ports: int, new: NDArray[np.bool_]) -> RawSamples:
+    """The capture's samples that are `new` (N,), with these mouse ports."""
+    raw = capture.samples[new]
     mice = np.stack([raw["mice"]["dx"], raw["mice"]["dy"]], axis=2)[:, :ports]
     return RawSamples(
         np.stack([raw[name].astype(np.int64) for name in COUNT_FIELDS], axis=1),
         mice.astype(np.int64),
-        capture.mouse_count.astype(np.int64),
+        capture.mouse_count[new].astype(np.int64),
     )

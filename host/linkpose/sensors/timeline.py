@@ -107,6 +107,12 @@ def off_ticks(step_us: int, ticks: int, period_us: float) -> float:
     return float(off_us - max(0, round(off_us / wrap_us)) * wrap_us)
 
 
+def is_step(step_us: int, ticks: int, period_us: float) -> bool:
+    """Whether the board's clock (modulo 2³²) has gone on, or back, by these ticks."""
+    off_us = (step_us - ticks * period_us + _T_WRAP / 2) % _T_WRAP - _T_WRAP / 2
+    return abs(off_us) <= OFF_TICKS * period_us
+
+
 class Timeline:
     """Places the samples of one recording one after another, over wraps, losses and restarts of the board."""
 
@@ -116,7 +122,7 @@ class Timeline:
         self._end_s = end_s
         self.start_s = 0.0  # the host's time of the first sample
         self._last: Placed | None = None
-        self._wire_seq = 0  # the last sample's seq as it came
+        self._wire_seq = self._wire_t_us = 0  # the last sample's seq and t_us as they came
         self._cause = "link"
         self._restarted = False
         self.stamps = Stamps(self._period_s)
@@ -162,9 +168,9 @@ class Timeline:
     def place(self, sample: Sample, clock: Clock, arrived_s: float) -> Placed | None:
         """Place of a sample that arrived at `arrived_s` (s, the host's clock).
 
-        None for one that came twice, and for one from the end on.
+        None for one that came before, and for one from the end on.
         """
-        if self.is_over:
+        if self.is_over or self._is_old(sample):
             return None
         t_us = self.stamps.corrected(sample.seq, sample.t_us)
         host_s = clock.host_time(clock.unwrap(t_us, arrived_s))
@@ -187,10 +193,18 @@ class Timeline:
             self.gaps.append(Gap(before, time_s - before, missing, self._cause))
             self.lost += missing
         self._restarted, self._cause, self._wire_seq = False, "link", sample.seq
+        self._wire_t_us = sample.t_us
         self._last = Placed(time_s, seq, sample.flags | (GAP_BEFORE if marked else 0))
         self.samples += 1
         self.is_over = time_s + self._period_s >= self._last_due_s
         return self._last
+
+    def _is_old(self, sample: Sample) -> bool:
+        """Whether the sample came before: a line that repeats a part of the stream, frame by frame or as a whole."""
+        if self._last is None or self._restarted:
+            return False
+        back = (self._wire_seq - sample.seq) % _SEQ_WRAP
+        return back <= WINDOW_TICKS and is_step(sample.t_us - self._wire_t_us, -back, self._period_s * 1e6)
 
     def _ticks(self, seq: int, elapsed: float) -> int:
         """Ticks from the last sample to the one of this seq, which came `elapsed` periods later.

@@ -47,6 +47,7 @@ from linkpose.sensors.rig import Rig
 
 __all__ = ["FoundMouse", "PlanarEkf", "PlanarParameters", "PlanarUkf"]
 
+_WIDTH = ESTIMATE.itemsize // np.dtype(np.float64).itemsize
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
 
@@ -222,7 +223,7 @@ class _PlanarFilter:
             self._mice_state, self._tangent, self._points, self.state, out,
         )  # fmt: skip
         self.excluded_mice.add(block, out["excluded"].astype(np.int64))
-        return out.view(np.float64).reshape(len(block), len(ESTIMATE))[:, : len(self.columns)]
+        return out.view(np.float64).reshape(len(block), _WIDTH)[:, : len(self.columns)]
 
 
 class PlanarEkf(_PlanarFilter):
