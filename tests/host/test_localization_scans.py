@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from linkpose.errors import LinkposeError, MapMismatch
 from linkpose.localization.carmen import as_log
@@ -74,6 +75,27 @@ def test_a_beam_that_ends_behind_a_drawn_wall_is_behind_the_face_that_it_sees():
     for x, ahead_x, reach in ((5.5, -1.0, FARTHEST_M), (5.5, 1.0, 0.0), (5.5, 0.0, FARTHEST_M)):
         seen_distance(field.counts, field.geometry, x, 4.0, ahead_x, math.sqrt(1.0 - ahead_x**2), reach, at)
         assert at[0] == pytest.approx(1.3, abs=2e-3)
+
+
+def test_what_is_filled_around_a_building_does_not_make_its_walls_uncertain():
+    """A map of thin walls, with all filled outside of it: σ was 0.25 m, as if the walls were a metre thick."""
+    blocked = np.full((200, 200), OCCUPIED, np.uint8)
+    blocked[60:140, 60:140] = 0
+    blocked[60:110, 100] = OCCUPIED
+    fields = [
+        DistanceField.of(GridMap(outside, np.array([0.05, 0.0, 0.0, 0.0]))) for outside in (blocked, hollow(blocked))
+    ]
+    assert fields[0].wall_std_m < 0.03 and fields[1].wall_std_m < 0.03
+    smeared = hollow(blocked)
+    smeared[60:110, 100:106] = OCCUPIED
+    assert DistanceField.of(GridMap(smeared, np.array([0.05, 0.0, 0.0, 0.0]))).wall_std_m > 0.04
+
+
+def hollow(blocked: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The same map with what is outside of the building unknown, but for a cell of wall."""
+    inner = blocked.copy()
+    inner[:59] = inner[141:] = inner[:, :59] = inner[:, 141:] = UNKNOWN
+    return inner
 
 
 def test_noisy_beams_do_not_move_the_robot_along_a_corridor_with_drawn_walls():

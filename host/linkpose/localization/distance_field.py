@@ -32,7 +32,7 @@ COUNT_M = FARTHEST_M / 32767
 # Share of the wall cells beside free ones that have a wall cell behind, from which on a map counts as drawn: 1.0 in the
 # simulated office, 0.58 and 0.62 in two buildings mapped by GMapping, 0.90 in an old map with smeared walls.
 DRAWN_SHARE = 0.97
-# Upper bound on the uncertainty of where a beam ends (m). Thicker blocks are filled rooms, not walls.
+# Upper bound on the uncertainty of where a beam ends (m). Thicker blocks are filled rooms, not walls, and do not count.
 THICKEST_STD_M = 0.25
 
 
@@ -60,13 +60,25 @@ class DistanceField:
         inside = np.empty(grid.blocked.shape, np.int16)
         fill_distances(grid.blocked, cell, True, inside)
         # A wall of thickness t has a mean depth of t/4, and a place drawn evenly from it a deviation of t/√12.
-        depth = float(inside[wall].mean() - half) * COUNT_M if wall.any() else 0.0
+        smeared = wall & ~_blocks(wall, inside, cell)
+        depth = float(inside[smeared].mean() - half) * COUNT_M if smeared.any() else 0.0
         wall_std_m = min(4.0 * depth / math.sqrt(12.0), THICKEST_STD_M)
         is_drawn = thick_share(grid.blocked) > DRAWN_SHARE
         if is_drawn:
             wall_std_m = 0.0
             counts = np.where(wall, half - inside, counts - half).astype(np.int16)
         return DistanceField(counts, grid.geometry, wall_std_m, is_drawn)
+
+
+def _blocks(wall: NDArray[np.bool_], inside: Field, cell: float) -> NDArray[np.bool_]:
+    """The cells of blocks that are no walls: filled rooms, and what is filled around a building."""
+    deepest = math.sqrt(12.0) * THICKEST_STD_M / 2.0
+    core = np.where(wall & (inside > deepest / COUNT_M), OCCUPIED, FREE).astype(np.uint8)
+    if not core.any():
+        return np.zeros_like(wall)
+    to_core = np.empty(wall.shape, np.int16)
+    fill_distances(core, cell, False, to_core)
+    return np.asarray(wall & (to_core <= (deepest + cell) / COUNT_M))
 
 
 @compiled
