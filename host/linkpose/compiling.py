@@ -56,6 +56,7 @@ _SOURCES = (
     "__init__.py",
     "compiling.py",
     "errors.py",
+    "exclusions.py",
     "inputs.py",
     "outputs.py",
     "presentation.py",
