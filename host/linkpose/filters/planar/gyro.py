@@ -6,8 +6,8 @@ gyro, and a second pose follows the mice alone from the last agreement on. Until
 two poses is part of the stated standard deviation.
 
 A jump adds the same rate whatever the robot does. Mice that slip, or saturate, or have another scale or angle than
-assumed, err in proportion to the turn or to the way. The residuals of both models, fitted to blocks of 0.2 s since the
-last agreement, decide as soon as the motion of the robot has changed.
+assumed, err in proportion to the turn, with one share to the left and one to the right, or to the way. The residuals of
+both models, fitted to blocks of 0.2 s since the last agreement, decide as soon as the motion of the robot has changed.
 
 Source of the change detection: E. S. Page, "Continuous inspection schemes", Biometrika 41 (1954).
 """
@@ -169,8 +169,7 @@ def _end_turn(state: Record, m: Record, share: float) -> None:
 @inner
 def _accept_resolution(state: Record, m: Record, share: float) -> None:
     """All mice count `share` times as much as before, from a time on since the last turn in which they did not."""
-    is_everywhere = abs(state.jumped_to - share) < _JUMPED_EQUAL * share
-    accept_share(state, share, _RESOLVED_STD, is_everywhere)
+    accept_share(state, share, _RESOLVED_STD)
     position = complex(state.at.x, state.at.y)
     widen_way(state, 1.0 / share - 1.0, position - state.resolution.start)
     state.resolution.start = position
@@ -182,19 +181,19 @@ def _accept_resolution(state: Record, m: Record, share: float) -> None:
 
 
 @inner
-def accept_share(state: Record, share: float, std: float, is_everywhere: bool) -> None:
+def accept_share(state: Record, share: float, std: float) -> None:
     """All mice show `share` times as much of the gyro's turns as their scale explains, with this σ of the share.
 
     Either they count so much more everywhere (another floor, another resolution), or only in turns (they slip, or lose
-    the surface as it turns under them). Turns do not tell which. In turns, the whole share is corrected. On straights,
-    the scale is the mean of both causes, so that neither makes the path worse than without a correction, and half of
-    their difference is its σ. Where it `is_everywhere`, because it has shown on a straight too, the scale is corrected.
+    the surface as it turns under them). Turns do not tell which. In turns, the whole share is corrected; on straights,
+    a part, so that neither cause makes the path worse than without a correction, with half the difference as σ. Where
+    the velocity has jumped to this share on a straight, it is corrected there too.
     """
     before = state.turn_factor
     shown = share * shown_in_turns(state)
     widen_way(state, state.straight_std, state.straight_way)
     state.straight_way = 0j
-    if not is_everywhere:
+    if not abs(state.jumped_to - share) < _JUMPED_EQUAL * share:
         on_straights = 1.0 + ON_STRAIGHTS * (shown - 1.0)
         state.turn_factor = shown / on_straights
         state.straight_std = 0.5 * abs(shown - 1.0) / on_straights
@@ -322,7 +321,10 @@ def _is_over(state: Record, z: float, std: float) -> bool:
 
 @inner
 def _add_block(state: Record, off: float, variance: float, span: float) -> None:
-    """Add the terms of both fits: off = J span (a jump), off = c turn + e way (errors of the mice)."""
+    """Add the terms of both fits: off = J span (a jump), off = c turn + d |turn| + e way (errors of the mice).
+
+    With c and d, mice may lose one share of turns to the left, and another one of those to the right.
+    """
     dispute, turn = state.dispute, state.dispute.block_gyro
     dispute.age += span
     dispute.span += span
@@ -335,8 +337,11 @@ def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     way = dispute.block_way
     dispute.turn_square += weight * turn * turn
     dispute.turn_way += weight * turn * way
+    dispute.turn_size += weight * turn * abs(turn)
+    dispute.size_way += weight * abs(turn) * way
     dispute.way_square += weight * way * way
     dispute.turn_off += weight * turn * off
+    dispute.size_off += weight * abs(turn) * off
     dispute.way_off += weight * way * off
     dispute.off_square += weight * off * off
 
@@ -378,11 +383,14 @@ def refute_jump(state: Record) -> None:
 
 @inner
 def _cost_of_mice(dispute: Record) -> float:
-    """χ² of the best fit of off = c turn + e way."""
-    a, b, d = dispute.turn_square + 1.0 / _LOST_STD**2, dispute.turn_way, dispute.way_square + 1.0 / _VEERING_STD**2
-    x, y = dispute.turn_off, dispute.way_off
-    cost: float = dispute.off_square - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
-    return cost
+    """χ² of the best fit of off = c turn + d |turn| + e way, by elimination of e."""
+    way, turn = dispute.way_square + 1.0 / _VEERING_STD**2, dispute.turn_square + 1.0 / _LOST_STD**2
+    by_turn, by_size, by_off = dispute.turn_way / way, dispute.size_way / way, dispute.way_off / way
+    a, d = turn - by_turn * dispute.turn_way, turn - by_size * dispute.size_way
+    b = dispute.turn_size - by_turn * dispute.size_way
+    x, y = dispute.turn_off - by_turn * dispute.way_off, dispute.size_off - by_size * dispute.way_off
+    cost: float = dispute.off_square - by_off * dispute.way_off
+    return cost - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
 
 
 @inner
@@ -412,6 +420,7 @@ def _forget(dispute: Record) -> None:
     dispute.span = 0.0
     dispute.jump_square = dispute.jump_product = 0.0
     dispute.turn_square = dispute.turn_way = dispute.way_square = 0.0
+    dispute.turn_size = dispute.size_way = dispute.size_off = 0.0
     dispute.turn_off = dispute.way_off = dispute.off_square = 0.0
     dispute.blocks = 0
     for i in range(len(dispute.by_scale)):

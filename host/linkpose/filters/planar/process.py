@@ -171,7 +171,7 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
         return
     for at in range(MICE, state.size, OF_MOUSE):
         _restart(state, at + POSITION, at + OF_MOUSE, 0.0)
-    accept_share(state, 1.0 + off, p.floor_scale, False)
+    accept_share(state, 1.0 + off, p.floor_scale)
     _correct_way(state, off)
     restart_turns(state)
     state.floors += 1
@@ -444,7 +444,7 @@ def _watch_jump(state: Record, m: Record, before: complex, dt: float) -> None:
         state.unconfirmed_s += dt
         is_back = is_jump and square(state.held - shown) < square(state.held - last)
         if is_back:
-            state.jumped_to = 1.0
+            state.jumped_to = 0.0
             _restore_way(state, shown)
         if is_back or state.unconfirmed_s > _UNCONFIRMED_S:
             state.unconfirmed_s = -_SPREAD_S

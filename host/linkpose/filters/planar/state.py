@@ -88,9 +88,12 @@ _DISPUTE = np.dtype(
         ("jump_square", "f8"),
         ("jump_product", "f8"),
         ("turn_square", "f8"),
+        ("turn_size", "f8"),  # size: |turn|
         ("turn_way", "f8"),
+        ("size_way", "f8"),
         ("way_square", "f8"),
         ("turn_off", "f8"),
+        ("size_off", "f8"),
         ("way_off", "f8"),
         ("off_square", "f8"),
         # Change of the turn by the mice with the scale and the angle of each (rad).
@@ -183,7 +186,7 @@ _FIELDS = [
     ("held", "c16"),  # velocity before it, in the robot's axes (m/s)
     ("shown", "c16"),  # velocity of the last reading (m/s)
     ("earlier", "c16"),  # the filter's velocity before the last reading (m/s)
-    ("jumped_to", "f8"),  # speed after the last such change on a straight, as a share of that before it
+    ("jumped_to", "f8"),  # speed after the last such change on a straight, as a share of that before it; 0: none
     ("unconfirmed_s", "f8"),  # since then (s); 0: there is none; below 0: the end of one spreads
     ("unconfirmed_turn", "f8"),  # turning since then in which mice and gyro agree (rad)
     ("unconfirmed_m", "f8"),  # way that the robot went if the mice are wrong (m)
@@ -309,7 +312,7 @@ def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
     state: Any = records[0]
     state.size = int(MICE) + int(OF_MOUSE) * mice
     state.gyro_variance, state.gyro_samples = p.noise_factor**2 * gyro_variance, 20.0
-    state.resolution.share = state.turn_factor = state.grip = state.jumped_to = 1.0
+    state.resolution.share = state.turn_factor = state.grip = 1.0
     covariance = state.covariance
     for index, std in (
         *((k, 1e-6) for k in (X, Y, HEADING)),
