@@ -389,8 +389,8 @@ def _cost_of_mice(dispute: Record) -> float:
     a, d = turn - by_turn * dispute.turn_way, turn - by_size * dispute.size_way
     b = dispute.turn_size - by_turn * dispute.size_way
     x, y = dispute.turn_off - by_turn * dispute.way_off, dispute.size_off - by_size * dispute.way_off
-    cost: float = dispute.off_square - by_off * dispute.way_off
-    return cost - (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    by_both = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return float(dispute.off_square - by_off * dispute.way_off - by_both)
 
 
 @inner
