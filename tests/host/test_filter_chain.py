@@ -11,6 +11,7 @@ import pytest
 import linkpose as lp
 from linkpose.errors import InvalidValue
 from linkpose.filters.chain import ChainFilter
+from linkpose.filters.chain.state import BA, BG, OF_SENSOR
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 from linkpose.sensors.rig import Chain, Rig
 from linkpose.simulation.chain import ChainRun
@@ -151,6 +152,69 @@ def test_gyro_biases_of_the_data_sheet_at_a_start_in_motion_stay_within_the_std(
         turned = min((sign * found["chain_angle_deg"] - angle for sign in (1, -1)), key=lambda e: np.std(e[late]))
         assert np.mean(np.abs(turned[late]) < 2 * found["chain_angle_std_deg"][late]) > 0.9
         assert np.sqrt(np.mean(turned[late] ** 2)) < 8
+
+
+@pytest.mark.parametrize(("seed", "first_joint"), [(900, "free"), (911, "fixed"), (911, "free")])
+def test_a_heading_that_is_still_wrong_does_not_show_calibrated_gyros(seed: int, first_joint: str) -> None:
+    """In the first second of motion, the biases of the data sheet passed zero with a small σ."""
+    run = ChainRun("hinge", seed, 24.0, errors="datasheet", first_joint=first_joint)
+    measured = run.measurements()
+    use = measured.time_s >= 8
+    measured, truth = measured[use], run.truth_columns(measured.time_s[use])
+    chain = ChainFilter(Rig(chain=Chain("hinge")))
+    found = dict(zip(chain.columns, chain.process(measured).T, strict=True))
+    error = _error_deg(found, _matrices(*(truth[name] for name in ("qw", "qx", "qy", "qz"))))
+    use = np.isfinite(error) & (measured.time_s > 10)
+    assert not chain.state["is_narrow"].any()
+    assert np.mean(error[use] < 2 * found["chain_rotation_std_deg"][use]) > 0.85
+
+
+def _slow_hinge(seed: int, tempo: float, misfit: float) -> lp.Measurements:
+    """A hinge that two links turn slowly in space, from a start in motion: no gyro bias, sensors with a wrong scale.
+
+    `tempo` (Hz): of the motion; `misfit`: σ of the elements of the accelerometers' scale matrices. Those of the gyros
+    are 1 %.
+    """
+    rng, h = np.random.default_rng(seed), 1 / RATE_HZ
+    t = np.arange(-1, round(SECONDS * RATE_HZ) + 1) * h
+
+    def wave(size: float) -> np.ndarray:
+        return size * sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in tempo * rng.uniform(0.3, 0.8, 3))
+
+    x, y, z = np.eye(3)
+    first = _turn(z, wave(0.15)) @ _turn(y, 0.2 + wave(0.1)) @ _turn(x, -0.3 + wave(0.1))
+    second = first @ _turn(y, wave(0.15)) @ _turn(np.array([0.6, 0.0, 0.8]), np.array([2.0]))[0]
+    centre = np.stack([wave(0.03), wave(0.03), wave(0.02)], 1)
+    out = []
+    for rotation, r in ((first, R1), (second, R2)):
+        place = centre + rotation @ r
+        accel = (place[2:] - 2 * place[1:-1] + place[:-2]) / h**2 + [0, 0, STANDARD_GRAVITY]
+        scales = [np.eye(3) + size * rng.standard_normal((3, 3)) for size in (misfit, 0.01)]
+        force = np.einsum("nji,nj->ni", rotation[1:-1], accel) @ scales[0].T
+        out.append(force + 0.03 * rng.standard_normal(force.shape))
+        out.append(_rate(rotation, h) @ scales[1].T + 0.002 * rng.standard_normal(force.shape))
+    return lp.Measurements.from_imu(t[1:-1], out[0], out[1], accel2_m_s2=out[2], gyro2_rad_s=out[3])
+
+
+def _vertical_biases(measured: lp.Measurements) -> list[float]:
+    """Vertical components of both gyro biases over their σ, where the truth is 0."""
+    chain, out = ChainFilter(Rig(chain=Chain("hinge"))), []
+    chain.process(measured)
+    for k in range(2):
+        up, at = chain.state.rotation[k, 2], slice(OF_SENSOR * k + BG, OF_SENSOR * k + BA)
+        out.append(up @ chain.state.gyro_bias[k] / np.sqrt(up @ chain.state.covariance[at, at] @ up))
+    return out
+
+
+def test_a_slow_turn_is_no_rest() -> None:
+    """Turns of 3 °/s were taken for the biases of sensors at rest, with a σ of a fiftieth of that."""
+    ratios = [ratio for seed in range(3) for ratio in _vertical_biases(_slow_hinge(seed, 0.12, 0.02))]
+    assert np.sqrt(np.mean(np.square(ratios))) < 2
+
+
+def test_wrong_scales_in_slow_motion_do_not_make_the_gyro_biases_too_certain() -> None:
+    ratios = [ratio for seed in range(4) for ratio in _vertical_biases(_slow_hinge(seed, 0.25, 0.03))]
+    assert np.sqrt(np.mean(np.square(ratios))) < 1.15
 
 
 @pytest.mark.parametrize("errors", ["calibrated", "datasheet"])

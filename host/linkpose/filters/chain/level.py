@@ -58,7 +58,9 @@ def follow_innovation(s: Record, part: int, row: int, innovation: float, varianc
     mean = s.moving_mean[part, row]
     mean += min(h / q.moving_mean_s, 1.0) * (innovation / math.sqrt(variance) - mean)
     s.moving_mean[part, row] = mean
-    if _turns(s) and s.rotation_std < q.level_std_rad:
+    if s.rotation_std >= q.level_std_rad:  # innovations so far may be those of a wrong heading
+        s.moving_square[part] = min(s.moving_square[part], q.level_square)
+    elif _turns(s):
         square = min(mean * mean * 2 * q.moving_mean_s / h, _MOST_SQUARE)
         span = min(q.level_first_s + s.level_span, q.level_s)
         s.moving_square[part] += min(h / span, 1.0) / 3 * (square - s.moving_square[part])

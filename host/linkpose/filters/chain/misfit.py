@@ -37,9 +37,16 @@ _MOST_DOUBLINGS = 10
 
 
 @inner
-def follow_misfit(bank: Record, best: Record, h: float, q: Record) -> None:
-    """Measure for how long the readings have not fitted two links with one joint, `h` (s) after the last time."""
-    fits = best.moving_square[0] < _MOST_LASTING * q.level_square and best.widening < _MOST_WIDENING
+def follow_misfit(bank: Record, states: Record, h: float, q: Record) -> None:
+    """Measure for how long the readings have not fitted two links with one joint, `h` (s) after the last time.
+
+    While several headings are possible, lasting innovations show that the best one is wrong.
+    """
+    best, alive = states[bank.best], 0
+    for i in range(states.shape[0]):
+        alive += states[i].alive
+    fits = best.moving_square[0] < _MOST_LASTING * q.level_square or alive > 1
+    fits = fits and best.widening < _MOST_WIDENING
     reaches = best.reach_square > _LEAST_REACH_M_S**2
     fits = fits and not (reaches and best.residual_share > _MOST_RESIDUAL**2)
     for k in range(2):

@@ -85,7 +85,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
             std = q.tilt_rad + abs(force / GRAVITY - 1) + q.tilt_moving_s * rate
             _align(s, k, accel, std, 0.8 * math.pi / count * k, q)
             s.speed_square[k], s.accel_square[k], s.shared_square[k] = 0.25, 1.0, 0.0
-            s.up_spread[k] = 0.0
+            s.up_spread[k] = s.up_square[k] = 0.0
             for j in range(3):
                 s.up[k, j], s.up_swing[k, j] = s.rotation[k, 2, j], 0.0
         s.moved_heading = 0.0
@@ -93,6 +93,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
         for k in range(2):
             for j in range(3):
                 s.moved_axis[k, j] = 0.0
+        s.narrow_span = 0.0
         s.residual_share, s.innovation_ratio, s.widening = q.first_residual**2, 1.0, 1.0
         s.play_square = q.first_play_rad**2
         clear_stops(s)
@@ -209,11 +210,11 @@ def _update(s: Record, bank: Record, gyro: Floats, h: float, q: Record, noise: F
     apply_correction(s, size, hinge, base)
     if base >= 0:
         likelihood += update_fixed_joint(s, size, base, gyro, q, noise)
+    narrow_prior(s, size, h, q)
     for k in range(2):
-        narrow_prior(s, size, k, q)
         likelihood += update_velocity(s, size, k, h, q)
         if bank.still_s[k] > q.rest_s:
-            update_rest(s, size, k, gyro, q, noise)
+            update_rest(s, size, k, gyro, bank.turning_square[k], h, q, noise)
     apply_correction(s, size, hinge, base)
     if hinge >= 0:
         if s.has_axis > 0.0:
@@ -267,7 +268,7 @@ def _select(bank: Record, states: Record, q: Record) -> None:
         a, b = s.relative, best.relative
         cosine = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
         s.apart = 2 * math.acos(min(cosine, 1.0))
-        same = min(max(s.rotation_std, best.rotation_std), q.same_rad)
+        same = min(s.rotation_std, best.rotation_std, q.same_rad)
         if s.odds < -q.most_odds or s.apart < same:
             s.alive = 0
 
@@ -428,7 +429,7 @@ def _read(bank: Record, k: int, time_s: float, accel: Floats, gyro: Floats, cali
 def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q: Record, noise: Floats) -> None:
     """One sample, `h` (s) after the last."""
     for k in range(2):
-        follow_rest(bank, states[bank.best], k, gyro, accel, h, q)
+        follow_rest(bank, states[bank.best], k, gyro, accel, h, q, noise)
         if bank.still_s[k] == 0.0:
             bank.rests = 0
     bank.since_update += h
@@ -449,7 +450,7 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
         bank.since_update = 0.0
         end_step(bank, states)
         _select(bank, states, q)
-        follow_misfit(bank, states[bank.best], q.period_s, q)
+        follow_misfit(bank, states, q.period_s, q)
         if not bank.spread and states[0].heading_share > 0.0:
             _spread(bank, states, 1.0, gyro, q)
 
@@ -464,6 +465,7 @@ def _remember(bank: Record, time: float, gyro: Floats, accel: Floats, first: boo
             bank.gyro[k, i], bank.accel[k, i] = gyro[k, i], accel[k, i]
             if first:
                 bank.mean_gyro[k, i], bank.mean_accel[k, i] = gyro[k, i], accel[k, i]
+                bank.lagging_gyro[k, i], bank.lagging_accel[k, i] = gyro[k, i], accel[k, i]
 
 
 @inner

@@ -63,15 +63,27 @@ def integrate(
         s.swing[k, i] = s.swing[k, i] * (1 - min(h / q.swing_s, 1.0)) + own * h
     guess = h * h / 12 if h > LONGEST_STEP_S else 0.0
     rate_square = bx * bx + by * by + bz * bz
+    turning = (by * fz - bz * fy) ** 2 + (bz * fx - bx * fz) ** 2 + (bx * fy - by * fx) ** 2
     gyro_misfit, accel_misfit = s.level * q.gyro_misfit**2, s.level * q.accel_misfit**2
-    s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * rate_square * GYRO_MISFIT_S)
+    misfit_square = rate_square + (slowness(s, k, q) - 1.0) * turning / GRAVITY**2
+    s.rotation_variance[k] += h * (h * noise[0] + gyro_misfit * misfit_square * GYRO_MISFIT_S)
     s.rotation_variance[k] += (h * guess * _JERK_RAD_S3) ** 2
-    s.path_square[k] += h * rate_square
+    s.path_square[k] += h * misfit_square
     s.velocity_variance[k] += h * (h * noise[1] * s.widening + accel_misfit * s.accel_square[k] * _ACCEL_MISFIT_S)
     s.velocity_variance[k] += (h * guess * _JERK_M_S3) ** 2
-    turning = (by * fz - bz * fy) ** 2 + (bz * fx - bx * fz) ** 2 + (bx * fy - by * fx) ** 2
     s.force_rate_square[k] += min(h / q.accel_scale_s, 1.0) * (turning - s.force_rate_square[k])
     _follow_speed(s, k, square, h, q)
+
+
+@inner
+def slowness(s: Record, k: int, q: Record) -> float:
+    """Time over which gravity turns to and fro in the axes of sensor k, in multiples of `turning_s`; at least 1.
+
+    Scale and cross-axis errors are constant, so that what they add to the rate and to the force lasts as long as the
+    turn. White noise with the same sum has a density that is proportional to this time.
+    """
+    slow = GRAVITY * math.sqrt(s.up_square[k]) / (q.turning_s * math.sqrt(s.force_rate_square[k]) + 1e-9)
+    return float(max(slow, 1.0))
 
 
 @inner
@@ -83,15 +95,17 @@ def _follow_speed(s: Record, k: int, accel_square: float, h: float, q: Record) -
     keep = min(h / q.speed_memory_s, 1.0)
     s.speed_square[k] += keep * (square - s.speed_square[k])
     keep_up = min(h / q.swing_memory_s, 1.0)
-    off = changing = 0.0
+    off = changing = apart_square = 0.0
     for i in range(3):
         s.swing_mean[k, i] += keep_up * (s.swing[k, i] - s.swing_mean[k, i])
         changing += (s.swing[k, i] - s.swing_mean[k, i]) ** 2
         apart = s.rotation[k, 2, i] - s.up[k, i]
         s.up[k, i] += keep_up * apart
+        apart_square += apart * apart
         s.up_swing[k, i] += h * apart - min(h / q.swing_s, 1.0) * s.up_swing[k, i]
         off += s.up_swing[k, i] ** 2
     s.up_spread[k] += keep * (off - s.up_spread[k])
+    s.up_square[k] += keep * (apart_square - s.up_square[k])
     s.shared_square[k] += keep * (changing / 3 - s.shared_square[k])
     s.accel_square[k] += keep * (accel_square / 3 - s.accel_square[k])
 
@@ -156,7 +170,8 @@ def propagate_covariance(s: Record, size: int, q: Record) -> None:
         _transpose(p, size)
     for k in range(2):
         o, turned, impulse = OF_SENSOR * k, s.turned[k], s.impulse[k]
-        walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + s.level * q.accel_scale**2 * s.force_rate_square[k]) * span
+        scale_walk = s.level * q.accel_scale**2 * s.force_rate_square[k] * slowness(s, k, q)
+        walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + scale_walk) * span
         _decay_bias(s, size, k, walk, q)
         for i in range(3):
             p[o + i, o + i] += s.rotation_variance[k]

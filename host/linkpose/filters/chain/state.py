@@ -50,6 +50,10 @@ class ChainParameters(NamedTuple):
     # the return, ball joints of [D] lose a third of their accuracy. [O]; doubled, σ +20 %.
     accel_scale: float = 0.02
     accel_scale_s: float = 0.5  # over which that rate is averaged (s)
+    # Time over which gravity turns to and fro in a sensor's axes, its deviation over its rate, at which gyro_misfit and
+    # accel_scale hold: that of the simulated leg (seeds 400, 401). Errors of slower motion last longer, and their
+    # densities grow with it.
+    turning_s: float = 0.29
     accel_walk_m_s2_sqrts: float = 0.001  # of the accelerometer bias: [MPU-6050]'s 35 mg over 65 K, 10 K in 10 min
     accel_misfit: float = 0.02  # share of the linear acceleration that is noise, correlated over 0.05 s
     gyro_walk_rad_s_sqrts: float = 3e-4  # 1 °/s in the hour in which a sensor warms up
@@ -147,8 +151,8 @@ class ChainParameters(NamedTuple):
     # [O]: at 0.03, the slow robot arm loses half of its accuracy.
     relinearized_rad: float = 0.1
     most_odds: float = 12.0  # log odds against a hypothesis beyond which it is dropped
-    # Two hypotheses whose rotations differ by less than their σ, and by less than this, are the same: half the spacing
-    # of the first headings (π / 8). Without this bound, one that is still unknown ends all others.
+    # Two hypotheses whose rotations differ by less than the σ of either, and by less than this, are the same: half the
+    # spacing of the first headings (π / 8).
     same_rad: float = 0.4
     longest_gap_s: float = 0.5  # beyond it the attitudes are lost and the headings start anew
     unknown_rad: float = 1.0  # σ of the relative rotation beyond which it is not reported
@@ -159,9 +163,12 @@ class ChainParameters(NamedTuple):
     speed_m_s: float = 0.3
     gyro_bias_rad_s: float = 0.02  # after a subtraction at rest, which the first estimates of the bias show
     first_gyro_bias_rad_s: float = 0.2  # before that: data sheet of [MPU-6050], ±20 °/s, uniform
-    # Log odds of the former from which on it counts; e : 1. Chosen on the simulated leg in motion, seeds 400-409; at 3,
-    # calibrated sensors are recognised up to 20 s later.
+    # Log odds of the former, by both sensors, from which on it counts; e : 1. Chosen on the simulated leg in motion,
+    # seeds 400-409; at 3, calibrated sensors are recognised up to 20 s later.
     prior_odds: float = 1.0
+    # For which they have to hold (s): in the first second of motion, wrong headings take the biases past zero with a
+    # small σ. Same seeds; at 0 and for each sensor alone, 12 of 40 starts with the data sheet's biases seem calibrated.
+    prior_s: float = 1.0
     accel_bias_m_s2: float = 0.3  # data sheet of [MPU-6050]: ±50 mg
     lever_m: float = 0.3  # of an unknown r_k: links of people and robots
 
@@ -174,6 +181,7 @@ STATE = np.dtype(
         ("velocity", "f8", (2, 3)),
         ("gyro_bias", "f8", (2, 3)),
         ("accel_bias", "f8", (2, 3)),
+        ("narrow_span", "f8"),  # for how long the biases have shown that prior (s)
         ("is_narrow", "i8", 2),  # whether the prior of either gyro bias is the one after a subtraction
         ("lever", "f8", (2, 3)),  # r_k
         ("axis", "f8", (2, 3)),  # j_k
@@ -200,6 +208,7 @@ STATE = np.dtype(
         ("up", "f8", (2, 3)),  # mean of Z of n in either sensor's axes,
         ("up_swing", "f8", (2, 3)),  # and its distance from that mean, integrated like the velocity (s),
         ("up_spread", "f8", 2),  # and its mean square
+        ("up_square", "f8", 2),  # mean square of that distance
         ("speed_square", "f8", 2),
         ("accel_square", "f8", 2),
         ("excess_square", "f8"),  # mean square residual of the joint beyond its floor (m²/s²)
@@ -261,6 +270,9 @@ BANK = np.dtype(
         ("accel", "f8", (2, 3)),
         ("mean_gyro", "f8", (2, 3)),
         ("mean_accel", "f8", (2, 3)),
+        ("lagging_gyro", "f8", (2, 3)),  # means of these means
+        ("lagging_accel", "f8", (2, 3)),
+        ("turning_square", "f8", 2),  # square of the rate at which the mean force turns, less noise (rad²/s²)
         ("still_s", "f8", 2),
         ("rests", "i8"),  # whether both sensors have been at rest since the first sample
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
