@@ -66,11 +66,11 @@ def follow_rest(
     """How long sensor k has been at rest: rate and force steady, and the rate explained by the bias's σ.
 
     A slow turn has a steady rate, too, but turns gravity or changes its rate. The square of the rate that this shows
-    is in `turning_square`.
+    is in `turning_square`, less that of noise and of `rest_std_rad_s`.
     """
     p, o = best.covariance, OF_SENSOR * k + BG
     keep = min(h / _REST_MEAN_S, 1.0)
-    rate_off = force_off = rate = turning = 0.0
+    rate_off = force_off = rate = turning = scatter = 0.0
     for i in range(3):
         bank.mean_gyro[k, i] += keep * (gyro[k, i] - bank.mean_gyro[k, i])
         bank.mean_accel[k, i] += keep * (accel[k, i] - bank.mean_accel[k, i])
@@ -80,6 +80,7 @@ def follow_rest(
         lag = bank.mean_gyro[k, i] - bank.lagging_gyro[k, i]
         bank.lagging_gyro[k, i] += keep * lag
         turning += (lag * _TURN_S / _REST_MEAN_S) ** 2
+        scatter += (gyro[k, i] - bank.mean_gyro[k, i]) ** 2 / 3
         rate_off = max(rate_off, abs(gyro[k, i] - bank.mean_gyro[k, i]))
         force_off = max(force_off, abs(accel[k, i] - bank.mean_accel[k, i]))
         rate = max(rate, abs(bank.mean_gyro[k, i] - best.gyro_bias[k, i]))
@@ -87,8 +88,11 @@ def follow_rest(
     allowed = min(q.most_rest_rad_s, 3 * std + 5 * q.rest_std_rad_s)
     if std**2 > 3 * _UNLEARNED * q.first_gyro_bias_rad_s**2:
         allowed = q.most_first_rest_rad_s
-    own = _OF_NOISE * h / (4 * _REST_MEAN_S**3) * (noise[1] / GRAVITY**2 + noise[0] * _TURN_S**2)
-    bank.turning_square[k] = max(turning - own, 0.0)
+    bank.gyro_scatter[k] += keep * (scatter - bank.gyro_scatter[k])
+    # The gyro's noise may exceed its data sheet.
+    own = max(noise[0], bank.gyro_scatter[k]) * _TURN_S**2 + noise[1] / GRAVITY**2
+    own *= _OF_NOISE * h / (4 * _REST_MEAN_S**3)
+    bank.turning_square[k] = max(turning - own - q.rest_std_rad_s**2, 0.0)
     steady = rate_off < q.rest_gyro_rad_s and force_off < q.rest_accel_m_s2 and rate < allowed
     steady = steady and bank.turning_square[k] < q.rest_gyro_rad_s**2
     bank.still_s[k] = bank.still_s[k] + h if steady else 0.0

@@ -272,6 +272,7 @@ BANK = np.dtype(
         ("mean_accel", "f8", (2, 3)),
         ("lagging_gyro", "f8", (2, 3)),  # means of these means
         ("lagging_accel", "f8", (2, 3)),
+        ("gyro_scatter", "f8", 2),  # mean square of the rate's distance from its mean along one axis (rad²/s²)
         ("turning_square", "f8", 2),  # square of the rate at which the mean force turns, less noise (rad²/s²)
         ("still_s", "f8", 2),
         ("rests", "i8"),  # whether both sensors have been at rest since the first sample
