@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -113,8 +114,14 @@ def vanishing(where: str) -> type:
     def gone(*_: object) -> None:
         raise termios.error(errno.EIO, "Input/output error")
 
-    quiet = {name: lambda *_: b"" for name in ("read", "write", "reset_input_buffer", "cancel_read", "close")}
-    return type("Vanishing", (), {"in_waiting": 0, **quiet, where: gone})
+    def read(*_: object) -> bytes:
+        cancelled.wait()
+        return b""
+
+    cancelled = threading.Event()
+    quiet = {name: lambda *_: None for name in ("write", "reset_input_buffer", "close")}
+    cancel = {"cancel_read": lambda _: cancelled.set()}
+    return type("Vanishing", (), {"in_waiting": 0, "read": read, **cancel, **quiet, where: gone})
 
 
 @pytest.mark.parametrize(
@@ -127,8 +134,8 @@ def test_a_device_that_goes_while_it_is_opened_is_a_sentence(
     port = vanishing(where)
     monkeypatch.setattr(ports, "_is_no_terminal", lambda name: False)
     monkeypatch.setattr(ports.serial, "serial_for_url", lambda *_, **__: port())
-    with pytest.raises(LinkposeError, match=sentence) if sentence else contextlib.nullcontext():
-        connection = Connection("/dev/ttyX")
+    expected = pytest.raises(LinkposeError, match=sentence) if sentence else contextlib.nullcontext()
+    with expected, contextlib.closing(Connection("/dev/ttyX")) as connection:
         connection.send(Ping(1))
 
 
