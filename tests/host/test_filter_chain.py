@@ -432,3 +432,23 @@ def test_a_wrong_heading_of_the_start_is_no_misfit(seed: int) -> None:
 
 def test_readings_in_order_give_no_remark() -> None:
     assert not lp.estimate(_chain("ball")[0], filters=["chain"], joint="ball").remarks
+
+
+@pytest.mark.parametrize("joint", ["ball", "hinge"])
+def test_exchanged_sensors_give_the_inverse_rotation(joint: str) -> None:
+    """With an unknown mounting and a free first joint, nothing shows which sensor is on which link."""
+    measured, *_ = _chain(joint)
+    exchanged = lp.Measurements.from_imu(
+        measured.time_s,
+        measured.accel2_m_s2,
+        measured.gyro2_rad_s,
+        accel2_m_s2=measured.accel_m_s2,
+        gyro2_rad_s=measured.gyro_rad_s,
+    )
+    forward, inverse = (lp.estimate(each, filters=["chain"], joint=joint).chain for each in (measured, exchanged))
+    last = slice(2 * len(measured.time_s) // 3, None)
+    a, b = (_matrices(c.qw, c.qx, c.qy, c.qz)[last] for c in (forward, inverse))
+    cosine = (np.einsum("nij,nji->n", a, b) - 1) / 2
+    apart_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    assert np.all(apart_deg < 2 * np.hypot(forward.rotation_std_deg, inverse.rotation_std_deg)[last])
+    assert apart_deg.max() < 1.0
