@@ -60,6 +60,14 @@ def test_a_sigma_that_was_rounded_to_zero_is_that_of_its_last_digit():
     assert Statistics.of(np.ones(9), np.zeros(9)).nees is None
 
 
+def test_a_constant_error_within_sigma_is_no_error_far_outside():
+    """A wrong first air pressure shifts all heights by one error, whose NEES is as large as that of few far ones."""
+    found = Statistics.of(np.full(1000, 1.55), np.ones(1000))
+    assert found.nees > 2 and found.verdict().startswith("σ is 1.3 times too large: 100 %")
+    steady = Statistics.of(np.full(1000, 1.9), np.ones(1000))
+    assert steady.verdict() == "σ is right: 100 % of the errors are within ±2σ (95 % expected)."
+
+
 def test_rows_fixed_by_definition_have_no_part_in_nees():
     """The yaw of the first row is 0 with σ 0. In other rows, σ of 0 with a real error counts as outside."""
     error, std = np.append(0.3 * np.sign(NOISE), [0.0, 1e-6, -1e-6]), np.append(np.full(len(T), 0.3), [0.0, 0.0, 1e-7])

@@ -97,6 +97,15 @@ def test_colours_widths_and_bands_are_those_of_the_filters(tmp_path):
     )
 
 
+def test_a_filter_without_a_height_is_named_where_it_is_first_drawn(tmp_path):
+    roll = 10 * np.sin(np.arange(600) / 100)
+    more = {"tilt_roll_deg": roll + 1, "tilt_pitch_deg": roll, "joint_inertial_pitch_deg": roll}
+    figure, _ = plotting.plot_tables(link_files(tmp_path, **more))
+    roll_panel, pitch_panel = figure.axes[-2:]
+    assert drawn(roll_panel) == ["truth", "joint-inertial", "joint", "tilt"]
+    assert drawn(pitch_panel) == []
+
+
 def test_barometric_filters_are_drawn_when_asked_for(tmp_path):
     figure, remarks = plotting.plot_tables(link_files(tmp_path), ["imu-baro"])
     assert drawn(figure.axes[0])[:2] == ["truth", "imu-baro"]

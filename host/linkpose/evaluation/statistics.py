@@ -17,6 +17,8 @@ HONEST_SHARE = (0.90, 0.99)
 # NEES beyond which some errors are far outside although the share is not too low. σ of the least such share, 1.2 times
 # too small, has 1.5 with normal errors. Doubled, an error of 20σ in 100 is still named.
 _FAR_NEES = 2.0
+# Errors so many σ large are far outside: one normal error in 16 000. A constant error of 1.5σ has a NEES of 2.3, too.
+_FAR_RATIO = 4.0
 _ROUNDING = 1.001  # that two rounded files differ by, in units of the last digit, with some for binary fractions
 _NORMAL_95 = 1.96  # 95 % of normal errors are within this many σ
 
@@ -55,8 +57,9 @@ class Statistics:
         share = f"{100 * self.within_2sigma:.0f} % of the errors are within ±2σ (95 % expected)"
         if self.within_2sigma < low:
             return f"σ is {self.sigma_ratio:.1f} times too small: {share}."
-        found = f"{1 / max(self.sigma_ratio, 0.01):.1f} times too large" if self.within_2sigma > high else "right"
-        if self.nees > _FAR_NEES:
+        times = 1 / max(self.sigma_ratio, 0.01)
+        found = f"{times:.1f} times too large" if self.within_2sigma > high and times >= 1.05 else "right"
+        if self.nees > _FAR_NEES and self.worst_ratio is not None and self.worst_ratio > _FAR_RATIO:
             far = f"single errors are far outside, up to {self.worst_ratio:.3g}σ"
             return f"σ is {found} for most errors: {share}, but {far}."
         return f"σ is {found}: {share}."

@@ -199,5 +199,5 @@ def _table(axes: Axes, scores: Sequence[Score]) -> None:
     for (row, column), cell in table.get_celld().items():
         cell.set_height(1.0 / (len(rows) + 1))
         cell.visible_edges = "B" if row == 0 else ""
-        cell.set_text_props(ha="left" if column < 2 else "right")
+        cell.set_text_props(ha="left" if column < 2 else "right", va="center_baseline")
         cell.PAD = 0.02

@@ -27,6 +27,11 @@ def has(sources: Sources, *wanted: Quantity) -> bool:
     return any(track.has(q) for track in sources.tracks or sources.all for q in wanted)
 
 
+def labels(sources: Sources, quantity: Quantity) -> set[str]:
+    """Of the filters that have a quantity."""
+    return {track.label for track, _ in pairs(sources.tracks, quantity)}
+
+
 def shade_unknown(axes: Axes, tracks: Sequence[DrawnTrack]) -> None:
     """Shades gaps of the first file, and where none of its filters gives a value."""
     first = [track for track in tracks if track.file == tracks[0].file and track.values] if tracks else []

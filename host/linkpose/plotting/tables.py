@@ -129,7 +129,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
 
 
 def _link(sources: Sources) -> Section | None:
-    """Height (largest), its error, roll, pitch, yaw."""
+    """Height (largest), its error, roll, pitch, yaw. A legend names what no panel above has named."""
     if not panels.has(sources, HEIGHT, ROLL, PITCH):
         return None
     found = []
@@ -143,9 +143,12 @@ def _link(sources: Sources) -> Section | None:
             if panels.differences_hide_best(sources, HEIGHT):
                 found.append(PlotPanel(1.3, lambda axes: panels.from_best(axes, sources, HEIGHT, best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
+    named = panels.labels(sources, HEIGHT)
     for quantity in (ROLL, PITCH, YAW):
         if panels.has(sources, quantity):
-            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found)))
+            drawn = panels.labels(sources, quantity)
+            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found or not drawn <= named)))
+            named |= drawn
     return Section(found)
 
 
