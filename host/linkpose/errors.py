@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 LONGEST_TEXT = 1500  # characters of a sentence. A list of all filters with reasons is shorter
+MOST_STARTS = 3  # that a sentence lists
 
 
 class LinkposeError(Exception):
@@ -341,6 +342,28 @@ class AmbiguousStart(LinkposeError):
         self.places = places
 
 
+class UndecidedStart(LinkposeError):
+    """No place of the map explains the laser scans of the log better than all others. `log` names it.
+
+    `starts` (x m, y m, heading rad) explain them best at the time `time_s`, the best one first. They explain them alike
+    unless the robot `is_still`: then it moved too little to exclude other places.
+    """
+
+    def __init__(
+        self, log: str, time_s: float, starts: Sequence[tuple[float, float, float]], is_still: bool = False
+    ) -> None:
+        words = [f"({x:.1f}, {y:.1f}, {heading:.2f})" for x, y, heading in starts[:MOST_STARTS]]
+        if is_still:
+            text = f"the robot moves too little to be sure of its place: the scans fit {words[0]} (m, m, rad) best"
+        else:
+            text = (
+                f"the scans fit {len(starts)} places of the map alike, "
+                f"{'' if len(starts) == len(words) else 'such as '}{', '.join(words[:-1])} and {words[-1]} (m, m, rad)"
+            )
+        super().__init__(f"{log}: {text} at {time_s:.6g} s, so the path stays unknown")
+        self.log, self.time_s, self.starts, self.is_still = log, time_s, tuple(starts), is_still
+
+
 class NothingToEstimate(LinkposeError):
     """Errors of the ranges are to be estimated, and the log holds no ranges. `log` names it."""
 
@@ -370,14 +393,19 @@ class MapMismatch(LinkposeError):
 
 
 class NothingApplied(LinkposeError):
-    """A filter rejected all `rejected` measurements of the log. `log` names it, `filter` is the filter."""
+    """A filter applied no measurement of the log, and rejected `rejected`. `log` names it, `filter` is the filter.
 
-    def __init__(self, log: str, name: str, rejected: int) -> None:
+    `remark` states what a comparison of single scans with the map has found; empty where there was none.
+    """
+
+    def __init__(self, log: str, name: str, rejected: int, remark: str = "") -> None:
         super().__init__(
-            f"{log}: {name} applied none of the measurements ({rejected} rejected), so there is no estimate; check "
-            "the units (m, s, rad), the start, and the places of the beacons or the map"
+            f"{log}: {name} found no pose that explains the scans: {remark}"
+            if remark
+            else f"{log}: {name} applied none of the measurements ({rejected} rejected), so there is no estimate; "
+            "check the units (m, s, rad), the start, and the places of the beacons or the map"
         )
-        self.log, self.filter, self.rejected = log, name, rejected
+        self.log, self.filter, self.rejected, self.remark = log, name, rejected, remark
 
 
 # ---- values ----

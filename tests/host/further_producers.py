@@ -23,6 +23,7 @@ from test_calibrate_mice import LENGTH_M, broken, driven
 from test_calibration_chain import recording
 from test_calibration_link import OFFSET, SIX_SIDES
 from test_flash import ScriptedPort
+from test_localization_scans import along_a_symmetric_room, in_one_place, localize_in
 
 import linkpose as lp
 from linkpose import inputs
@@ -456,6 +457,12 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "the beacons are near one line, and the first ranges fit a start at … m; add --start X,Y,0 with the true one, or a beacon off the line": written(
             lambda path: lp.localize(path, beacons={"1": (0.0, 0.0), "2": (4.0, 0.0), "3": (8.0, 0.0)}),
             "time_s,kind,a,b,c\n0,range,1,5,\n0,range,2,3,\n0,range,3,5,\n",
+        ),
+        "…: the scans fit … places of the map alike, … (m, m, rad) at … s, so the path stays unknown; add the true one as --start X,Y,HEADING, or drive to where the places differ": raises(
+            lambda: localize_in(*along_a_symmetric_room())
+        ),
+        "…: the robot moves too little to be sure of its place: the scans fit … (m, m, rad) best at … s, so the path stays unknown; add the true one as --start X,Y,HEADING, or drive to where the places differ": raises(
+            lambda: localize_in(*in_one_place())
         ),
         "… holds no ranges from which a scale or bias could be estimated; leave out --estimate": written(
             lambda path: lp.localize(path, map=small_map(path.parent), estimate=("bias",)), SCANS, "a.log"

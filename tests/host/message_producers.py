@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from test_localization_scans import flat_with_rooms, of_half_the_size, scans_in
+from test_localization_scans import elsewhere, flat_with_rooms, localize_in, of_half_the_size, scans_in
 
 import linkpose as lp
 from linkpose import estimate
@@ -242,6 +242,7 @@ MORE: dict[str, dict[str, Producer]] = {
             read_beacons, "id,x_m,y_m\n5,0,0\n05,1,1\n"
         ),
         "…, line …: … is no finite number; complete or delete the row": reading(read_truth, "time_s,x_m,y_m\n0,,1\n"),
+        "…: … found no pose that explains the scans: …": raises(lambda: localize_in(*elsewhere())),
         "… applied none of the measurements (… rejected), so there is no estimate; check the units (m, s, rad), the start, and the places of the beacons or the map": (
             log_of("0,pose,0,0,0\n1,range,1,90,\n", lambda log: lp.localize(log, beacons=BEACONS))
         ),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from linkpose.errors import LinkposeError, MapMismatch
+from linkpose.errors import LinkposeError, MapMismatch, NothingApplied, UndecidedStart
 from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at, seen_distance
 from linkpose.localization.doubts import scan_doubts
@@ -18,7 +18,7 @@ from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.localizer import estimate_track
 from linkpose.localization.map_check import check_map
-from linkpose.localization.paths import localize
+from linkpose.localization.paths import Paths, localize
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import score_track
 from linkpose.localization.track import Track
@@ -210,14 +210,65 @@ def flat_with_rooms() -> GridMap:
 
 def scans_in(grid: GridMap) -> list[Scan]:
     """Scans of 90 beams all around from four places, by steps of a quarter of a cell along each beam."""
+    return scans_from(grid, [(1.5, 1.5, 0.3), (1.0, 4.5, 2.0), (5.0, 4.5, -1.0), (6.5, 1.0, 1.2)])
+
+
+def scans_from(grid: GridMap, poses: list[tuple[float, float, float]]) -> list[Scan]:
+    """Such scans from poses (m, m, rad), one each second."""
     cell, angles, steps = grid.geometry[0], np.radians(np.arange(0, 360, 4.0)), np.arange(0.0, 12.0, 0.025)
     scans = []
-    for time, (x, y, heading) in enumerate([(1.5, 1.5, 0.3), (1.0, 4.5, 2.0), (5.0, 4.5, -1.0), (6.5, 1.0, 1.2)]):
+    for time, (x, y, heading) in enumerate(poses):
         across = ((x + np.outer(np.cos(angles + heading), steps)) / cell).astype(int).clip(0, 79)
         along = ((y + np.outer(np.sin(angles + heading), steps)) / cell).astype(int).clip(0, 59)
         ranges = steps[np.argmax(grid.blocked[along, across] == OCCUPIED, axis=1)]
         scans.append(Scan(float(time), ranges, angles, (0.0, 0.0, 0.0), 80.0))
     return scans
+
+
+def along_a_symmetric_room() -> tuple[Log, GridMap]:
+    """A drive of 0.5 m each second in a room of 8 x 6 m that looks the same from the opposite side."""
+    blocked = np.zeros((60, 80), np.uint8)
+    blocked[[0, -1], :] = blocked[:, [0, -1]] = OCCUPIED
+    room = GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0]))
+    poses = [(1.5 + 0.5 * i, 2.0, 0.0) for i in range(8)]
+    log: Log = [*scans_from(room, poses), *(Event(0.1 * i, "odometry", (0.5, 0.0)) for i in range(80))]
+    return sorted(log, key=lambda event: event.time_s), room
+
+
+def localize_in(log: Log, grid: GridMap) -> Paths:
+    return localize(log, map=grid)
+
+
+def elsewhere() -> tuple[Log, GridMap]:
+    """The drive of `along_a_symmetric_room`, with ranges of another, wider place."""
+    log, room = along_a_symmetric_room()
+    return [replace(e, ranges_m=e.ranges_m + 1.2) if isinstance(e, Scan) else e for e in log], room
+
+
+def in_one_place() -> tuple[Log, GridMap]:
+    """Two seconds of scans in a flat, and next to no motion."""
+    grid = flat_with_rooms()
+    log: Log = [replace(scans_in(grid)[0], time_s=0.1 * i) for i in range(20)]
+    return [*log, Event(2.0, "odometry", (0.0, 0.0)), Event(2.1, "odometry", (0.1, 0.0))], grid
+
+
+def test_a_search_that_never_decides_names_the_places_that_fit_alike() -> None:
+    """The closing sentence blamed the units and the map."""
+    log, room = along_a_symmetric_room()
+    with pytest.raises(UndecidedStart, match="the scans fit 2 places of the map alike") as raised:
+        localize_in(log, room)
+    places = np.array(sorted(raised.value.starts))[:, :2]
+    assert places == pytest.approx(np.array([(1.5, 2.0), (6.5, 4.0)]), abs=0.2)
+    (_, _, one), (_, _, other) = raised.value.starts
+    assert abs(math.cos(one - other) + 1.0) < 0.01
+    assert localize(log, map=room, start=(1.5, 2.0, 0.0))["scan_match_x_m"][-1] == pytest.approx(5.45, abs=0.1)
+
+
+def test_a_robot_that_hardly_moves_and_a_map_of_another_place_are_named_at_the_end_of_a_search() -> None:
+    with pytest.raises(UndecidedStart, match=r"moves too little .* the scans fit .1.5, 1.5, 0.3"):
+        localize_in(*in_one_place())
+    with pytest.raises(NothingApplied, match=r"no pose that explains the scans: only .* of this place"):
+        localize_in(*elsewhere())
 
 
 def of_half_the_size(grid: GridMap) -> GridMap:

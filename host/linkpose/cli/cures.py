@@ -51,6 +51,7 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     errors.MissingBeacons: lambda e: "add --beacons BEACONS.csv",
     errors.MissingStart: lambda e: "add --start X,Y,HEADING (m, m, rad)",
     errors.AmbiguousStart: lambda e: "add --start X,Y,0 with the true one, or a beacon off the line",
+    errors.UndecidedStart: lambda e: "add the true one as --start X,Y,HEADING, or drive to where the places differ",
     errors.NothingToEstimate: lambda e: "leave out --estimate",
     errors.NeedsScans: lambda e: "use --filter ekf",
     errors.NotPositiveDefinite: lambda e: (

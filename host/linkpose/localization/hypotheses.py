@@ -35,9 +35,13 @@ SCANS, SCANS_AGAINST_INCUMBENT = 4, 10
 
 @dataclass(slots=True)
 class Hypothesis:
-    """A filter and the log-likelihood of the scans that it has explained; `is_incumbent` if it was tracked before."""
+    """A filter and the log-likelihood of the scans that it has explained; `is_incumbent` if it was tracked before.
+
+    `first` (3,) is the pose with which it entered the contest.
+    """
 
     filter: KalmanFilter
+    first: Floats
     score: float = 0.0
     is_incumbent: bool = False
 
@@ -56,6 +60,7 @@ class Contest:
         self.required = SCANS_AGAINST_INCUMBENT if self.incumbent else SCANS
         self.scans = 0
         self.moved_m = self.turned_rad = 0.0
+        self.lead = LEAD
 
     @property
     def incumbent(self) -> KalmanFilter | None:
@@ -73,6 +78,11 @@ class Contest:
         off[2] = wrap_angle(float(off[2]))
         return 0.5 * np.outer(off, off)
 
+    def alike(self) -> list[Hypothesis]:
+        """Those that explain the log as well as the best one, best first."""
+        best = self.hypotheses[0].score
+        return [hypothesis for hypothesis in self.hypotheses if hypothesis.score >= best - self.lead]
+
     def moved(self, distance_m: float, turn_rad: float) -> None:
         """Adds a motion of the robot."""
         self.moved_m += abs(distance_m)
@@ -86,7 +96,7 @@ class Contest:
                 hypothesis.score += log_likelihood
         ranked = sorted(self.hypotheses, key=lambda hypothesis: -hypothesis.score)
         misfit = max(0.0, -ranked[0].score)
-        lead, hopeless = max(LEAD, LEAD_SHARE * misfit), max(HOPELESS, HOPELESS_SHARE * misfit)
+        self.lead, hopeless = max(LEAD, LEAD_SHARE * misfit), max(HOPELESS, HOPELESS_SHARE * misfit)
         kept: list[Hypothesis] = []
         for hypothesis in ranked:
             same = next(filter(hypothesis.is_near, kept), None)
@@ -97,6 +107,6 @@ class Contest:
         self.hypotheses = kept
         if len(kept) == 1 and kept[0].is_incumbent:
             return kept[0]
-        if self.scans >= self.required and (len(kept) == 1 or kept[0].score > kept[1].score + lead):
+        if self.scans >= self.required and (len(kept) == 1 or kept[0].score > kept[1].score + self.lead):
             return kept[0]
         return None

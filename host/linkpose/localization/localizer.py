@@ -290,6 +290,7 @@ class Localizer:
             self.widened,
             self.relocated,
             self.consistency,
+            self.laser.rivals() if self.laser else None,
         )
 
     def _row(self) -> Row:

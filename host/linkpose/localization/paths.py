@@ -194,12 +194,12 @@ class PreparedLog:
         tracks: dict[str, Track] = {}
         for method, chosen in settings.items():
             track = estimate_track(self.log, method, chosen, self.grid, self.beacons, str(self.origin))
+            on_map = ""
             if method == "scan-match" and self.grid is not None:
                 share = track.applied / max(track.applied + track.rejected, 1)
-                if remark := check_map(self.log, self.grid, share, str(self.origin)):
-                    remarks += (remark,)
-                remarks += tuple(scan_doubts(self.log, track))
-            track.check_applied(str(self.origin), method)
+                on_map = check_map(self.log, self.grid, share, str(self.origin))
+                remarks += (*([on_map] if on_map else []), *scan_doubts(self.log, track))
+            track.check_applied(str(self.origin), method, on_map)
             if is_tuned and not tracks:
                 remarks += tuple(doubts(self.log, chosen, track, self.free))
             tracks[method] = track

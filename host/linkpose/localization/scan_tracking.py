@@ -13,6 +13,7 @@ from linkpose.localization.hypotheses import INCUMBENT, Contest, Hypothesis
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beams_of
+from linkpose.localization.track import Rivals
 
 # The errors of a map do not average out over scans; they are added to the reported covariance. GRID_ERROR (m, m, rad)
 # is the part that no beam shows: the reference paths of two public buildings differ by so much. The rest is the error
@@ -61,6 +62,8 @@ class ScanTracker:
         """`growth` is that of a range's standard deviation with the range (m/m)."""
         self.matcher = ScanMatcher(grid, growth)
         self.contest: Contest | None = None
+        self.now_s = self.opened_s = 0.0  # the latest scan; the start of the latest contest
+        self.last_beams: Floats = np.empty((0, 5))
         self.bad = 0
         self.was_known = False
         self.wait = BAD_SCANS
@@ -88,6 +91,7 @@ class ScanTracker:
         beams = beams_of(scan)
         if len(beams) < FEWEST_BEAMS:
             return Result(run, known)
+        self.now_s, self.last_beams = scan.time_s, beams
         if self.contest is not None:
             return self._continue(self.contest, run, beams)
         if not known:
@@ -128,6 +132,15 @@ class ScanTracker:
         common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
         self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
 
+    def rivals(self) -> Rivals | None:
+        """The poses that explain the scans alike, if the pose was never known. None after a log without scans."""
+        if self.contest is None or self.was_known:
+            return None
+        alike = self.contest.alike()
+        share, _ = self.matcher.compare(self.last_beams, _pose_of(alike[0].filter))
+        poses = [(float(x), float(y), float(heading)) for x, y, heading in (one.first for one in alike)]
+        return Rivals(self.opened_s, poses, share, self.contest.scans < self.contest.required)
+
     def _open(
         self, run: KalmanFilter, beams: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
     ) -> Result:
@@ -138,11 +151,12 @@ class ScanTracker:
             candidate.place(candidate.pose_indices, pose, np.diag(CANDIDATE_STD**2))
             self.matcher.correct(candidate, beams)
             candidates.append(candidate)
+        self.opened_s = self.now_s
         self.contest = Contest(
-            [Hypothesis(other, INCUMBENT, True) for other in others]
-            + [Hypothesis(candidate) for candidate in candidates[len(others) :]]
+            [Hypothesis(other, _pose_of(other), INCUMBENT, True) for other in others]
+            + [Hypothesis(candidate, _pose_of(candidate)) for candidate in candidates[len(others) :]]
         )
-        self.contest.judge([self.matcher.compare(beams, c.state[c.pose_indices])[1] for c in candidates])
+        self.contest.judge([self.matcher.compare(beams, _pose_of(c))[1] for c in candidates])
         return self._undecided(run, beams)
 
     def _undecided(self, run: KalmanFilter, beams: Floats) -> Result:
@@ -163,10 +177,15 @@ class ScanTracker:
             # A search that found nothing better is not repeated soon.
             self.wait = min(2 * self.wait, MOST_BAD_SCANS) if winner.is_incumbent else BAD_SCANS
             self.contest, self.bad, self.was_known = None, 0, True
-            share, _ = self.matcher.compare(beams, winner.filter.state[winner.filter.pose_indices])
+            share, _ = self.matcher.compare(beams, _pose_of(winner.filter))
             return Result(winner.filter, True, round(share * len(beams)), len(beams), relocated)
         self.bad = self.bad + 1 if max(likelihoods) < self._below(BAD) else 0
         if self.bad >= BAD_SCANS:  # none of the hypotheses is right: the robot was carried meanwhile
             self.bad = 0
             return self._open(run, beams, [])
         return self._undecided(run, beams)
+
+
+def _pose_of(run: KalmanFilter) -> Floats:
+    """x, y, heading (3,) of a filter."""
+    return np.asarray(run.state[run.pose_indices], dtype=np.float64)

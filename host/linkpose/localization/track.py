@@ -3,13 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from linkpose.errors import NothingApplied
+from linkpose.errors import NothingApplied, UndecidedStart
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.linalg import Floats
+
+# The best of several poses that fit alike must explain such a share of the beams; else the map is another one. With the
+# map or the laser mirrored, the share is 0.03 to 0.25.
+LEAST_SHARE = 0.5
+
+
+class Rivals(NamedTuple):
+    """Poses (x m, y m, heading rad) at `time_s` that explain the scans since alike, best first.
+
+    `share` of the beams of the latest scan hit a wall from the best one. `is_still`: the robot moved too little for a
+    decision.
+    """
+
+    time_s: float
+    poses: list[tuple[float, float, float]]
+    share: float
+    is_still: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +38,8 @@ class Track:
     `rejected` count measurements: a range, a beam, a landmark, a depth, an attitude. `rejected_sightings` holds time
     and beacon of each range and each landmark outside the gate. `widened` counts how often the standard deviations of
     the pose were raised because most measurements were rejected, `relocated` how often the pose was found again.
-    `consistency` holds the normalised innovations squared by sensor.
+    `consistency` holds the normalised innovations squared by sensor, `rivals` what was left of a search of the map that
+    never decided.
     """
 
     names: tuple[str, ...]
@@ -33,11 +52,18 @@ class Track:
     widened: int
     relocated: int = 0
     consistency: Consistency = field(default_factory=Consistency)
+    rivals: Rivals | None = None
 
-    def check_applied(self, origin: str, name: str) -> None:
-        """Raises NothingApplied where the filter applied no measurement, so that its path is dead reckoning."""
-        if self.applied == 0:
-            raise NothingApplied(origin, name, self.rejected)
+    def check_applied(self, origin: str, name: str, remark: str = "") -> None:
+        """Raises NothingApplied where the filter applied no measurement, so that its path is dead reckoning.
+
+        `remark` states what is wrong with the map. Raises UndecidedStart where several places of the map fit alike.
+        """
+        if self.applied:
+            return
+        if self.rivals is not None and self.rivals.share >= LEAST_SHARE:
+            raise UndecidedStart(origin, self.rivals.time_s, self.rivals.poses, self.rivals.is_still)
+        raise NothingApplied(origin, name, self.rejected, remark)
 
     @property
     def position_m(self) -> Floats:
