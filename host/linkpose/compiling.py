@@ -63,6 +63,7 @@ _SOURCES = (
     "quantities.py",
     "rotations.py",
     "lean_compiler.py",
+    "lean_lowering.py",
     "filters/**/*.py",
     "localization/**/*.py",
     "recording/**/*.py",

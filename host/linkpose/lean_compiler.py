@@ -4,9 +4,10 @@ Numba's own pipeline serves any Python function. It runs 28 passes over each fun
 and optimises each callee again in every caller. Cold, that took two thirds of the time until the first estimate
 appeared. These two pipelines keep the passes that such functions need. `Inner` functions stay unoptimised LLVM code;
 `Outer` links all that it calls and optimises it once. Numba's answers to questions that recur are remembered.
+`lean_lowering` writes the LLVM code.
 
-Not supported here: closures, comprehensions, generators, `with`, exceptions with computed messages. Array expressions
-work, but are not fused.
+Not supported here: closures, comprehensions, generators, `with`, `try`, exceptions with computed messages. Array
+expressions work, but are not fused.
 
 Source: numba's developer manual, "Customizing the compiler" (pipelines), and numba.core.codegen (libraries).
 """
@@ -16,18 +17,19 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
-import operator
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
 from llvmlite.binding import Linkage, executionengine
-from numba.core import base, ir, lowering, typed_passes, types, untyped_passes
+from numba.core import base, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.ir_utils import build_definitions
 from numba.core.ssa import reconstruct_ssa
+
+from linkpose.lean_lowering import Lower
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -75,16 +77,6 @@ class _Release(typed_passes.IRLegalization):  # type: ignore[misc]
         return bool(state.flags.nrt) and super().run_pass(state)
 
 
-class _Lower(lowering.Lower):  # type: ignore[misc]
-    """Writes LLVM code."""
-
-    def lower_binop(self, resty: Any, expr: Any, op: Any) -> Any:
-        """Only powers have code of their own for constant operands: numba would look for it three times."""
-        if op not in (operator.pow, operator.ipow):
-            expr.static_lhs = expr.static_rhs = ir.UNDEFINED
-        return super().lower_binop(resty, expr, op)
-
-
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _Lowering(typed_passes.NativeLowering):  # type: ignore[misc]
     """The step to LLVM code."""
@@ -92,8 +84,8 @@ class _Lowering(typed_passes.NativeLowering):  # type: ignore[misc]
     _name = "lean_native_lowering"
 
     @property
-    def lowering_class(self) -> type[lowering.Lower]:
-        return _Lower
+    def lowering_class(self) -> type[Lower]:
+        return Lower
 
 
 _PASSES = (

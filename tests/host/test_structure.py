@@ -16,7 +16,8 @@ PACKAGE = Path(__file__).parents[2] / "host" / "linkpose"
 # From the bottom up. A part imports parts of lower levels only; those of one level do not import each other, except as
 # listed. A string that names a module of linkpose, for import_module or for pyserial, counts as an import.
 LEVELS = [
-    {"lean_compiler", "rotations"},
+    {"lean_lowering", "rotations"},
+    {"lean_compiler"},
     {"errors", "compiling", "quantities"},
     {"inputs", "outputs"},
     {"wire", "presentation", "extremes"},
