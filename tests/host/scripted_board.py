@@ -12,7 +12,7 @@ from linkpose.device import session as session_module
 from linkpose.simulation import protocol_sim
 from linkpose.simulation.board import Run, SimulatedBoard
 from linkpose.wire.frames import OtherProtocol, encode
-from linkpose.wire.messages import Configure, GetInfo, Hello, Message, ResetCause, Status
+from linkpose.wire.messages import Configure, GetInfo, Hello, Message, ResetCause, Start, Status
 
 
 class ScriptedBoard(SimulatedBoard):
@@ -20,7 +20,8 @@ class ScriptedBoard(SimulatedBoard):
 
     `hello` and `status` change what the board reports; `lost` decides which answers get lost, by the command. A reset
     happens so many ticks after the host has checked the stream's settings (`resets`), and at each command for which
-    `resets_at` is true.
+    `resets_at` is true; after one of `foreign_starts`, another program starts the board. From `repeats_from` on, it
+    sends one sample again and again.
     """
 
     def __init__(self) -> None:
@@ -28,6 +29,9 @@ class ScriptedBoard(SimulatedBoard):
         self.status: Callable[[Status], Status] = lambda status: status
         self.lost: Callable[[Message | OtherProtocol], bool] = lambda message: False
         self.resets: list[int] = []
+        self.foreign_starts: list[int] = []
+        self.repeats_from = -1
+        self._frame = b""
         self.resets_at: Callable[[Message | OtherProtocol], bool] = lambda message: False
         self.cause = int(ResetCause.POWER_ON)
         self.hung_at = 0xFFFF
@@ -61,13 +65,33 @@ class ScriptedBoard(SimulatedBoard):
     def advance(self, now_us: int) -> bytes:
         if self._pauses:
             return b""
+        before = self._tick
         data = super().advance(now_us)
+        if self._tick <= self.repeats_from:
+            self._frame = data[: data.find(b"\0") + 1] or self._frame
+        elif self.repeats_from >= 0:
+            data = self._frame * (self._tick - before)
         while self.inserted and self._samples is not None and self._tick >= self.inserted[0][0]:
-            data += encode(self.inserted.pop(0)[1])
-        if self.resets and self._checked_at is not None and self._tick >= self._checked_at + self.resets[0]:
-            self.resets.pop(0)
+            message = self.inserted.pop(0)[1]
+            data += encode(message)
+            if isinstance(message, Hello):  # the host looks at the settings
+                self._checked_at = None
+        if self._has_passed(self.resets):
             data += self.reset()
+        if self._has_passed(self.foreign_starts):
+            self.reset()
+            super()._answer(Start(), now_us)
+            self._checked_at = 0
+            data += super().advance(self._start_us)
+            self._checked_at = None
         return data
+
+    def _has_passed(self, ticks: list[int]) -> bool:
+        """Whether so many ticks as the first of these have passed since the host checked, which is then removed."""
+        if not ticks or self._checked_at is None or self._tick < self._checked_at + ticks[0]:
+            return False
+        del ticks[0]
+        return True
 
     def _answer(self, message: Message | OtherProtocol, now_us: int) -> list[Message]:
         if self.resets_at(message):

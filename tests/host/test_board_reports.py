@@ -220,6 +220,95 @@ def test_another_program_at_the_same_socket_is_reported_once(
     )
 
 
+# ---- silence, and streams of others ----
+
+
+def test_a_stream_that_another_program_starts_is_never_scaled_by_the_settings_of_before(board: ScriptedBoard) -> None:
+    """The board streams at ±16 g and 50 Hz as asked; after a reset it is started at its defaults, and no HELLO comes.
+
+    Gravity read 19.6 m/s² and time ran at half its rate, without a word.
+    """
+    board.foreign_starts = [20]
+    messages, connected, blocks = stream_through(board)
+    check_resumed(connected, blocks)
+    (line,) = messages
+    assert "does not go on from its last sample: the board was started again, or is another one" in line
+
+
+def test_another_board_that_streams_ends_the_recording(board: ScriptedBoard) -> None:
+    board.foreign_starts = [20]
+    other_id = {"id": 0x70}
+
+    def hello(message: Hello) -> Hello:
+        if board.foreign_starts:
+            return message
+        return message._replace(devices=(message.devices[0]._replace(**other_id), *message.devices[1:]))
+
+    board.hello = hello
+    with Session("sim://link?speed=0", print) as session, pytest.raises(session_module.AnotherBoard, match="0x70"):
+        list(session.stream(2.0))
+
+
+def test_a_hello_with_other_settings_during_the_stream_is_not_ignored(board: ScriptedBoard) -> None:
+    """Another program asks for HELLO after it has changed the settings."""
+    messages: list[str] = []
+    with Session("sim://link?speed=0", messages.append) as session:
+        board.inserted = [(50, session.hello._replace(streaming=1, accel_range_g=2))]
+        assert sum(map(len, session.stream(2.0))) + session.timeline.lost == 200
+        assert [gap.cause for gap in session.timeline.gaps] == ["reset"]
+    assert ["does not go on from its last sample" in line for line in messages] == [True]
+
+
+def test_one_sample_sent_for_ever_ends_with_the_duration(board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of them passed for a sample that had come, so that the run never ended."""
+    monkeypatch.setattr(session_module, "SILENCE_S", 0.2)
+    board.repeats_from = 50
+    messages: list[str] = []
+    with Session("sim://link?speed=0", messages.append) as session:
+        assert sum(map(len, session.stream(2.0))) == 50
+        assert (session.timeline.lost, session.timeline.gaps[-1].cause) == (150, "link")
+    assert ["numbers that came before" in line for line in messages] == [True, False]
+    assert "150 samples are counted as lost" in messages[1]
+
+
+def test_what_is_missing_when_the_user_ends_the_run_counts(
+    board: ScriptedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording that Ctrl-C ended in a silence of hours had "0 lost" and no gap."""
+    monkeypatch.setattr(session_module, "LATE_S", 0.05)
+    messages: list[str] = []
+    with Session("sim://link?speed=0", messages.append) as session:
+        board.pauses_at = 50
+        stream = session.stream()
+        while session.health().silent_s < 1.0:
+            next(stream)
+        stream.close()
+        check_missing_at_the_end(session, messages, "link")
+        assert session.timeline.lost >= 90
+
+
+def test_what_is_missing_when_the_user_ends_the_wait_for_the_board_counts(tmp_path: Path) -> None:
+    messages: list[str] = []
+    with PtyBoard(tmp_path / "port") as board, Session(str(tmp_path / "port"), messages.append) as session:
+        stream = session.stream()
+        while session.timeline.samples < 20:
+            next(stream)
+        board.pull()
+        while session.health().silent_s < 0.3:
+            next(stream)
+        stream.close()
+        check_missing_at_the_end(session, messages, "cable")
+        assert session.timeline.lost >= 25
+
+
+def check_missing_at_the_end(session: Session, messages: list[str], cause: str) -> None:
+    timeline = session.timeline
+    assert timeline.lost == timeline.missing_at_end
+    assert [gap.cause for gap in timeline.gaps] == [cause]
+    assert timeline.duration_s == pytest.approx(0.01 * (timeline.samples + timeline.lost), abs=0.02)
+    assert f"{timeline.lost} samples are counted as lost" in messages[-1]
+
+
 # ---- resets while the session resumes ----
 
 

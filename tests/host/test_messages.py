@@ -435,6 +435,7 @@ REPORTS = [
     "test_device.py::test_a_board_that_returns_under_another_name_is_found",
     "test_board_reports.py::test_where_the_firmware_hung_is_reported",
     "test_board_reports.py::test_another_firmware_after_a_reset_is_reported",
+    "test_board_reports.py::test_a_stream_that_another_program_starts_is_never_scaled_by_the_settings_of_before",
     "test_device.py::test_a_stream_that_turns_to_noise_is_reported",
     "test_device.py::test_a_board_that_does_not_return_ends_with_the_duration_and_what_is_missing_counts",
     "test_device.py::test_a_board_clock_that_stands_still_or_jumps_is_reported_once",

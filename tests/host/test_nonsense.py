@@ -17,6 +17,7 @@ from linkpose.errors import FileFormatError
 from linkpose.recording.consistency import contradiction
 from linkpose.recording.reader import load_recording
 from linkpose.recording.units import suspicions
+from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.measurements import Measurements
 from linkpose.simulation.chain import ChainRun
 from linkpose.simulation.link import LinkRun
@@ -344,6 +345,18 @@ def coarse(table: dict[str, np.ndarray]) -> None:
 )
 def test_readings_that_are_repeated_and_marked_as_new_are_named(tmp_path: Path, change, is_named: bool) -> None:
     assert ("baro_fresh is 1 in 600 rows, and pressure_Pa changes in" in remarks(tmp_path, change)) == is_named
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_recording_with_many_losses_is_not_called_one_with_wrong_times_or_repeated_readings(every: int) -> None:
+    """Every second sample was lost: "multiply time_s by 0.5", and "pressure_Pa changes in 41 of 147 rows"."""
+    rows = np.arange(0, 1200, every)
+    pressure_pa = 100_000 + np.random.default_rng(3).normal(0.0, 3.0, 400)[rows // 3]
+    fresh = np.diff(rows // 3, prepend=-1) > 0
+    flags = np.full(len(rows), GAP_BEFORE | 9, dtype=np.int64)
+    still = np.tile([0.0, 0.0, 9.81], (len(rows), 1)) + np.random.default_rng(4).normal(0.0, 0.02, (len(rows), 3))
+    values = Measurements.from_imu(rows / 100, still, np.random.default_rng(5).normal(0.0, 0.001, (len(rows), 3)))
+    assert not suspicions(dataclasses.replace(values, pressure_Pa=pressure_pa, baro_fresh=fresh, flags=flags), 100.0)
 
 
 @pytest.mark.parametrize(("every", "is_named"), [(2, True), (5, True), (20, False)])

@@ -147,6 +147,42 @@ def test_a_part_of_the_stream_that_comes_twice_is_taken_once_live_and_in_replay(
     assert ((replayed.flags & GAP_BEFORE) != 0).tolist() == [bool(place.flags & GAP_BEFORE) for place in live]
 
 
+@pytest.mark.parametrize(
+    ("seq", "t_us"),
+    [
+        (lambda tick: tick - 150, lambda tick: 10_000 * (tick - 150)),
+        (lambda tick: tick + 5000, lambda tick: 10_000 * tick),
+        (lambda tick: tick + 150, lambda tick: 10_000 * tick + 60_000_000),
+    ],
+    ids=["started again", "count jumps", "clock jumps over a loss"],
+)
+def test_samples_of_another_stream_are_left_out_live_and_in_replay(tmp_path, seq, t_us):
+    """They came to 5000 samples lost within 0.01 s, to times a minute ahead, or to values in another scale."""
+    ours = [sample(tick, 10_000 * tick) for tick in range(150)]
+    others = [sample(seq(tick), t_us(tick)) for tick in range(150, 170)]
+    again = [sample(tick, 30_000_000 + 10_000 * tick) for tick in range(50)]
+    timeline = Timeline(100.0)
+    for each in ours:
+        assert timeline.follows(each) and timeline.place(each, BoardClock(), 0.0)
+    assert not timeline.follows(others[0])
+    capture, hello = tmp_path / "others.bin", board.hello(board.DEFAULTS)
+    capture.write_bytes(b"".join(map(frames.encode, [hello, *ours, *others, hello, *again])))
+    replayed = load_recording(capture).measurements
+    assert replayed.time_s == pytest.approx(np.arange(200) / 100, abs=1e-6)
+    assert np.flatnonzero(replayed.flags & GAP_BEFORE).tolist() == [150]
+    capture.write_bytes(b"".join(map(frames.encode, [hello, *ours, *others])))  # with no HELLO behind them, they stay
+    replayed = load_recording(capture)
+    assert np.flatnonzero(replayed.measurements.flags & GAP_BEFORE).tolist() == [150]
+    assert len(replayed.measurements) == 170 and not any("samples lost" in remark for remark in replayed.remarks)
+
+
+@pytest.mark.parametrize("ticks", [101, 5000, 65536 + 150, 200_000])
+def test_a_long_loss_is_no_other_stream(ticks):
+    timeline = Timeline(100.0)
+    timeline.place(sample(0, WRAP - 5_000), BoardClock(), 0.0)
+    assert timeline.follows(sample(ticks, WRAP - 5_000 + 10_000 * ticks))
+
+
 def test_samples_lost_before_the_first_one_count():
     timeline = Timeline(100)
     place = timeline.place(sample(3, 0), BoardClock(), 0.0)

@@ -129,7 +129,7 @@ class Session:
         self.timeline = Timeline(1.0)
         self._pings: dict[int, float] = {}
         self._token = random.getrandbits(32)  # another program's differ
-        self._other_program_reported = False
+        self._other_program_reported = self._foreign_start_reported = False
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
@@ -348,6 +348,15 @@ class Session:
         timeline = self.timeline = Timeline(self.hello.sample_rate_hz, duration_s or math.inf)
         self._begin()
         self._arrived_s = self._connection.now()
+        try:
+            yield from self._samples(timeline)
+        finally:
+            self._end(timeline)
+        if not timeline.samples:
+            raise BoardError("the board accepted START, but no sample arrived; check the cable, and reset the board")
+
+    def _samples(self, timeline: Timeline) -> Iterator[list[Placement]]:
+        """The samples up to the timeline's end, over resets and pulled cables."""
         while not timeline.is_over:
             try:
                 placements = self._next(timeline)
@@ -363,9 +372,12 @@ class Session:
             yield placements
             if self._silent_s > LATE_S:
                 self._end_when_due(timeline)
-        if not timeline.samples:
-            raise BoardError("the board accepted START, but no sample arrived; check the cable, and reset the board")
-        if timeline.missing_at_end:
+
+    def _end(self, timeline: Timeline) -> None:
+        """Count what is missing at the end of the run, also where the user or a failure ended it in a silence."""
+        if self._silent_s > LATE_S or timeline.is_interrupted:
+            timeline.end_at(timeline.duration_s + self._connection.now() - self._arrived_s)
+        if timeline.samples and timeline.missing_at_end:
             self.notify(
                 f"no sample came in the last {timeline.end_gap_s:.2f} s of the run: {timeline.missing_at_end} samples "
                 "are counted as lost"
@@ -408,6 +420,8 @@ class Session:
                 messages += arrival.messages
                 arrived_s = arrival.time_s
             hellos = [message for message in arrival.messages if isinstance(message, Hello)]
+            for hello in hellos:
+                self._check_identity(hello)
             if hellos:
                 sound = all(hello.streaming and _configured(hello) == wanted for hello in hellos)
                 rest: list[Message | OtherProtocol] = [
@@ -422,31 +436,37 @@ class Session:
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
-        waited_s, self._looked_s = now - self._looked_s, now
-        if arrival is None or not arrival.messages:
-            self._unread_bytes += len(arrival.data) if arrival else 0
-            self._silent_s += min(waited_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
-            self._ask_when_silent()
-            return []
+        self._silent_s += min(now - self._looked_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
+        self._looked_s = now
+        if arrival is not None and not arrival.messages:
+            self._unread_bytes += len(arrival.data)
         placements: list[Placement] = []
-        for at, message in enumerate(arrival.messages):
-            if isinstance(message, Sample):
-                self._silent_s = self._asked_s = 0.0
-                self._unread_bytes = 0
-                self._arrived_s = arrival.time_s
-                place = timeline.place(message, self._clock, arrival.time_s)
-                self._report_clock_fault(timeline)
-                self._repeats = 0 if place else self._repeats + 1
-                self._report_repeats(timeline)
-                if place is not None:
-                    placements.append(Placement(message, place))
-            elif placements and isinstance(message, Hello | OtherProtocol):
-                # It may end the connection, and the samples before it must not be lost then.
+        for at, message in enumerate(arrival.messages if arrival else ()):
+            assert arrival is not None
+            is_event = not timeline.follows(message) if isinstance(message, Sample) else _may_end(message)
+            if placements and is_event:  # it may end the connection, and the samples before it must not be lost then
                 self._unhandled = Arrival(arrival.time_s, arrival.messages[at:], b"")
                 break
+            if isinstance(message, Sample) and not is_event:
+                placements += self._place(message, arrival.time_s, timeline)
             elif self._handle(message, arrival, timeline):
                 break
+        if not placements:
+            self._ask_when_silent()
         return placements
+
+    def _place(self, sample: Sample, arrived_s: float, timeline: Timeline) -> list[Placement]:
+        """The sample and its place; nothing if it came before, or comes after the end."""
+        place = timeline.place(sample, self._clock, arrived_s)
+        self._report_clock_fault(timeline)
+        self._repeats = 0 if place else self._repeats + 1
+        self._report_repeats(timeline)
+        if place is None:
+            return []
+        self._silent_s = self._asked_s = 0.0
+        self._unread_bytes = 0
+        self._arrived_s = arrived_s
+        return [Placement(sample, place)]
 
     def _check_supply(self, status: Status) -> None:
         if not 0 < status.vcc_mv < LOW_SUPPLY_MV or self._supply_reported:
@@ -478,7 +498,7 @@ class Session:
     def _ask_when_silent(self) -> None:
         """Send GET_INFO to a silent board: it may have been reset and its HELLO lost."""
         if self._silent_s - self._asked_s > SILENCE_S:
-            if self._asked_s == 0.0:
+            if self._asked_s == 0.0 and not self._repeats:
                 noise = f", only {self._unread_bytes} bytes of noise" if self._unread_bytes > MOST_UNREAD_BYTES else ""
                 self.notify(f"no sample for {SILENCE_S:g} s{noise}; asking the board")
             self._asked_s = self._silent_s
@@ -499,19 +519,49 @@ class Session:
         elif isinstance(message, Hello) and not message.streaming:
             self._check_versions(message)
             self.notify(f"the board was reset ({reset_causes(message)}); going on, the gap is marked")
-            timeline.interrupted("reset")
-            try:
-                self._resume(message)
-            except (WrongFirmware, AnotherBoard, Disconnected):
-                raise
-            except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
-                raise NotResumed(self.port, error) from error
+            self._go_on(timeline, lambda: self._resume(message))
+            return True
+        elif isinstance(message, Sample) or (isinstance(message, Hello) and _configured(message) != self._wanted):
+            self._report_foreign_start()
+            self._go_on(timeline, self._begin)
             return True
         return False
 
+    def _report_foreign_start(self) -> None:
+        """Report a stream that this program has not started, once: its settings may be others."""
+        if not self._foreign_start_reported:
+            self._foreign_start_reported = True
+            self.notify(
+                f"the stream at {self.port} does not go on from its last sample: the board was started again, or is "
+                "another one; its settings are checked, the gap is marked"
+            )
+
+    def _go_on(self, timeline: Timeline, resume: Callable[[], None]) -> None:
+        """Mark the gap and continue. Raises NotResumed where that fails: the board is then waited for."""
+        timeline.interrupted("reset")
+        try:
+            resume()
+        except (WrongFirmware, AnotherBoard, Disconnected):
+            raise
+        except LinkposeError as error:  # reset again, or answers were lost: wait for it as after a pulled cable
+            raise NotResumed(self.port, error) from error
+
     def _resume(self, hello: Hello) -> None:
         """Restores the settings and continues streaming."""
-        self.hello, before = hello, self._first_hello
+        self._check_identity(hello)
+        self.hello = hello
+        if self._first_hello.source_revision != hello.source_revision:
+            self.notify(
+                f"the board's firmware is another one now: source revision {hello.source_revision:08x} instead of "
+                f"{self._first_hello.source_revision:08x}"
+            )
+        if _configured(hello) != self._wanted:
+            self.configure(self._wanted)
+        self._begin()
+
+    def _check_identity(self, hello: Hello) -> None:
+        """Raises AnotherBoard if this HELLO is not of the board that the session began with."""
+        before = self._first_hello
         if before.baro_words != hello.baro_words and found(before) & found(hello) & Sensors.BMP180:
             raise AnotherBoard(f"another board answers at {self.port} now; record it into a file of its own")
         for old, new in zip(before.devices, hello.devices, strict=True):
@@ -520,14 +570,6 @@ class Session:
                     f"another board answers at {self.port} now (a sensor has the id {new.id:#04x} instead of "
                     f"{old.id:#04x}); record it into a file of its own"
                 )
-        if before.source_revision != hello.source_revision:
-            self.notify(
-                f"the board's firmware is another one now: source revision {hello.source_revision:08x} instead of "
-                f"{before.source_revision:08x}"
-            )
-        if _configured(hello) != self._wanted:
-            self.configure(self._wanted)
-        self._begin()
 
     def _reconnect(self, timeline: Timeline) -> Iterator[list[Placement]]:
         """Wait until the board can be opened again and streams, or the duration is over; yields while it waits.
@@ -618,6 +660,11 @@ def _configured(hello: Hello) -> Configure:
 def _first(kind: type[Answer], messages: Iterable[Message | OtherProtocol]) -> Answer | None:
     """The first message of a kind."""
     return next((message for message in messages if isinstance(message, kind)), None)
+
+
+def _may_end(message: Message | OtherProtocol) -> bool:
+    """Whether a message may end the connection or restart the stream."""
+    return isinstance(message, Hello | OtherProtocol)
 
 
 def _no_answer(command: str) -> LinkposeError:

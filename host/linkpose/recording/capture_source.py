@@ -23,7 +23,7 @@ from linkpose.sensors.conversion import (
 from linkpose.sensors.devices import impossible
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.rig import Rig
-from linkpose.sensors.timeline import OFF_TICKS, WINDOW_TICKS
+from linkpose.sensors.timeline import OFF_TICKS, WINDOW_TICKS, is_foreign, is_step, off_ticks
 from linkpose.wire.frames import OtherProtocol
 from linkpose.wire.messages import PROTOCOL_MAJOR, Hello
 
@@ -148,6 +148,7 @@ class _CaptureClock:
         self._restarts = np.array(restarts, dtype=np.int64)
         self._period_us = round(1e6 / rate_hz)
         self._placed = self._elapsed_us = 0
+        self._foreign_to = 0  # the sample before which those of another stream end
         self._last: tuple[int, int] | None = None  # t_us and seq
         self.gaps = self.lost = self.jumps = 0
 
@@ -155,17 +156,18 @@ class _CaptureClock:
         """Which of the next samples (N,) are new; times (M,) of these, s, and the flag of those after a gap."""
         inside = (self._restarts >= self._placed) & (self._restarts < self._placed + len(raw))
         restarts = self._restarts[inside] - self._placed
-        self._placed += len(raw)
         t_us, seq = raw["t_us"].astype(np.int64), raw["seq"].astype(np.int64)
         new = self._are_new(t_us, seq, restarts)
+        restarts = self._drop_foreign(new, t_us, seq, restarts)
+        self._placed += len(raw)
         restarts = (np.cumsum(new) - 1)[restarts]
         t_us, seq = t_us[new], seq[new]
         if not len(seq):
             return new, np.empty(0), np.empty(0, np.int64)
-        before = self._last or (int(t_us[0]), -1)
-        step_us = np.diff(t_us, prepend=before[0]) % _T_WRAP
-        ticks = np.diff(seq, prepend=before[1]) % _SEQ_WRAP
-        jumped = self._jumps(step_us, ticks)
+        step_us, ticks = self._steps(t_us, seq)
+        jumped = (ticks > 0) & (ticks <= WINDOW_TICKS)
+        jumped &= np.abs(off_ticks(step_us, ticks, self._period_us)) > OFF_TICKS * self._period_us
+        jumped[0] &= self._last is not None
         step_us[jumped] = ticks[jumped] * self._period_us
         self.jumps += int(np.count_nonzero(jumped))
         step_us[restarts], ticks[restarts] = self._period_us, 1
@@ -177,30 +179,49 @@ class _CaptureClock:
         self._elapsed_us, self._last = int(elapsed_us[-1]), (int(t_us[-1]), int(seq[-1]))
         return new, np.round(elapsed_us * 1e-6, TIME_DECIMALS), np.where(marked, GAP_BEFORE, 0)
 
+    def _steps(self, t_us: NDArray[np.int64], seq: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Steps of the board's clock (µs) and ticks from sample to sample, forward over their wraps."""
+        before = self._last or (int(t_us[0]), -1)
+        return np.diff(t_us, prepend=before[0]) % _T_WRAP, np.diff(seq, prepend=before[1]) % _SEQ_WRAP
+
     def _are_new(
         self, t_us: NDArray[np.int64], seq: NDArray[np.int64], restarts: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """Which samples did not come before, as `sensors.timeline.Timeline` finds live."""
         before = self._last or (int(t_us[0]), int(seq[0]) - 1)
         back = -np.diff(seq, prepend=before[1]) % _SEQ_WRAP
-        off_us = np.diff(t_us, prepend=before[0]) + back * self._period_us
-        off_us = (off_us + _T_WRAP // 2) % _T_WRAP - _T_WRAP // 2
-        is_back = (back <= WINDOW_TICKS) & (np.abs(off_us) <= OFF_TICKS * self._period_us)
+        is_back = (back <= WINDOW_TICKS) & is_step(np.diff(t_us, prepend=before[0]), -back, self._period_us)
         is_back[restarts] = False
         if not is_back.any():  # as almost always
             return np.ones(len(seq), np.bool_)
         count = np.cumsum(np.where(is_back, -back, _SEQ_WRAP - back))
         return np.asarray(count > np.maximum.accumulate(np.concatenate([[0], count[:-1]])))
 
-    def _jumps(self, step_us: NDArray[np.int64], ticks: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which steps of the board's clock contradict its count of ticks, as `sensors.timeline.Stamps` finds live."""
-        off_us = (step_us - ticks * self._period_us + _T_WRAP // 2) % _T_WRAP - _T_WRAP // 2
-        wrap_us = _SEQ_WRAP * self._period_us
-        off_us -= np.maximum(0, np.rint(off_us / wrap_us)).astype(np.int64) * wrap_us
-        jumps = (ticks > 0) & (ticks <= WINDOW_TICKS) & (np.abs(off_us) > OFF_TICKS * self._period_us)
-        if self._last is None:
-            jumps[0] = False
-        return np.asarray(jumps)
+    def _drop_foreign(
+        self, new: NDArray[np.bool_], t_us: NDArray[np.int64], seq: NDArray[np.int64], restarts: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Takes from `new` the samples of a stream that this program had not started, as the session does live.
+
+        They go up to the HELLO by which the session began again. Without one, they are a restart of their own. Returns
+        all restarts.
+        """
+        new[: max(0, self._foreign_to - self._placed)] = False
+        while True:
+            kept = np.flatnonzero(new)
+            if not len(kept):
+                return restarts
+            foreign = is_foreign(*self._steps(t_us[kept], seq[kept]), self._period_us)
+            foreign[0] &= self._last is not None
+            foreign &= ~np.isin(kept, restarts)
+            if not foreign.any():  # as almost always
+                return restarts
+            first = int(kept[foreign.argmax()])
+            later = self._restarts[self._restarts > self._placed + first]
+            if len(later):
+                self._foreign_to = int(later[0])
+                new[first : self._foreign_to - self._placed] = False
+            else:
+                restarts = np.union1d(restarts, [first])
 
 
 def _raw_samples(capture: Capture, ports: int, new: NDArray[np.bool_]) -> RawSamples:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.recording.consistency import contradiction
+from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.sensors.measurements import Floats, Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
 
@@ -46,7 +47,7 @@ _UPRIGHT = 0.7  # cosine of the slope of the steepest floor, 45°
 _SPIKES = 0.001  # share of readings beyond these that are no wrong unit
 _TILTS_RAD_S = 0.1  # rms rate about horizontal axes at which gravity turns through the accelerometer's axes
 _LONGEST_STEP_S = 0.5
-# Of a sensor whose every reading is new, n changes in N rows have about n²/N in the row after another change. None at
+# Of a sensor whose every reading is new, n changes in N readings have about n²/N right after another change. None at
 # all, where so many are expected, means that readings are repeated: chance gives e⁻¹⁰.
 _FEWEST_SUCCESSIVE = 10.0
 
@@ -57,7 +58,8 @@ def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list
     The first UNIT_ROWS samples are judged. `rate_hz` is the sample rate in the file's metadata, if it has one.
     """
     measurements = measurements[:UNIT_ROWS]
-    time = _time(_median(np.diff(measurements.time_s)), rate_hz)
+    is_next = (measurements.flags[1:] & GAP_BEFORE) == 0  # a step over a gap says nothing of the unit
+    time = _time(_median(np.diff(measurements.time_s)[is_next]), rate_hz)
     found = [
         *_imu(measurements, bool(time)),
         *_second_imu(measurements, bool(time)),
@@ -216,11 +218,11 @@ def _pressure(median_pa: float) -> str:
 
 
 def _repeated(flag: str, column: str, fresh: NDArray[np.bool_], values: Floats) -> str:
-    """A remark if readings are marked as new that repeat the row before: filters would count each of them again."""
-    known = fresh[1:] & fresh[:-1] & np.isfinite(values[1:] + values[:-1]).all(axis=1)
-    changes = (np.diff(values, axis=0) != 0).any(axis=1) & known
-    rows, count = np.count_nonzero(known), np.count_nonzero(changes)
-    if count**2 <= _FEWEST_SUCCESSIVE * rows or (changes[1:] & changes[:-1]).any():
+    """A remark if readings are marked as new that repeat the one before: filters would count each of them again."""
+    readings = values[fresh & np.isfinite(values).all(axis=1)]
+    changes = (np.diff(readings, axis=0) != 0).any(axis=1)
+    count = np.count_nonzero(changes)
+    if count**2 <= _FEWEST_SUCCESSIVE * len(changes) or (changes[1:] & changes[:-1]).any():
         return ""
     return (
         f"{flag} is 1 in {np.count_nonzero(fresh)} rows, and {column} changes in {count} of them: the others repeat a "

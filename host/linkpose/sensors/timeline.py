@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
+
+from numpy.typing import NDArray
 
 from linkpose.sensors.conversion import GAP_BEFORE, Placed
 from linkpose.wire.messages import Sample
@@ -100,17 +102,34 @@ class Stamps:
             self._ticks = self._off_us = 0.0
 
 
-def off_ticks(step_us: int, ticks: int, period_us: float) -> float:
+Steps = TypeVar("Steps", float, NDArray[Any])  # one step or one for each sample
+
+
+def off_ticks(step_us: Steps, ticks: Steps, period_us: float) -> Steps:
     """By how much (µs) a step of the board's clock differs from these ticks, or from 65536 more of them, and so on."""
-    off_us = (step_us - ticks * period_us + _T_WRAP / 2) % _T_WRAP - _T_WRAP / 2
+    off_us = _difference(step_us, ticks, period_us)
     wrap_us = _SEQ_WRAP * period_us
-    return float(off_us - max(0, round(off_us / wrap_us)) * wrap_us)
+    wraps = (off_us + wrap_us / 2) // wrap_us
+    return off_us - wraps * (wraps > 0) * wrap_us
 
 
-def is_step(step_us: int, ticks: int, period_us: float) -> bool:
+def is_step(step_us: Steps, ticks: Steps, period_us: float) -> Any:
     """Whether the board's clock (modulo 2³²) has gone on, or back, by these ticks."""
-    off_us = (step_us - ticks * period_us + _T_WRAP / 2) % _T_WRAP - _T_WRAP / 2
-    return abs(off_us) <= OFF_TICKS * period_us
+    return abs(_difference(step_us, ticks, period_us)) <= OFF_TICKS * period_us
+
+
+def is_foreign(step_us: Steps, ticks: Steps, period_us: float) -> Any:
+    """Whether no stream goes on in this way: over more ticks than Stamps watches, the clock has gone on differently.
+
+    The board was started again, it is another board, or the sample is damaged.
+    """
+    most_us = OFF_TICKS / WINDOW_TICKS * ticks * period_us
+    return (ticks > WINDOW_TICKS) & (abs(off_ticks(step_us, ticks, period_us)) > most_us)
+
+
+def _difference(step_us: Steps, ticks: Steps, period_us: float) -> Steps:
+    """By how much (µs) a step of the board's clock, modulo 2³², differs from these ticks."""
+    return (step_us - ticks * period_us + _T_WRAP / 2) % _T_WRAP - _T_WRAP / 2
 
 
 class Timeline:
@@ -150,6 +169,12 @@ class Timeline:
         if not self.is_over and time_s >= self._end_s:
             self._end()
 
+    def end_at(self, time_s: float) -> None:
+        """End the timeline at `time_s`, in seconds since the first sample, if it has a sample and has not ended yet."""
+        if self._last and not self.is_over:
+            self._end_s = min(self._end_s, time_s)
+            self._end()
+
     def _end(self) -> None:
         """Count what is missing between the last sample and the end."""
         self.is_over = True
@@ -164,6 +189,18 @@ class Timeline:
         """The next sample comes from a board that was reset ("reset") or away ("cable"): its counters restart."""
         self._cause, self._restarted = cause, True
         self.stamps.restart()
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether no sample has come since `interrupted`."""
+        return self._restarted
+
+    def follows(self, sample: Sample) -> bool:
+        """Whether the sample can be of the same stream as the last one."""
+        if self._last is None or self._restarted or self._is_old(sample):
+            return True
+        step_us, ticks = sample.t_us - self._wire_t_us, (sample.seq - self._wire_seq) % _SEQ_WRAP
+        return not is_foreign(step_us, ticks, self._period_s * 1e6)
 
     def place(self, sample: Sample, clock: Clock, arrived_s: float) -> Placed | None:
         """Place of a sample that arrived at `arrived_s` (s, the host's clock).
@@ -204,7 +241,7 @@ class Timeline:
         if self._last is None or self._restarted:
             return False
         back = (self._wire_seq - sample.seq) % _SEQ_WRAP
-        return back <= WINDOW_TICKS and is_step(sample.t_us - self._wire_t_us, -back, self._period_s * 1e6)
+        return back <= WINDOW_TICKS and bool(is_step(sample.t_us - self._wire_t_us, -back, self._period_s * 1e6))
 
     def _ticks(self, seq: int, elapsed: float) -> int:
         """Ticks from the last sample to the one of this seq, which came `elapsed` periods later.
@@ -212,6 +249,6 @@ class Timeline:
         seq gives the ticks modulo 65536; the clock gives the number of wraps and, after a restart, all ticks.
         """
         step = (seq - self._wire_seq) % _SEQ_WRAP
-        if self._restarted or (step > elapsed + _SEQ_WRAP / 4 and step > 1):
+        if self._restarted:
             return max(1, round(elapsed))
         return step + max(0, round((elapsed - step) / _SEQ_WRAP)) * _SEQ_WRAP
