@@ -29,6 +29,7 @@ class Terminal:
     ) -> None:
         self._screen = pyte.HistoryScreen(columns, rows, history=1000)
         self._stream = pyte.ByteStream(self._screen)
+        self.received = b""  # as it came
         self._leader, follower = pty.openpty()
         self._set_size(columns, rows)
         # pytest's workers set COLUMNS and LINES, which would hide the terminal's own size.
@@ -65,10 +66,15 @@ class Terminal:
         while not condition(self.text):
             assert time.monotonic() < end, self.text
             if select.select([self._leader], [], [], 0.1)[0]:
-                self._stream.feed(os.read(self._leader, 65536))
+                self._read()
             elif self.process.poll() is not None:
                 assert condition(self.text), self.text
         return self.text
+
+    def _read(self) -> None:
+        data = os.read(self._leader, 65536)
+        self.received += data
+        self._stream.feed(data)
 
     def press(self, keys: str) -> None:
         """Types these keys."""
@@ -83,7 +89,7 @@ class Terminal:
         """Reads to the end of the command; its status."""
         while self.process.poll() is None or select.select([self._leader], [], [], 0)[0]:
             if select.select([self._leader], [], [], 0.1)[0]:
-                self._stream.feed(os.read(self._leader, 65536))
+                self._read()
         return self.process.returncode
 
     def __enter__(self) -> Terminal:

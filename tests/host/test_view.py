@@ -406,6 +406,38 @@ def test_the_final_table_has_the_median_deviation() -> None:
     assert [line.split()[-1] for line in final_table(extremes.summary(), 80)[1:]] == ["mm", "0.001°"]
 
 
+EVIL = "\x1b]0;title\x07\x1b[31m"
+
+
+def hostile_texts(tmp_path: Path, linkpose: Callable[..., Any]) -> list[list[object]]:
+    """Commands whose input holds escape sequences, in what they print."""
+    recording, truth, estimate = tmp_path / f"r{EVIL}.csv", tmp_path / "t.csv", tmp_path / "e.csv"
+    linkpose("simulate", "link", "--duration", 3, "-o", recording, "--truth", truth)
+    linkpose("estimate", recording, "--filter", "tilt", "-o", estimate)
+    estimate.write_text(estimate.read_text().replace("tilt_height", f"{EVIL}_height"))
+    device = tmp_path / "d.csv"
+    device.write_text(recording.read_text().replace("sim://link", json.dumps(EVIL)[1:-1]))
+    written = tmp_path / f"w{EVIL}.csv"
+    return [
+        ["info", recording],
+        ["info", device],
+        ["evaluate", estimate, truth],
+        ["estimate", recording, "--filter", "tilt", "-o", written],
+        ["record", written, "--force", "--port", "sim://link?speed=0", "--duration", 1],
+        ["plot", estimate, "-o", tmp_path / "p.png"],
+    ]
+
+
+def test_escape_sequences_from_files_never_reach_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:
+    """click removes them from what goes to a file or a pipe, so that only a terminal shows that they are escaped."""
+    for command in hostile_texts(tmp_path, linkpose):
+        with Terminal(*command, columns=200) as terminal:
+            assert terminal.wait() == 0, terminal.text
+            for sequence in (b"\x1b]", b"\x07", b"\x1b[31m"):
+                assert sequence not in terminal.received, command[0]
+            assert "Warning" not in terminal.text
+
+
 def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Callable[..., Any]) -> None:
     recording, rows = tmp_path / "r.csv", tmp_path / "rows.csv"
     linkpose("simulate", "link", "--duration", 3, "-o", recording, "--truth", tmp_path / "t.csv")

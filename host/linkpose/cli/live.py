@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, TypeVar
 import click
 
 from linkpose.cli.rendering import wrapped
+from linkpose.cli.streams import unfiltered
 from linkpose.errors import NamedTwice, printable
 from linkpose.presentation import counted
 
@@ -67,9 +68,10 @@ class Console:
         now = time.perf_counter()
         if self.shows_progress and now - self._shown_at >= PROGRESS_INTERVAL_S:
             self._shown_at = now
-            text = make_text()[: shutil.get_terminal_size().columns - 1]  # \r does not undo a wrapped line
-            sys.stderr.write("\r" + text.ljust(self._width))
-            sys.stderr.flush()
+            text = printable(make_text())[: shutil.get_terminal_size().columns - 1]  # \r does not undo a wrapped line
+            stream = unfiltered(sys.stderr)
+            stream.write("\r" + text.ljust(self._width))
+            stream.flush()
             self._width = len(text)
 
     def compile(self, names: Sequence[str]) -> None:
@@ -86,8 +88,9 @@ class Console:
     def clear(self) -> None:
         """Removes the progress line from the screen."""
         if self._width:
-            sys.stderr.write("\r" + " " * self._width + "\r")
-            sys.stderr.flush()  # before anything that stdout shows on the same terminal
+            stream = unfiltered(sys.stderr)
+            stream.write("\r" + " " * self._width + "\r")
+            stream.flush()  # before anything that stdout shows on the same terminal
             self._width = 0
 
 

@@ -13,9 +13,13 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
+from linkpose.cli.streams import unfiltered
+from linkpose.errors import printable
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.table import Table
+    from rich.text import Text
 
     from linkpose.experiments.variants import ClaimVerdict
 
@@ -30,7 +34,7 @@ def progress(label: str, quiet: bool = False) -> Callable[[Iterable[Any]], Itera
 
 def _with_bar(label: str, is_shown: bool, items: Iterable[Any]) -> Iterator[Any]:
     if is_shown:
-        with click.progressbar(list(items), label=label, file=sys.stderr) as bar:
+        with click.progressbar(list(items), label=label, file=unfiltered(sys.stderr)) as bar:
             yield from bar
     else:
         yield from items
@@ -53,7 +57,11 @@ def show_table(table: Table) -> None:
     """Prints a table below its title. It is never cut: a narrow terminal wraps its lines, a file gets whole ones."""
     from rich.console import Console
 
-    console = Console()
+    class SafeConsole(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(printable(text), **options)
+
+    console = SafeConsole(file=unfiltered(sys.stdout))
     console.width = max(console.width, _TABLE_WIDTH)
     title, table.title = table.title, None  # above the table, rich would wrap it at the table's width
     if title:

@@ -16,6 +16,7 @@ import numpy as np
 from linkpose import quantities
 from linkpose.cli.curve import curve, path_map, time_axis
 from linkpose.device.session import Health
+from linkpose.errors import printable
 from linkpose.exclusions import Exclusions
 from linkpose.filters import required_sensors
 from linkpose.presentation import (
@@ -126,7 +127,7 @@ class Screen:
         width = min(width, WIDEST)
         text = Text(no_wrap=True, overflow="crop")
         for line, style in self._fit(self._sections(health, width, status), height - 1):
-            text.append(line[:width] + "\n", style=style)
+            text.append(printable(line)[:width] + "\n", style=style)
         text.rstrip()
         return text
 

@@ -1,7 +1,8 @@
-"""Standard streams that may be closed, full or without a reader.
+"""Standard streams that may be closed, full or without a reader, and whose terminal obeys escape sequences.
 
 A message that cannot be shown is dropped, because the measurement is worth more than the message. A result that cannot
-be written is a failure with one sentence.
+be written is a failure with one sentence. On a terminal, control characters from files and devices are shown as text,
+whichever way they come; what moves the cursor itself writes to `unfiltered`.
 """
 
 from __future__ import annotations
@@ -15,14 +16,23 @@ from collections.abc import Iterator
 from typing import Any, TextIO, cast
 
 from linkpose.cli import characters
-from linkpose.errors import LinkposeError
+from linkpose.errors import LinkposeError, printable
 
 
 class _Stream:
     """A text stream whose failures are handled. Everything else is the stream's own."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, is_filtered: bool = True) -> None:
         self._stream = stream
+        self._is_filtered = is_filtered and stream.isatty()
+
+    def unfiltered(self) -> _Stream:
+        """The stream for text that may move the cursor."""
+        return type(self)(self._stream, is_filtered=False)
+
+    def _shown(self, text: str) -> str:
+        """As it may be written; bytes, with which click finds out the kind of a stream, are left to fail."""
+        return printable(text) if self._is_filtered and isinstance(text, str) else text
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -33,7 +43,7 @@ class _Messages(_Stream):
 
     def write(self, text: str) -> int:
         try:
-            return self._stream.write(text)
+            return self._stream.write(self._shown(text))
         except (OSError, ValueError):
             _discard(self._stream)
             return len(text)
@@ -52,7 +62,7 @@ class _Results(_Stream):
         if text == "":  # click writes an empty text to test the stream, which fails on a full disk
             return 0
         with self._failing_well():
-            return self._stream.write(text)
+            return self._stream.write(self._shown(text))
 
     def flush(self) -> None:
         with self._failing_well():
@@ -67,6 +77,11 @@ class _Results(_Stream):
             if error.errno in (errno.EPIPE, errno.EINVAL):  # EINVAL: Windows
                 raise LinkposeError("the reader of the output has gone; stopped") from None
             raise LinkposeError(f"cannot write the output: {error.strerror}; write it to another place") from None
+
+
+def unfiltered(stream: TextIO) -> TextIO:
+    """The stream for text that may move the cursor, and holds nothing from a file or a device that is not printable."""
+    return cast(TextIO, stream.unfiltered()) if isinstance(stream, _Stream) else stream
 
 
 def _discard(stream: TextIO) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen
+from linkpose.cli.streams import unfiltered
 from linkpose.device.session import Health
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class View:
         from rich.console import Console
         from rich.live import Live
 
-        console = Console(stderr=True)
+        console = Console(file=unfiltered(sys.stderr))
         if console.is_dumb_terminal:
             return
         # Results go to stdout untouched: rich must not redirect it.

@@ -133,7 +133,7 @@ class Session:
         self.status: Status | None = None  # the board's own counters, as it last sent them
         self._supply_reported = False
         self._unhandled: Arrival | None = None  # what came together with an answer and has not been handled
-        self._pinged_at = self._looked_s = 0.0  # s, perf_counter
+        self._pinged_at = 0.0  # s, perf_counter
         self._unread_bytes = 0  # since the last sample, that belong to no message
         self._arrived_s = math.nan  # s, the connection's clock: of the last sample, or of the stream's begin
         self._repeats = 0  # samples since the last one with a new number
@@ -403,7 +403,7 @@ class Session:
             self.configure(wanted)
         else:
             raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
-        self._pinged_at = self._looked_s = time.perf_counter()
+        self._pinged_at = time.perf_counter()
         self._silent_s = self._asked_s = 0.0
         self._unread_bytes = 0
 
@@ -431,13 +431,13 @@ class Session:
         return None
 
     def _next(self, timeline: Timeline) -> list[Placement]:
+        looked_s = time.perf_counter()
         arrival, self._unhandled = self._unhandled or self._connection.receive(RECEIVE_TIMEOUT_S), None
         now = time.perf_counter()
         if now - self._pinged_at >= PING_INTERVAL_S:
             self._pinged_at = now
             self._ping()
-        self._silent_s += min(now - self._looked_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
-        self._looked_s = now
+        self._silent_s += min(now - looked_s, RECEIVE_TIMEOUT_S)  # no more: a suspended program has not waited
         if arrival is not None and not arrival.messages:
             self._unread_bytes += len(arrival.data)
         placements: list[Placement] = []

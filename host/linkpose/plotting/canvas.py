@@ -189,18 +189,23 @@ def fit_legends(figure: Figure) -> Figure:
         if all(legend.get_window_extent().width <= axes.bbox.width for axes, legend in legends):
             return figure  # the layout, which takes a quarter of a second, leaves the axes at least this width
         figure.draw_without_rendering()
-    for axes in figure.axes:
-        while (legend := axes.get_legend()) is not None:
-            columns = int(legend._ncols)  # type: ignore[attr-defined]  # matplotlib has no reader for it
-            if columns == 1 or legend.get_window_extent().width <= _OVERHANG * axes.bbox.width:
-                break
-            texts = [text.get_text() for text in legend.get_texts()]
-            by_place = dict(zip(_by_rows(list(range(len(texts))), columns), texts, strict=True))
-            handles, labels = axes.get_legend_handles_labels()
-            handle_of = dict(zip(labels, handles, strict=True))
-            in_rows = {by_place[place]: handle_of[by_place[place]] for place in range(len(texts))}
-            _fill_legend(axes, in_rows, columns - 1, legend.get_title().get_text())
+        for axes in figure.axes:
+            _narrow_legend(axes)
     return figure
+
+
+def _narrow_legend(axes: Axes) -> None:
+    """Refills the legend with fewer and fewer columns until it is as wide as the axes."""
+    while (legend := axes.get_legend()) is not None:
+        columns = int(legend._ncols)  # type: ignore[attr-defined]  # matplotlib has no reader for it
+        if columns == 1 or legend.get_window_extent().width <= _OVERHANG * axes.bbox.width:
+            break
+        texts = [text.get_text() for text in legend.get_texts()]
+        by_place = dict(zip(_by_rows(list(range(len(texts))), columns), texts, strict=True))
+        handles, labels = axes.get_legend_handles_labels()
+        handle_of = dict(zip(labels, handles, strict=True))
+        in_rows = {by_place[place]: handle_of[by_place[place]] for place in range(len(texts))}
+        _fill_legend(axes, in_rows, columns - 1, legend.get_title().get_text())
 
 
 _HANDLE = 2.4  # of an entry of a legend, with its distance from the label: in sizes of the lettering
