@@ -41,6 +41,16 @@ def test_ten_minutes_are_never_worse_than_without(disturbance):
             assert f.found.largest_disturbance_uT > 4 and f.found.rejected_s > 15
 
 
+@pytest.mark.parametrize("disturbance", ["building", "car"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_yaw_whose_std_falls_does_not_take_on_the_first_directions(disturbance, seed):
+    """As of a gyro with the data sheet's bias, which the motion then shows. The yaw itself hardly drifts."""
+    inner, block, drift = run(seed, disturbance, drift_deg_s=0.003, minutes=5)
+    inner.rows[:, 5] = np.maximum(2.0, 40.0 * np.exp(-block.time_s / 15.0))
+    error, *_ = held(inner, block, drift)
+    assert rms(error) < max(1.1 * rms(drift), rms(drift) + 0.2)
+
+
 def test_a_disturbance_is_a_function_of_kind_seed_and_time():
     t = np.linspace(0.0, 300.0, 601)
     moving = HandMotion(np.random.default_rng(0), 1.0, None)

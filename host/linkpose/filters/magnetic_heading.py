@@ -21,7 +21,9 @@ not observed, and is assumed to be as large as the two that are: the changes of 
 vertical component since the reference. From their variance follows that of the direction, V. V is not averaged over
 time, since the disturbance may last; the correction is the part own² / (own² + m + V) of what the directions state,
 with σ² = own² of the filter's own yaw and the variance m of the directions. Where the field varies by as much as the
-yaw may have drifted, the yaw therefore stays almost as it is.
+yaw may have drifted, the yaw therefore stays almost as it is. The corrected part of ε grows only as fast as the
+directions determine ε: a yaw whose σ is large at first and then falls would otherwise be corrected as a whole before V
+has been measured.
 
 Sources: gates of norm and dip and the temporary rejection as in [VQF], section 3.4; ρ and c are first-order
 Gauss-Markov processes.
@@ -256,13 +258,18 @@ class MagneticHeading:
         return np.minimum((1.0 - gain) ** 2 * own + directions, own)
 
     def _follow_applied(self, window: _Window) -> None:
-        """Let the applied part follow (own + m) / (own + m + V)."""
+        """Let the applied part follow (own + m) / (own + m + V).
+
+        Without information in the directions that is 1, which tells nothing of the field: the part rises in proportion
+        to own / (own + m), and falls at once.
+        """
         level = max(window.level_uT, _LEAST_LEVEL_UT)
         self._disturbance_rad2 = 2.0 * (_CAUTION / level) ** 2 * self._variation.square_uT2  # at the reference, and now
         own, variance = window.yaw_std_rad**2, float(self._covariance[_DRIFT, _DRIFT])
         share = max(1.0 - variance / max(own, 1e-12), 0.0)  # of own in own + m
         wanted = own / (own + share * self._disturbance_rad2) if own > 0.0 else 0.0
-        self._applied += _WINDOW_S / _SLEW_S * (wanted - self._applied)
+        pace = share if wanted > self._applied else 1.0
+        self._applied += pace * _WINDOW_S / _SLEW_S * (wanted - self._applied)
 
     def _turn_position(self, rows: Floats, drift: Floats, gained: Floats) -> None:
         """x and y turned by −drift; their σ less the variance of the yaw that the anchor has `gained` (rad²)."""
