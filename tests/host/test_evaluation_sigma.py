@@ -54,6 +54,23 @@ def test_the_verdict_says_by_how_much_sigma_is_off(claimed, verdict):
     assert found is not None and found.startswith(verdict)
 
 
+@pytest.mark.parametrize(
+    ("shares", "claimed", "verdict"),
+    [
+        ((1.0, 1.0, 1.0), 1.0, "σ is right: 99 %"),
+        ((1.0, 0.0, 0.0), 1.0, "σ is right: 9"),
+        ((1.0, 1.0, 1.0), 2.0, "σ is 2.0 times too large: 100 %"),
+        ((1.0, 1.0, 1.0), 0.5, "σ is 1.6 times too small: 6"),
+    ],
+)
+def test_the_angle_of_a_rotation_has_three_components(shares, claimed, verdict):
+    """Its σ is that of all three together: with a right σ, up to 99 % of the errors are within 2σ."""
+    spread = np.sqrt(np.array(shares) / np.sum(shares))
+    angle = np.linalg.norm(spread * np.random.default_rng(1).standard_normal((20000, 3)), axis=1)
+    found = Statistics.of(angle, np.full(len(angle), claimed)).verdict(of_three=True)
+    assert found is not None and found.startswith(verdict) and "(95 to 99 % expected)" in found
+
+
 def test_a_sigma_that_was_rounded_to_zero_is_that_of_its_last_digit():
     found = Statistics.of(np.full(100, 3e-6), np.zeros(100), least_std=1e-6)
     assert found.nees == pytest.approx(9.0) and found.within_2sigma == 0.0

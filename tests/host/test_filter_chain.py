@@ -225,6 +225,17 @@ def test_motion_shows_whether_the_gyros_were_calibrated(errors: str) -> None:
     assert chain.state["is_narrow"].tolist() == [int(errors == "calibrated")] * 2
 
 
+def test_calibrated_gyros_are_not_taken_for_ones_that_warm_up() -> None:
+    """With the walk of a sensor that warms up, σ after a minute is 0.28°."""
+    run = ChainRun("ball", 400, 60.0)
+    measured = run.measurements()
+    truth = _matrices(*(run.truth_columns(measured.time_s)[name] for name in ("qw", "qx", "qy", "qz")))
+    estimates = lp.estimate(measured, filters=["chain"], joint="ball")
+    late = measured.time_s > 30
+    error, std = _error_deg(estimates, truth)[late], estimates["chain_rotation_std_deg"][late]
+    assert std.mean() < 0.25 and np.mean(error < 2 * std) > 0.95
+
+
 def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     measured, _, angle = _chain("hinge")
     estimates = lp.estimate(measured, filters=["chain"], joint="hinge")

@@ -115,12 +115,12 @@ def _show(found: Evaluation, quiet: bool) -> None:
 
 def _sentences(score: Score) -> list[str]:
     """How many rows were used, and whether σ is right, for each quantity that has one."""
-    from linkpose.quantities import words
+    from linkpose.quantities import ROTATION, words
 
     rows = f"{score.filter}: {score.rows} of {score.known_rows} rows compared"
     if score.empty_rows:
         rows += f", {score.empty_rows} without an estimate left out"
     if score.yaw_drift_deg_per_min is not None:
         rows += f"; the yaw drifts by {score.yaw_drift_deg_per_min:.2g} °/min"
-    verdicts = {name: value.verdict() for name, value in score.statistics().items()}
+    verdicts = {name: value.verdict(of_three=name == ROTATION.name) for name, value in score.statistics().items()}
     return [f"{rows}.", *(f"  {words(name)}: {verdict}" for name, verdict in verdicts.items() if verdict)]

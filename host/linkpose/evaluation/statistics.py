@@ -21,6 +21,9 @@ _FAR_NEES = 2.0
 _FAR_RATIO = 4.0
 _ROUNDING = 1.001  # that two rounded files differ by, in units of the last digit, with some for binary fractions
 _NORMAL_95 = 1.96  # 95 % of normal errors are within this many σ
+# The same for the length of a normal error with three equal components, where σ² is the sum of their variances:
+# √(7.815 / 3), χ² with three degrees of freedom. 99.3 % of such errors are within 2σ.
+_NORMAL_95_OF_THREE = 1.614
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,15 +52,20 @@ class Statistics:
         collected.add(error, std)
         return collected.statistics()
 
-    def verdict(self) -> str | None:
-        """One sentence on σ; None where there is no σ."""
+    def verdict(self, *, of_three: bool = False) -> str | None:
+        """One sentence on σ; None where there is no σ.
+
+        `of_three`: the error is the length of a vector with three components, and σ² the sum of their variances, as of
+        a rotation. With a right σ, 95 % (all in one component) to 99 % (equal components) of such errors are within 2σ.
+        """
         if self.within_2sigma is None or self.sigma_ratio is None or self.nees is None:
             return None
         low, high = HONEST_SHARE
-        share = f"{100 * self.within_2sigma:.0f} % of the errors are within ±2σ (95 % expected)"
+        expected = "95 to 99" if of_three else "95"
+        share = f"{100 * self.within_2sigma:.0f} % of the errors are within ±2σ ({expected} % expected)"
         if self.within_2sigma < low:
             return f"σ is {self.sigma_ratio:.1f} times too small: {share}."
-        times = 1 / max(self.sigma_ratio, 0.01)
+        times = (_NORMAL_95_OF_THREE / _NORMAL_95 if of_three else 1.0) / max(self.sigma_ratio, 0.01)
         found = f"{times:.1f} times too large" if self.within_2sigma > high and times >= 1.05 else "right"
         if self.nees > _FAR_NEES and self.worst_ratio is not None and self.worst_ratio > _FAR_RATIO:
             far = f"single errors are far outside, up to {self.worst_ratio:.3g}σ"

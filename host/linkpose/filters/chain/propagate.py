@@ -172,11 +172,12 @@ def propagate_covariance(s: Record, size: int, q: Record) -> None:
         o, turned, impulse = OF_SENSOR * k, s.turned[k], s.impulse[k]
         scale_walk = s.level * q.accel_scale**2 * s.force_rate_square[k] * slowness(s, k, q)
         walk = s.widening * (q.accel_walk_m_s2_sqrts**2 + scale_walk) * span
+        gyro_walk = (min(s.level, 1.0) if s.is_narrow[k] else 1.0) * q.gyro_walk_rad_s_sqrts**2 * span
         _decay_bias(s, size, k, walk, q)
         for i in range(3):
             p[o + i, o + i] += s.rotation_variance[k]
             p[o + V + i, o + V + i] += s.velocity_variance[k]
-            p[o + BG + i, o + BG + i] += q.gyro_walk_rad_s_sqrts**2 * span
+            p[o + BG + i, o + BG + i] += gyro_walk
             p[o + BA + i, o + BA + i] += walk
             p[o + R + i, o + R + i] += q.lever_walk_m_sqrts**2 * span
             impulse[i] = 0.0

@@ -56,7 +56,10 @@ class ChainParameters(NamedTuple):
     turning_s: float = 0.29
     accel_walk_m_s2_sqrts: float = 0.001  # of the accelerometer bias: [MPU-6050]'s 35 mg over 65 K, 10 K in 10 min
     accel_misfit: float = 0.02  # share of the linear acceleration that is noise, correlated over 0.05 s
-    gyro_walk_rad_s_sqrts: float = 3e-4  # 1 °/s in the hour in which a sensor warms up
+    # 1 °/s in the hour in which a sensor warms up. Of a gyro whose bias has been subtracted, the square follows the
+    # level, down to that of an MPU-6050 at constant temperature, 2e-5 (rad/s)/√s (Allan deviation). At 3e-4 throughout,
+    # this walk is half of the variance of calibrated sensors after a minute.
+    gyro_walk_rad_s_sqrts: float = 3e-4
     lever_walk_m_sqrts: float = 1e-4  # lets an error of the model leave r_k again
     # Residual of the joint: its floor (m/s), least share of ‖ω‖ ‖r‖, that share before it has been measured, and the
     # time over which it is measured (s).
@@ -67,7 +70,7 @@ class ChainParameters(NamedTuple):
     # Acceleration noise grows up to `most_widening` times where innovations exceed their σ, by e in 1/widening_rate s.
     widening_rate: float = 1.0
     most_widening: float = 100.0
-    # Level of the model's errors: a factor of the variances gyro_misfit², accel_scale² and accel_misfit². Level 1
+    # Level of the model's errors: a factor of the squares of gyro_misfit, accel_scale and accel_misfit. Level 1
     # is the data sheet, the least level is calibrated sensors. Wrong rotations add innovations that last for a second,
     # so the level follows the square of the innovations' moving mean, each divided by its σ. Chosen on the simulated
     # leg (seeds 0-3, calibrated and data sheet) and [D]. At level 1 throughout, σ of calibrated sensors is 3 to 8
