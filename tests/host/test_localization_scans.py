@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -142,6 +143,44 @@ def test_a_robot_is_followed_in_an_old_map_with_smeared_walls(drive):
     result = score_track(track, run.truth)
     assert result.position_rmse_m < 0.3
     assert result.within_2_sigma is not None and result.within_2_sigma > 0.9
+    assert track.known.all() and track.relocated == 0
+
+
+def among_people(log: Log, count: int) -> Log:
+    """People of 0.5 m who walk with the robot, 1 to 2.5 m from it, hide what is behind them."""
+    seen: Log = []
+    for event in log:
+        if isinstance(event, Scan):
+            ranges = event.ranges_m.copy()
+            for k in range(count):
+                away = 1.75 + 0.75 * math.sin(0.3 * event.time_s + 2.0 * k)
+                bearing = 0.4 * math.sin(0.2 * event.time_s + k) + math.pi * ((k + 0.5) / count - 0.5)
+                hidden = np.abs(event.angles_rad - bearing) < math.asin(0.25 / away)
+                ranges[hidden] = np.fmin(ranges[hidden], away)
+            event = replace(event, ranges_m=ranges)
+        seen.append(event)
+    return seen
+
+
+def with_short_echoes(log: Log) -> Log:
+    """A third of the beams end on their way."""
+    rng = np.random.default_rng(6)
+    return [
+        replace(e, ranges_m=e.ranges_m * np.where(rng.random(len(e.ranges_m)) < 0.33, rng.random(len(e.ranges_m)), 1.0))
+        if isinstance(e, Scan)
+        else e
+        for e in log
+    ]
+
+
+@pytest.mark.parametrize("disturbed", [lambda log: among_people(log, 5), with_short_echoes])
+def test_beams_that_end_in_free_space_do_not_pull_the_robot(drive, disturbed: Callable[[Log], Log]) -> None:
+    """They moved the path by up to 0.15 m."""
+    run, grid = drive
+    track = estimate_track(disturbed(as_log(run.readings)), "scan-match", Settings(start=tuple(run.pose[0])), grid)
+    result = score_track(track, run.truth)
+    assert result.position_rmse_m < 0.03
+    assert result.within_2_sigma is not None and result.within_2_sigma > 0.95
     assert track.known.all() and track.relocated == 0
 
 

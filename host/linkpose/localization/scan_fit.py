@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import Field, seen_distance
+from linkpose.localization.distance_field import Field, distance_at, seen_distance
 from linkpose.localization.linalg import Floats, lower_cholesky, wrap_angle
 
 # The fit ends when a step is smaller than this (m, and rad): a tenth of what a laser scanner resolves.
@@ -28,6 +28,8 @@ MOST_STEPS = 20
 # Steps longer than this (m) are cut: beyond it the linearised field has nothing to do with the scan.
 LONGEST_STEP_M = 0.5
 LONGEST_TURN_RAD = 0.2
+# A wall nearer to the laser than this (m) is not one that a beam has crossed: the pose is wrong by as much.
+CLEAR_M = 0.3
 
 
 class Walls(NamedTuple):
@@ -72,6 +74,36 @@ def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: 
 
 
 @compiled
+def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights: Floats) -> int:
+    """Sets the weights of beams to 0 that end in free space, and returns their number.
+
+    Such a beam ends farther than `beside` (m) from all walls and has crossed none: a person, a new piece of furniture
+    or dust is before the wall. Where it ends does not depend on the pose.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    cell = walls.geometry[0]
+    inside = 0.0 if walls.reach > 0.0 else 0.6 * cell  # a point nearer to a wall is in it (half a cell on its sides)
+    at = np.empty(3)
+    count = 0
+    for i in range(beams.shape[0]):
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        x = pose[0] + c * beams[i, 0] - s * beams[i, 1]
+        y = pose[1] + s * beams[i, 0] + c * beams[i, 1]
+        seen_distance(walls.counts, walls.geometry, x, y, ux, uy, walls.reach, at)
+        if abs(at[0]) <= beside:
+            continue
+        left, crosses = beams[i, 4] - CLEAR_M, False  # m of the beam before its end
+        while left > beside and not crosses:
+            distance_at(walls.counts, walls.geometry, x - left * ux, y - left * uy, at)
+            crosses = at[0] < inside
+            left -= max(at[0] - cell, 0.5 * cell)
+        if not crosses:
+            weights[i] = 0.0
+            count += 1
+    return count
+
+
+@compiled
 def scan_cost(walls: Walls, scan: Weighted, pose: Floats) -> float:
     """The first sum above, seen from `pose`."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -84,6 +116,26 @@ def scan_cost(walls: Walls, scan: Weighted, pose: Floats) -> float:
         seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         total += math.log1p(scan.weights[i] * at[0] * at[0] / scale2)
     return 0.5 * scan.information * scale2 * total
+
+
+@compiled
+def bounded_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
+    """Both sums above, where a beam costs c²/(2 σ²) w d² / (c² + w d²): the loss of Geman and McClure (the same table).
+
+    A beam that ends far from all walls costs the same at each pose. With the Cauchy loss, many of them together prefer
+    a pose that is nearer to them by decimetres.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    beams, scale2 = scan.beams, scan.scale * scan.scale
+    at = np.empty(3)
+    total = 0.0
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        square = scan.weights[i] * at[0] * at[0]
+        total += square / (scale2 + square)
+    return 0.5 * scan.information * scale2 * total + _prior_cost(prior, pose)
 
 
 @compiled
@@ -145,8 +197,8 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -
 
 
 @compiled
-def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians: Floats) -> float:
-    """Improves `pose` (3,) in place and fills `hessians` as `normal_equations` does there; returns the cost."""
+def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians: Floats) -> None:
+    """Improves `pose` (3,) in place and fills `hessians` as `normal_equations` does there."""
     slope, step, trial = np.empty(3), np.empty(3), np.empty(3)
     matrix, lower = np.empty((3, 3)), np.empty((3, 3))
     cost = _cost(walls, scan, prior, pose)
@@ -181,16 +233,21 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
             break
     pose[2] = wrap_angle(pose[2])
     normal_equations(walls, scan, pose, hessians, slope)
-    return cost
 
 
 @compiled
 def _cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
+    return scan_cost(walls, scan, pose) + _prior_cost(prior, pose)
+
+
+@compiled
+def _prior_cost(prior: Prior, pose: Floats) -> float:
+    """The second sum above."""
     off = np.empty(3)
     for k in range(3):
         off[k] = pose[k] - prior.mean[k]
     off[2] = wrap_angle(off[2])
-    total = scan_cost(walls, scan, pose)
+    total = 0.0
     for j in range(3):
         for k in range(3):
             total += 0.5 * off[j] * prior.information[j, k] * off[k]

@@ -19,7 +19,16 @@ from linkpose.localization.global_search import likely_poses, nearby_poses
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats, wrap_angle
-from linkpose.localization.scan_fit import Prior, Walls, Weighted, beam_weights, fit_scan, misfit
+from linkpose.localization.scan_fit import (
+    Prior,
+    Walls,
+    Weighted,
+    beam_weights,
+    bounded_cost,
+    drop_short,
+    fit_scan,
+    misfit,
+)
 
 # Deviation of a beam's end from the wall that the map shows (m), at least: half a cell of 5 cm, and a scanner's 3 cm.
 # Doubling it makes the filter follow its odometry more; the error in two public buildings grows by a fifth. A map with
@@ -28,12 +37,18 @@ BEAM_STD_M = 0.05
 # Scale of the Cauchy loss in units of that deviation: beams that end farther from a wall count less than half. From 1.5
 # to 6 the errors in two public buildings with good maps differ by less than 10 %; below 2 an old map does worse.
 LOSS_SCALE = 3.0
-# Scale of the first fit of each start (m), which draws a scan in from farther.
+# Scale of the first fit of a start that is not the prediction (m), which draws a scan in from farther.
 WIDE_SCALE_M = 0.5
 MOST_BEAMS = 180  # of one scan that are fitted; the rest is left out evenly
 FEWEST_BEAMS = 5  # fewer ends do not determine a pose
 # A beam that ends nearer than this (m) to a wall has hit it.
 HIT_M = 0.2
+# A beam that ends in free space, farther from all walls than this (m), has met a person or what else the map does not
+# have, and is left out; the fit is repeated from the pose of each value. In simulations with 10 people around a
+# robot, the error is 0.02 to 0.04 m; with the loss alone, and with the wide fit of the prediction, it was 0.09 m.
+BESIDE_M = (0.3, 0.3, 0.2)
+# The beams that are left judge the pose if they are such a share of all: with 14 people in view, a third is left.
+LEAST_SEEN = 0.2
 # A prediction that is uncertain by more than this (m, rad) has local minima around it: the fit starts at several poses.
 CERTAIN_M, CERTAIN_RAD = 0.15, 0.1
 # A slip of the wheels since the last scan (m, m, rad), added to the prediction where the fit has failed, and how much
@@ -51,6 +66,7 @@ NO_WALL = 0.1  # probability that a beam meets what the map does not have
 class Fit:
     """How a scan fitted: `share` of its beams that hit a wall, log-likelihood, and the test statistic of the shift.
 
+    `seen_likelihood` is the log-likelihood without the beams that end in free space: people are no fault of the pose.
     `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `walls` (3, 3) is Σ v J Jᵀ at
     the fitted pose, the information of walls whose places are uncertain by 1 m, and `pull` (3,) the effect of an error
     that all of them share. `misfit_m2` is the mean square of how far beams end from the walls that they hit (m²), in a
@@ -59,6 +75,7 @@ class Fit:
 
     share: float
     log_likelihood: float
+    seen_likelihood: float
     d2: float
     beams: int
     walls: Floats
@@ -96,14 +113,15 @@ class ScanMatcher:
         mean, covariance = run.state[at], run.covariance[np.ix_(at, at)]
         prior: Floats = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
         std = np.sqrt(np.diag(covariance))
-        best, hessians, cost = self._fit(beams, mean, prior, mean)
+        best, hessians, cost = self._fit(beams, mean, prior, mean, is_near=True)
         if max(std[0], std[1]) > CERTAIN_M or std[2] > CERTAIN_RAD:
             for start in _around(mean, std):
                 other = self._fit(beams, mean, prior, start)
                 if other[2] < cost:
                     best, hessians, cost = other
         share, log_likelihood = self.compare(beams, best)
-        if log_likelihood < expected:
+        seen_likelihood = self._seen(beams, best, log_likelihood)
+        if seen_likelihood < expected:
             loose: Floats = np.asarray(np.linalg.inv(covariance + np.diag(np.square(SLIP))), dtype=np.float64)
             lead = log_likelihood + SLIP_LEAD
             for start in nearby_poses(self.field.geometry, self.field.counts, beams, mean, NEARBY):
@@ -114,12 +132,13 @@ class ScanMatcher:
                     best, hessians, prior, lead = pose, other_hessians, loose, slipped
                     share, log_likelihood = other_share, other_likelihood
             covariance = np.asarray(np.linalg.inv(prior), dtype=np.float64)
+            seen_likelihood = self._seen(beams, best, log_likelihood)
         # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
         d2 = _condition(run, at, best, covariance, prior + hessians[0] / self.beam_std_m**2)
         pull = np.empty(3)
         weighted = self._weighted(beams, best, LOSS_SCALE * self.beam_std_m)
         off_m2 = misfit(self.walls, weighted, best, int(self.field.is_drawn), pull)
-        return Fit(share, log_likelihood, d2, len(beams), hessians[1], pull, off_m2)
+        return Fit(share, log_likelihood, seen_likelihood, d2, len(beams), hessians[1], pull, off_m2)
 
     def compare(self, beams: Floats, pose: Floats) -> tuple[float, float]:
         """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""
@@ -135,12 +154,32 @@ class ScanMatcher:
         found.sort(key=lambda item: item[0])
         return [pose for _, pose in found[:most]]
 
-    def _fit(self, beams: Floats, mean: Floats, prior: Floats, start: Floats) -> tuple[Floats, Floats, float]:
+    def _fit(
+        self, beams: Floats, mean: Floats, prior: Floats, start: Floats, is_near: bool = False
+    ) -> tuple[Floats, Floats, float]:
+        """The pose that `start` leads to, its Hessians, and its cost.
+
+        A start that `is_near` needs no wide fit, in which people and short echoes pull as much as walls do.
+        """
         pose, hessians = start.copy(), np.empty((2, 3, 3))
         narrow = LOSS_SCALE * self.beam_std_m
-        for scale in (max(WIDE_SCALE_M, narrow), narrow):
-            cost = fit_scan(self.walls, self._weighted(beams, pose, scale), Prior(mean, prior), pose, hessians)
-        return pose, hessians, cost
+        if not is_near:
+            for scale in (max(WIDE_SCALE_M, narrow), narrow):
+                fit_scan(self.walls, self._weighted(beams, pose, scale), Prior(mean, prior), pose, hessians)
+        for beside in BESIDE_M:
+            seen = self._weighted(beams, pose, narrow)
+            drop_short(self.walls, beams, pose, beside, seen.weights)
+            fit_scan(self.walls, seen, Prior(mean, prior), pose, hessians)
+        return pose, hessians, bounded_cost(self.walls, self._weighted(beams, pose, narrow), Prior(mean, prior), pose)
+
+    def _seen(self, beams: Floats, pose: Floats, log_likelihood: float) -> float:
+        """The log-likelihood of the beams that do not end in free space; that of all, where these are too few."""
+        weights = np.ones(len(beams))
+        drop_short(self.walls, beams, pose, BESIDE_M[-1], weights)
+        seen = beams[weights > 0.0]
+        if len(seen) < max(FEWEST_BEAMS, LEAST_SEEN * len(beams)):
+            return log_likelihood
+        return self.compare(np.ascontiguousarray(seen), pose)[1]
 
     def _weighted(self, beams: Floats, pose: Floats, scale: float) -> Weighted:
         """The scan with the weights that its beams have from `pose`."""

@@ -98,14 +98,14 @@ class ScanTracker:
             return self._open(run, beams, [])
         fit = self.matcher.correct(run, beams, self._below(SUSPECT))
         self.was_known = True
-        self.bad = self.bad + 1 if fit.log_likelihood < self._below(BAD) else 0
+        self.bad = self.bad + 1 if fit.seen_likelihood < self._below(BAD) else 0
         if self.bad >= self.wait:
             found = self.matcher.search(beams, CANDIDATES)
             if found and self.matcher.compare(beams, found[0])[1] > fit.log_likelihood + BETTER:
                 return self._open(run, beams, [run.copy()], found)
             self.bad, self.wait = 0, min(2 * self.wait, MOST_BAD_SCANS)
         self._bind(fit)
-        self._adapt(fit.log_likelihood)
+        self._adapt(fit.seen_likelihood)
         return Result(run, True, round(fit.share * fit.beams), fit.beams, 0, fit)
 
     def _adapt(self, log_likelihood: float) -> None:
@@ -179,7 +179,7 @@ class ScanTracker:
             self.contest, self.bad, self.was_known = None, 0, True
             share, _ = self.matcher.compare(beams, _pose_of(winner.filter))
             return Result(winner.filter, True, round(share * len(beams)), len(beams), relocated)
-        self.bad = self.bad + 1 if max(likelihoods) < self._below(BAD) else 0
+        self.bad = self.bad + 1 if max(fit.seen_likelihood for fit in fits) < self._below(BAD) else 0
         if self.bad >= BAD_SCANS:  # none of the hypotheses is right: the robot was carried meanwhile
             self.bad = 0
             return self._open(run, beams, [])
