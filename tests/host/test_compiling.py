@@ -237,6 +237,28 @@ def test_code_that_others_can_write_is_neither_loaded_nor_overwritten(package, t
     assert list((tmp_path / "mine").rglob("*.nbc"))
 
 
+PATIENCE_CPU_S = 600.0  # of processor time; scan-match, which takes longest, takes 20 s
+
+
+@pytest.fixture
+def hang_found_by_processor_time():
+    """The time of a clock also counts what other processes take, and for how long a hypervisor stops this one."""
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def fail(*_):
+        pytest.fail(f"it has computed for {PATIENCE_CPU_S:.0f} s")
+
+    before = signal.signal(signal.SIGPROF, fail)
+    signal.setitimer(signal.ITIMER_PROF, PATIENCE_CPU_S)
+    yield
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
+    signal.signal(signal.SIGPROF, before)
+
+
+@pytest.mark.timeout(0)
+@pytest.mark.usefixtures("hang_found_by_processor_time")
 @pytest.mark.parametrize(
     "name", [*filters.NAMES, *get_args(Method), precompile.TEXT, precompile.NOISES, precompile.FILES]
 )

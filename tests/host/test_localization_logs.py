@@ -256,6 +256,20 @@ def test_disorder_and_lines_without_a_time(tmp_path):
     assert "cut short and left out" in " ".join(read.remarks)
 
 
+def test_what_was_changed_in_a_log_is_said_before_the_map_is_refused(tmp_path, linkpose):
+    """A map without a wall hid that the log had been sorted."""
+    lines = [f"FLASER 2 1.0 1.0 0 0 0 0 0 0 {1000.0 + i} h 0" for i in (0, 2, 1, 3)]
+    log, grid = tmp_path / "run.log", tmp_path / "map.yaml"
+    log.write_text("\n".join(lines) + "\n")
+    (tmp_path / "map.pgm").write_bytes(b"P5 2 2 255\n" + b"\xfe" * 4)
+    grid.write_text("image: map.pgm\nresolution: 0.1\norigin: [0, 0, 0]\n")
+    result = linkpose("localize", log, "--map", grid)
+    assert result.status == 1
+    moved, refusal = result.err.splitlines()
+    assert moved == f"{log}: 1 line moved into the order of time"
+    assert "no cell of the map is a wall" in refusal
+
+
 def test_motion_between_lines_of_one_instant_is_kept():
     """Ten lines of 0.1 m, two at each instant: 0.9 m in all, not half of it."""
     readings = [Reading(float(i // 2), (0.1 * i, 0.0, 0.0)) for i in range(10)]

@@ -322,9 +322,7 @@ def command(
         check_output(picture, force, FORMATS)
     options.refuse_mixed_output(output, json_lines)
     check_outputs([output] if output is not None else [], force)
-    prepared = prepare(log, map_path, beacons_path, odometry_path, methods, chosen)
-    for remark in prepared.remarks:
-        console.report(remark)
+    prepared = prepare(log, map_path, beacons_path, odometry_path, methods, chosen, console.report)
     console.compile([*prepared.settings, precompile.NOISES] if prepared.estimates_noises else list(prepared.settings))
     paths = prepared.run()
     for remark in paths.remarks[len(prepared.remarks) :]:

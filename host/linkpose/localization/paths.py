@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import functools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -213,13 +213,25 @@ def prepare(
     odometry: PathName | None,
     filters: Sequence[Method],
     options: LocalizationOptions,
+    report: Callable[[str], object] = lambda remark: None,
 ) -> PreparedLog:
-    """Reads and checks what `localize` takes. Raises LinkposeError where the parts do not fit each other."""
+    """Reads and checks what `localize` takes. Raises LinkposeError where the parts do not fit each other.
+
+    `report` receives each remark at once: those on the log explain why it may not fit the rest.
+    """
+    remarks: list[str] = []
+
+    def note(*texts: str) -> None:
+        for text in texts:
+            remarks.append(text)
+            report(text)
+
+    read = _events(log)
+    note(*read.remarks)
     grid = load_map(Path(grid)) if isinstance(grid, str | PathLike) else grid
     places = _places(beacons)
-    read = _events(log)
     origin = Path(log) if isinstance(log, str | PathLike) else IN_MEMORY
-    events, remarks = read.events, list(read.remarks)
+    events = read.events
     if odometry is not None:
         events = with_mice_odometry(events, Path(odometry))
     kinds = kinds_of(events)
@@ -229,7 +241,7 @@ def prepare(
         ranged = {event.beacon for event in events if isinstance(event, Event) and event.kind == "range"}
         constants = default_constants(kinds, len(ranged))
         if constants:
-            remarks.append("scale error and bias of the ranges are estimated, too")
+            note("scale error and bias of the ranges are estimated, too")
     # Odometry's own frame is the map's in a simulation only: scan-match checks the whole map instead.
     settings = {
         method: options.settings(constants, None if method == "scan-match" else read.start) for method in methods
@@ -239,18 +251,18 @@ def prepare(
         settings = {
             method: replace(chosen, speed_std_m_s=speed, turn_std_rad_s=turn) for method, chosen in settings.items()
         }
-        remarks.append("the odometry of the log is always at rest: the motion is taken from the scans; give --start")
+        note("the odometry of the log is always at rest: the motion is taken from the scans; give --start")
     if not read.is_carmen:  # its units are defined, and poses a millisecond apart give any turn rate
         check_units(events, places, str(origin))
     if vehicle_of(kinds) is CONSTANT_VELOCITY:
         settings, side = _with_side(events, settings, places, options.free)
-        remarks += side
+        note(*side)
     for method, chosen in settings.items():
         check(events, method, chosen, grid, places, str(origin))
     if options.correlation and most_at_once(events) == 1:
-        remarks.append("no two ranges of this log are of one instant, so their correlation changes nothing")
+        note("no two ranges of this log are of one instant, so their correlation changes nothing")
     if vehicle_of(kinds) is CONSTANT_VELOCITY:
-        remarks.append("the log has no odometry: a constant-velocity model is used, at the mean height of the beacons")
+        note("the log has no odometry: a constant-velocity model is used, at the mean height of the beacons")
     return PreparedLog(events, origin, grid, places, settings, options.free, tuple(remarks))
 
 
