@@ -65,6 +65,11 @@ def scale(factor: float, *names: str) -> Callable[[dict[str, np.ndarray]], None]
     return change
 
 
+def in_order(table: dict[str, np.ndarray], rows: np.ndarray) -> None:
+    """Brings the rows into this order, and leaves the times."""
+    table.update({name: values[rows] for name, values in table.items() if name != "time_s"})
+
+
 @functools.cache
 def fast_measurements() -> Measurements:
     return LinkRun(3, 1, 12.0).measurements()
@@ -228,6 +233,7 @@ WRONG = [
     (scale(1e-5, "pressure"), "is it in bar? multiply it by 100000"),
     (scale(100.0, "pressure"), "is it in hundredths of Pa? multiply it by 0.01"),
     (scale(0.5, "pressure"), "pressure_Pa is 50650 (median), as above 5100 m of altitude"),
+    (lambda table: in_order(table, np.random.default_rng(6).permutation(N)), "brought out of order, and time_s not?"),
     (lambda table: table.update(baro_temp_degC=np.full(N, 24_900.0)), "separator of thousands?"),
 ]
 
@@ -254,6 +260,7 @@ WRONG = [
         "bar",
         "hundredths",
         "half the pressure",
+        "shuffled",
         "thousands",
     ],
 )
@@ -345,6 +352,17 @@ def coarse(table: dict[str, np.ndarray]) -> None:
 )
 def test_readings_that_are_repeated_and_marked_as_new_are_named(tmp_path: Path, change, is_named: bool) -> None:
     assert ("baro_fresh is 1 in 600 rows, and pressure_Pa changes in" in remarks(tmp_path, change)) == is_named
+
+
+@pytest.mark.parametrize("shake_hz", [9.0, 12.5, 24.0])
+def test_a_vibration_is_no_disorder(shake_hz: float) -> None:
+    """At 50 Hz and this frequency, readings change from row to row as much as over the recording."""
+    time_s = np.arange(1000) / 50
+    wave = np.sin(2 * np.pi * shake_hz * time_s + 0.2)[:, None]
+    noise = np.random.default_rng(7).normal(0.0, 1.0, (1000, 6))
+    accel = [0.0, 0.0, 9.81] + 3.0 * wave + 0.05 * noise[:, :3]
+    found = suspicions(Measurements.from_imu(time_s, accel, wave + 0.01 * noise[:, 3:]), 50.0)
+    assert not any("order" in sentence for sentence in found)
 
 
 @pytest.mark.parametrize("every", [2, 3])

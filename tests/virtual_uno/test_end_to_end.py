@@ -20,6 +20,7 @@ from pty_server import PatientClock, PtyServer
 from rig_signals import RigFeed
 from wire_link import WireLink
 
+from linkpose.device.session import LATE_S
 from linkpose.recording.columns import ACCEL, GYRO, MAG, mouse_columns
 from linkpose.recording.table import read_table
 from linkpose.sensors.conversion import GAP_BEFORE
@@ -68,7 +69,7 @@ def test_live_estimates_from_the_real_firmware(served: PtyServer, tmp_path: Path
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
     assert summary["samples"] == pytest.approx(800, abs=8)
-    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
+    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0), lateness(served, LATE_S)
     assert linkpose("estimate", recording, "-o", replay, *J2S, *LINK_FILTERS).returncode == 0
     assert rows_of(replay) == rows_of(live)
     estimate = read_table(live, "estimate")
@@ -168,7 +169,7 @@ def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_p
     assert held.closing["mag"]["used_s"] > 2.0 > held.closing["mag"]["rejected_s"]
     assert np.isfinite(held.columns["joint_inertial_yaw_deg"][-100:]).all()
     summary = json.loads(done.stdout.splitlines()[-1])
-    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
+    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0), lateness(server, LATE_S)
     table = read_table(path, "recording")
     wanted = [f"imu2_{name}" for name in ACCEL + GYRO] + ["imu2_temp_degC", *MAG, "mag_fresh"]
     wanted += [name for port in (1, 2, 3) for name in mouse_columns(port)]
@@ -191,7 +192,7 @@ def test_the_angle_of_a_chain_from_two_sensors_on_one_board(board: Callable[...,
         done = linkpose("record", path, "--port", server.link, "--duration", 11, "--json")
     assert done.returncode == 0, done.stderr
     summary = json.loads(done.stdout.splitlines()[-1])
-    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0)
+    assert (summary["lost"], summary["corrupt"], summary["gaps"]) == (0, 0, 0), lateness(server, LATE_S)
     done = linkpose("estimate", path, "-o", estimate, "--filter", "chain", "--joint", "hinge")
     assert done.returncode == 0, done.stderr
     found = read_table(estimate, "estimate").columns
