@@ -64,10 +64,20 @@ class Connection:
             while not self._closing:
                 data = port.read(1)
                 if data:
-                    data += port.read(min(port.in_waiting, READ_SIZE))
+                    data += self._waiting_bytes()
                     arrived.put((now(), data))
         except Exception as error:  # whatever a driver raises when its device goes, the reader cannot go on
             arrived.put(error)
+
+    def _waiting_bytes(self) -> bytes:
+        """What else has arrived. A socket's `in_waiting` is 1 at most: each pair of bytes would take a turn."""
+        port = self._port
+        if not self._name.startswith("socket://"):
+            return bytes(port.read(min(port.in_waiting, READ_SIZE)))
+        timeout, port.timeout = port.timeout, 0
+        data = bytes(port.read(READ_SIZE))
+        port.timeout = timeout
+        return data
 
     def send(self, message: Message) -> float:
         """Sends a message and returns the time just before (s). Raises Disconnected."""
