@@ -124,6 +124,18 @@ def _remembered_call_type(function: Any, context: Any, args: tuple[Any, ...], kw
     return found
 
 
+_records: Any = types.Record
+_describe = _records.__repr__
+_descriptions: dict[int, tuple[Any, str]] = {}  # by id: the record's type, which is kept, and its text
+
+
+def _remembered_description(kind: Any) -> str:
+    """The text of a record's type, with all its fields, which numba writes into messages of each pass."""
+    if id(kind) not in _descriptions:
+        _descriptions[id(kind)] = kind, _describe(kind)
+    return _descriptions[id(kind)][1]
+
+
 _has_loc = functools.cache(base._has_loc)  # whether a function of numba has a parameter: inspecting it takes 0.1 ms
 
 
@@ -132,10 +144,12 @@ def _remembering() -> Iterator[None]:
     """Within this context, numba remembers what depends on nothing that changes. Numba's lock admits one thread."""
     inspected = base._has_loc
     _functions.get_call_type, base._has_loc = _remembered_call_type, _has_loc
+    _records.__repr__ = _remembered_description
     try:
         yield
     finally:
         _functions.get_call_type, base._has_loc = _resolve, inspected
+        _records.__repr__ = _describe
 
 
 _make_usable = JITCodeLibrary._finalize_specific
