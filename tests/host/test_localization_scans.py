@@ -173,13 +173,17 @@ def with_short_echoes(log: Log) -> Log:
     ]
 
 
-@pytest.mark.parametrize("disturbed", [lambda log: among_people(log, 5), with_short_echoes])
-def test_beams_that_end_in_free_space_do_not_pull_the_robot(drive, disturbed: Callable[[Log], Log]) -> None:
-    """They moved the path by up to 0.15 m."""
+@pytest.mark.parametrize(
+    ("disturbed", "limit_m"), [(lambda log: among_people(log, 5), 0.03), (with_short_echoes, 0.017)]
+)
+def test_beams_that_end_in_free_space_do_not_pull_the_robot(
+    drive, disturbed: Callable[[Log], Log], limit_m: float
+) -> None:
+    """The errors were 0.046 and 0.020 m (rms), with people up to 0.15 m."""
     run, grid = drive
     track = estimate_track(disturbed(as_log(run.readings)), "scan-match", Settings(start=tuple(run.pose[0])), grid)
     result = score_track(track, run.truth)
-    assert result.position_rmse_m < 0.03
+    assert result.position_rmse_m < limit_m
     assert result.within_2_sigma is not None and result.within_2_sigma > 0.95
     assert track.known.all() and track.relocated == 0
 
