@@ -13,7 +13,8 @@ Machine code and its pickled index run with the user's rights. The cache is read
 else can write it. The installation's machine code is read only if everybody who can write it can also write this file.
 Each file carries a checksum: a damaged file is recompiled.
 
-Decorators: `compiled` for a function that Python calls; `inner` for one that only compiled code calls.
+Decorators: `compiled` for a function that Python calls, `compiled_rules` for one that decides more than it computes;
+`inner` for one that only compiled code calls.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from numba.core.caching import (
 from numba.core.registry import cpu_target
 from numba.core.runtime.nrt import rtsys
 
-from linkpose.lean_compiler import Inner, Outer, interruptible
+from linkpose.lean_compiler import Inner, Outer, OuterOfRules, interruptible
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -334,6 +335,8 @@ def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
 
 
 compiled = _decorator(True, no_cfunc_wrapper=True, nogil=True, pipeline_class=Outer)  # filters run in parallel
+# For functions that decide more than they compute.
+compiled_rules = _decorator(True, no_cfunc_wrapper=True, nogil=True, pipeline_class=OuterOfRules)
 # Without a wrapper for Python and without a file of its own.
 inner = _decorator(False, no_cpython_wrapper=True, no_cfunc_wrapper=True, pipeline_class=Inner)
 

@@ -102,7 +102,9 @@ _PASSES = (
     typed_passes.NoPythonBackend,
 )
 # LLVM's level. Level 3 unrolls the loops over 34 states: twice the time to compile, and no faster.
-_OPTIMISATION = 2
+_OPTIMISATION = {"opt": 2}
+# For functions that decide more than they compute, whose loops are short: 30 % less time to compile, and no slower.
+_LIGHT_OPTIMISATION = {"opt": 1, "loop_vectorize": False}
 _SCALARS = (types.Float, types.Integer, types.Boolean)
 
 _functions: Any = types.Function  # the class of numba's built-in functions, such as operators
@@ -194,6 +196,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
     """LLVM code that is optimised once, as a whole, when the outermost function is complete."""
 
     _linking_libraries: list[Any]
+    _optimisation: dict[str, int] = _OPTIMISATION
 
     def _optimize_functions(self, module: Any) -> None:
         """Nothing to do for one function alone."""
@@ -209,7 +212,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
         for function in self._final_module.functions:
             if function.linkage == Linkage.linkonce_odr:
                 function.linkage = Linkage.private
-        manager, builder = self._codegen._module_pass_manager(opt=_OPTIMISATION)
+        manager, builder = self._codegen._module_pass_manager(**self._optimisation)
         manager.run(self._final_module, builder)
 
     def finalize(self) -> None:
@@ -222,6 +225,12 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
                 waiting += new
         self._linking_libraries = list(called)
         super().finalize()
+
+
+class _LightLibrary(_Library):
+    """LLVM code that is optimised lightly."""
+
+    _optimisation = _LIGHT_OPTIMISATION
 
 
 class _PartLibrary(_Library):
@@ -269,6 +278,12 @@ class Outer(CompilerBase):  # type: ignore[misc]
             passes.add_pass(each, each._name)
         passes.finalize()
         return [passes]
+
+
+class OuterOfRules(Outer):
+    """Pipeline of functions that Python calls and that decide more than they compute."""
+
+    library = _LightLibrary
 
 
 class Inner(Outer):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from linkpose.compiling import compiled, inner
+from linkpose.compiling import compiled_rules, inner
 from linkpose.filters._vector import wrapped
 from linkpose.filters.mice import reading
 from linkpose.filters.mice.faults import fault_limit, number, trusted
@@ -636,7 +636,7 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
 
 
-@compiled
+@compiled_rules
 def process(
     samples: Records, parameters: Records, planar: Records, rig: Records, mice: Records, mice_states: Records,
     tangent: Records, points: Records, states: Records, out: Records,
