@@ -35,8 +35,8 @@ def mice_findings(estimator: Estimator) -> Iterator[str]:
         change = "more" if factor > 1 else "fewer"
         yield (
             f"in turns, the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig "
-            "file states, compared with the gyro: they are on another floor, or slip in turns. On another floor, type "
-            "`linkpose calibrate mice`"
+            "file states, compared with the gyro: either they slip in turns, or the floor is another one; for that "
+            "one, type `linkpose calibrate mice`"
         )
 
 

@@ -173,6 +173,16 @@ def test_a_file_is_converted_in_blocks(estimate, tmp_path, monkeypatch):
         assert all(np.array_equal(found.columns[name], own.columns[name], equal_nan=True) for name in own.columns)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_signalling_nan_of_a_parquet_file_is_a_missing_value(tmp_path):
+    """NumPy warns in sums and in `any` of such a value; one flipped bit of an infinity makes it."""
+    pa, pq = importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
+    height = np.array([0x7FF0000000000001, 0], dtype=np.uint64).view(np.float64)
+    pq.write_table(pa.table({"time_s": [0.0, 0.01], "height_m": height}), tmp_path / "run.parquet")
+    found = read_table(tmp_path / "run.parquet").columns["height_m"]
+    assert np.isnan((found + 1.0)[0]) and found.any() and found[1] == 0.0
+
+
 def test_a_damaged_parquet_file_is_named(tmp_path):
     pa, pq = importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     path = tmp_path / "run.parquet"

@@ -369,7 +369,7 @@ REMARKS: dict[str, str | Producer] = {
     "mouse … is … mm from its place in the rig file: the turns show it at x_m = …, y_m = …": reported(
         moved_mice=[SimpleNamespace(mouse=2, off_m=0.03, x_m=0.1, y_m=0.0)]
     ),
-    "in turns, the mice count … ± … % … per metre than the rig file states, compared with the gyro: they are on another floor, or slip in turns. On another floor, type linkpose calibrate mice": reported(
+    "in turns, the mice count … ± … % … per metre than the rig file states, compared with the gyro: either they slip in turns, or the floor is another one; for that one, type linkpose calibrate mice": reported(
         mice_scale=(1.05, 0.001)
     ),
     "mice … and … are exchanged: in turns, each moves as at the place of another. Exchange their cables, or their [[mouse]] tables in the rig file": "test_planar_faults.py::test_mice_that_are_exchanged_are_named",

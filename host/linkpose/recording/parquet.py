@@ -10,6 +10,7 @@ import numpy as np
 
 from linkpose.errors import FileFormatError, MissingLibrary
 from linkpose.recording.textfile import Part, metadata_of
+from linkpose.sensors.measurements import Floats
 
 PARQUET_KEY = b"linkpose"  # of the metadata in a file's schema
 _MAGIC = b"PAR1"
@@ -66,10 +67,7 @@ class ParquetTable:
             for batch in self._file.iter_batches(_ROWS, columns=self.names):
                 if not batch.num_rows:
                     continue
-                columns = {
-                    name: column.cast(self._pyarrow.float64()).to_numpy(zero_copy_only=False).astype(np.float64)
-                    for name, column in zip(batch.schema.names, batch.columns, strict=True)
-                }
+                columns = dict(zip(batch.schema.names, map(self._numbers, batch.columns), strict=True))
                 yield Part(columns, line)
                 line += batch.num_rows
                 if progress is not None:
@@ -85,6 +83,12 @@ class ParquetTable:
 
     def _without_rows(self) -> FileFormatError:
         return FileFormatError(self._path, f"{self._path} has no row; nothing was recorded")
+
+    def _numbers(self, column: Any) -> Floats:
+        """The values (N,) of a column. A NaN of any bits becomes NumPy's own: a signalling one makes NumPy warn."""
+        values = np.array(column.cast(self._pyarrow.float64()).to_numpy(zero_copy_only=False), dtype=np.float64)
+        values[np.isnan(values)] = np.nan
+        return values
 
     def _unreadable(self, error: Exception) -> FileFormatError:
         return FileFormatError(self._path, f"{self._path} is no Parquet table of numbers: {error}")
