@@ -5,6 +5,7 @@ python tests/bench/mice.py [--json] [--seeds FIRST-LAST]
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 
@@ -19,16 +20,15 @@ FILTERS = ("planar-ekf", "planar-ukf")
 
 def main() -> None:
     parser = bench_parser(__doc__)
-    parser.add_argument("--seeds", default="0-4")
+    parser.add_argument("--seeds", type=_seeds, default="0-4", metavar="FIRST-LAST")
     parser.add_argument("--case", default="", help="only the cases whose names contain this text")
     parser.add_argument("--filter", choices=FILTERS, action="append")
     options = parser.parse_args()
-    first, last = map(int, options.seeds.split("-"))
     for name, make in CASES.items():
         if options.case not in name:
             continue
         found: dict[str, list[PoseError]] = {}
-        for seed in range(first, last + 1):
+        for seed in options.seeds:
             drive = make(seed)
             found.setdefault("baseline", []).append(pose_error(baseline(drive), drive.pose))
             for each in options.filter or FILTERS:
@@ -43,6 +43,15 @@ def main() -> None:
                 for who, (e, worst) in rows.items()
             ]
             print(f"{name:24}" + "   ".join(texts), flush=True)
+
+
+def _seeds(text: str) -> range:
+    """One seed, or all from FIRST to LAST."""
+    first, _, last = text.partition("-")
+    try:
+        return range(int(first), int(last or first) + 1)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a seed nor FIRST-LAST") from None
 
 
 def _mean(errors: list[PoseError]) -> PoseError:
