@@ -74,8 +74,8 @@ def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: 
 
 
 @compiled
-def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights: Floats) -> int:
-    """Sets the weights of beams to 0 that end in free space, and returns their number.
+def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights: Floats) -> None:
+    """Sets the weights of beams to 0 that end in free space.
 
     Such a beam ends farther than `beside` (m) from all walls and has crossed none: a person, a new piece of furniture
     or dust is before the wall. Where it ends does not depend on the pose.
@@ -84,7 +84,6 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
     cell = walls.geometry[0]
     inside = 0.0 if walls.reach > 0.0 else 0.6 * cell  # a point nearer to a wall is in it (half a cell on its sides)
     at = np.empty(3)
-    count = 0
     for i in range(beams.shape[0]):
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
         x = pose[0] + c * beams[i, 0] - s * beams[i, 1]
@@ -99,31 +98,15 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
             left -= max(at[0] - cell, 0.5 * cell)
         if not crosses:
             weights[i] = 0.0
-            count += 1
-    return count
 
 
 @compiled
-def scan_cost(walls: Walls, scan: Weighted, pose: Floats) -> float:
-    """The first sum above, seen from `pose`."""
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    beams, scale2 = scan.beams, scan.scale * scan.scale
-    at = np.empty(3)
-    total = 0.0
-    for i in range(beams.shape[0]):
-        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
-        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
-        total += math.log1p(scan.weights[i] * at[0] * at[0] / scale2)
-    return 0.5 * scan.information * scale2 * total
+def scan_cost(walls: Walls, scan: Weighted, pose: Floats, is_bounded: bool) -> float:
+    """The first sum above, seen from `pose`.
 
-
-@compiled
-def bounded_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
-    """Both sums above, where a beam costs c²/(2 σ²) w d² / (c² + w d²): the loss of Geman and McClure (the same table).
-
-    A beam that ends far from all walls costs the same at each pose. With the Cauchy loss, many of them together prefer
-    a pose that is nearer to them by decimetres.
+    `is_bounded`: a beam costs c²/(2 σ²) w d² / (c² + w d²) instead, the loss of Geman and McClure (the same table). A
+    beam that ends far from all walls then costs the same at each pose. With the Cauchy loss, many of them together
+    prefer a pose that is nearer to them by decimetres.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     beams, scale2 = scan.beams, scan.scale * scan.scale
@@ -134,8 +117,8 @@ def bounded_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> fl
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
         seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         square = scan.weights[i] * at[0] * at[0]
-        total += square / (scale2 + square)
-    return 0.5 * scan.information * scale2 * total + _prior_cost(prior, pose)
+        total += square / (scale2 + square) if is_bounded else math.log1p(square / scale2)
+    return 0.5 * scan.information * scale2 * total
 
 
 @compiled
@@ -201,7 +184,7 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
     """Improves `pose` (3,) in place and fills `hessians` as `normal_equations` does there."""
     slope, step, trial = np.empty(3), np.empty(3), np.empty(3)
     matrix, lower = np.empty((3, 3)), np.empty((3, 3))
-    cost = _cost(walls, scan, prior, pose)
+    cost = whole_cost(walls, scan, prior, pose, False)
     damping = 0.0
     for _ in range(MOST_STEPS):
         normal_equations(walls, scan, pose, hessians, slope)
@@ -219,7 +202,7 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
         shrink = min(shrink, LONGEST_TURN_RAD / (abs(step[2]) + 1e-12))
         for j in range(3):
             trial[j] = pose[j] + shrink * step[j]
-        trial_cost = _cost(walls, scan, prior, trial)
+        trial_cost = whole_cost(walls, scan, prior, trial, False)
         if trial_cost > cost:
             damping = 10.0 * damping + 0.1
             if damping > 1e3:
@@ -236,8 +219,9 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
 
 
 @compiled
-def _cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
-    return scan_cost(walls, scan, pose) + _prior_cost(prior, pose)
+def whole_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, is_bounded: bool) -> float:
+    """Both sums above; `is_bounded` as for `scan_cost`."""
+    return scan_cost(walls, scan, pose, is_bounded) + _prior_cost(prior, pose)
 
 
 @compiled

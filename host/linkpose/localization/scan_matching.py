@@ -24,10 +24,10 @@ from linkpose.localization.scan_fit import (
     Walls,
     Weighted,
     beam_weights,
-    bounded_cost,
     drop_short,
     fit_scan,
     misfit,
+    whole_cost,
 )
 
 # Deviation of a beam's end from the wall that the map shows (m), at least: half a cell of 5 cm, and a scanner's 3 cm.
@@ -170,7 +170,8 @@ class ScanMatcher:
             seen = self._weighted(beams, pose, narrow)
             drop_short(self.walls, beams, pose, beside, seen.weights)
             fit_scan(self.walls, seen, Prior(mean, prior), pose, hessians)
-        return pose, hessians, bounded_cost(self.walls, self._weighted(beams, pose, narrow), Prior(mean, prior), pose)
+        seen = self._weighted(beams, pose, narrow)
+        return pose, hessians, whole_cost(self.walls, seen, Prior(mean, prior), pose, True)
 
     def _seen(self, beams: Floats, pose: Floats, log_likelihood: float) -> float:
         """The log-likelihood of the beams that do not end in free space; that of all, where these are too few."""
