@@ -464,7 +464,7 @@ def _input(
         )
     if not len(recording):
         raise InvalidValue("source", "holds no sample")
-    return recording, None, None, suspicions(recording)
+    return recording, None, None, [found.sentence for found in suspicions(recording)]
 
 
 def with_chain_joint(rig: Rig, joint: str | None) -> Rig:

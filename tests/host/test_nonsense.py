@@ -83,12 +83,16 @@ def fast_swing() -> dict[str, np.ndarray]:
     return dict(zip(NAMES, columns, strict=False))
 
 
+def sentences(measurements: Measurements, rate_hz: float | None = None) -> list[str]:
+    return [found.sentence for found in suspicions(measurements, rate_hz)]
+
+
 def fast_remarks(change: Callable[[dict[str, np.ndarray]], object]) -> str:
     table = fast_swing()
     change(table)
     time_s, *values = table.values()
     accel, gyro = np.split(np.stack(values, axis=1), 2, axis=1)
-    return "\n".join(suspicions(Measurements.from_imu(time_s, accel, gyro)))
+    return "\n".join(sentences(Measurements.from_imu(time_s, accel, gyro)))
 
 
 def exchange(one: str, other: str) -> Callable[[dict[str, np.ndarray]], None]:
@@ -183,7 +187,7 @@ SECOND = [
 
 def second_remarks(seed: int, change: Callable[[Measurements], dict[str, np.ndarray]]) -> list[str]:
     measured = ChainRun("hinge", seed, 20.0).measurements()
-    return suspicions(dataclasses.replace(measured, **change(measured)))
+    return sentences(dataclasses.replace(measured, **change(measured)))
 
 
 @pytest.mark.parametrize(("change", "sentence"), SECOND, ids=[str(sentence)[:40] for _, sentence in SECOND])
@@ -198,7 +202,7 @@ def on_a_robot(z: float) -> list[str]:
     """With mice that count, and gravity along this direction of the z axis, and along x."""
     measured = ChainRun("hinge", 2, 20.0).measurements()
     accel = np.tile([9.80665 * np.sqrt(1 - z**2), 0.0, 9.80665 * z], (len(measured), 1))
-    return suspicions(dataclasses.replace(measured[:500], accel_m_s2=accel[:500], mice_counts=np.zeros((500, 2, 2))))
+    return sentences(dataclasses.replace(measured[:500], accel_m_s2=accel[:500], mice_counts=np.zeros((500, 2, 2))))
 
 
 @pytest.mark.parametrize("z", [1.0, 0.8, 0.5, 0.0, -1.0])
@@ -361,7 +365,7 @@ def test_a_vibration_is_no_disorder(shake_hz: float) -> None:
     wave = np.sin(2 * np.pi * shake_hz * time_s + 0.2)[:, None]
     noise = np.random.default_rng(7).normal(0.0, 1.0, (1000, 6))
     accel = [0.0, 0.0, 9.81] + 3.0 * wave + 0.05 * noise[:, :3]
-    found = suspicions(Measurements.from_imu(time_s, accel, wave + 0.01 * noise[:, 3:]), 50.0)
+    found = sentences(Measurements.from_imu(time_s, accel, wave + 0.01 * noise[:, 3:]), 50.0)
     assert not any("order" in sentence for sentence in found)
 
 

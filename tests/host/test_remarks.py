@@ -526,7 +526,15 @@ def has_all_parts(row: str, of: str) -> bool:
     return all(part.strip(" :;,.") in row for part in of.split("…"))
 
 
-STRINGS = {"str", "str | None", "list[str]", "Iterator[str]", "tuple[str, ...]"}
+TEXTS = (
+    "str",
+    "str | None",
+    "list[str]",
+    "Iterator[str]",
+    "tuple[str, ...]",
+    "list[Suspicion]",
+    "Iterator[_Explanation]",
+)
 FEWEST_WORDS = 3
 
 
@@ -549,7 +557,7 @@ class Functions:
             is_own = isinstance(call.func, ast.Name) or name_of(getattr(call.func, "value", call.func)) == "self"
             for where, function in self.by_name.get(name_of(call.func), []):
                 imported = where == path or (isinstance(call.func, ast.Name) and function.col_offset == 0)
-                if (is_own and imported) and function.returns and ast.unparse(function.returns) in STRINGS:
+                if (is_own and imported) and function.returns and ast.unparse(function.returns) in TEXTS:
                     self.add(where, function)
 
     def add(self, path: Path, function: ast.FunctionDef) -> None:

@@ -13,6 +13,7 @@ import functools
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,12 +44,20 @@ _AXES = "xyz"
 # Scales of one axis: another range or unit in one column. In right data of public recordings, the best of 0.5 and 2
 # left 0.91 and more of what is left without it, and each of the others as much. A gyro's axis that is ten times too
 # large stays within the range of the sensor where the motion is slow; an accelerometer's does not, because of gravity.
-_SCALES = {
-    f"{sensor}_{_AXES[axis]} times {factor:g}": np.where(np.arange(3) == axis, factor, 1.0)
+_SCALES = [
+    (sensor, axis, factor)
     for sensor, more in (("accel", (STANDARD_GRAVITY,)), ("gyro", (0.1, 10.0)))
     for axis in range(3)
     for factor in (0.5, 2.0, _DEGREES, 1000.0, *more)
-}
+]
+
+
+class _Explanation(NamedTuple):
+    """A change of the data, in a sentence, and what it leaves unexplained of the specific force."""
+
+    left_m_s2: float
+    sentence: str
+    alone: str = ""  # said instead where no other change explains as much
 
 
 def contradiction(measurements: Measurements) -> str:
@@ -65,36 +74,71 @@ def contradiction(measurements: Measurements) -> str:
     as_is = (motion := _Motion(rate, step_s)).unexplained(force)
     if not _CLEAR_M_S2 < as_is < np.inf or variation < _CLEAR_M_S2:
         return ""
-    motions = {factor: _Motion(factor * rate, step_s) for factor in _FACTORS}
-    left = {f"{factor:g}": scaled.unexplained(force) for factor, scaled in motions.items()}
-    for name, (sign, axes) in _exchanges().items():
-        left[name] = (motion if sign > 0 else motions[-1.0]).unexplained(force @ axes.T)
-    for name, by_axis in _SCALES.items():
-        if name.startswith("accel"):  # against its own variation: any force becomes small when it is scaled down
-            scaled_force = by_axis * force
-            left[name] = motion.unexplained(scaled_force) * variation / still.unexplained(scaled_force)
-        else:
-            left[name] = _Motion(by_axis * rate, step_s).unexplained(force)
-    delayed = _delayed(measurements)
-    left |= {_LATER.format(*order, at_s): value for order, at_s, value in delayed if value < _DELAYED * as_is}
-    best = min(left.values())
+    explanations = [
+        *_of_factors(rate, step_s, force),
+        *_of_exchanges(motion, _Motion(-rate, step_s), force),
+        *_of_scales(motion, still, rate, step_s, force),
+        *(found for found in _of_delays(measurements) if found.left_m_s2 < _DELAYED * as_is),
+    ]
+    best = min(found.left_m_s2 for found in explanations)
     if best > _BETTER * as_is or best > _EXPLAINS * variation:
         return ""
-    return _sentence([name for name, value in left.items() if value <= _TIE * best])
+    first, *others = [found for found in explanations if found.left_m_s2 <= _TIE * best]
+    return first.sentence if others else first.alone or first.sentence
 
 
-_LATER = "{} comes later than {} by {:g} s"
+def _of_factors(rate: Floats, step_s: float, force: Floats) -> Iterator[_Explanation]:
+    """All axes of the gyro times one factor, or the time."""
+    for factor in _FACTORS:
+        if factor == -1.0:
+            sentence = "gyro_* states the reverse of the rotation of gravity: its sign is wrong"
+        elif factor == 1 / _DEGREES:
+            sentence = f"gyro_* states 57 times the rotation of gravity: is it in °/s? multiply it by {factor:.7f}"
+        else:
+            sentence = (
+                f"gyro_* states {1 / factor:.4g} times the rotation of gravity: check the range (gyro_range_deg_s) and "
+                f"the unit, and multiply it by {factor:.4g}; or, if time_s is wrong, multiply that by {factor:.4g}"
+            )
+        yield _Explanation(_Motion(factor * rate, step_s).unexplained(force), sentence)
 
 
-def _delayed(measurements: Measurements) -> Iterator[tuple[tuple[str, str], float, float]]:
-    """For each delay: the later sensor and the other, the delay (s), and what is left unexplained without it."""
+def _of_exchanges(motion: _Motion, reversed_: _Motion, force: Floats) -> Iterator[_Explanation]:
+    """Axes exchanged or reversed, with the rates as they are or all reversed."""
+    for name, (sign, axes) in _exchanges().items():
+        left = (motion if sign > 0 else reversed_).unexplained(force @ axes.T)
+        text, alone = (
+            f"accel_* and gyro_* do not have the same axes{how}: were columns exchanged, or an axis reversed?"
+            for how in ("", f" ({name})")
+        )
+        yield _Explanation(left, text, alone)
+
+
+def _of_scales(motion: _Motion, still: _Motion, rate: Floats, step_s: float, force: Floats) -> Iterator[_Explanation]:
+    """One axis of one sensor times a factor."""
+    variation = still.unexplained(force)
+    for sensor, axis, factor in _SCALES:
+        by_axis = np.where(np.arange(3) == axis, factor, 1.0)
+        if sensor == "accel":  # against its own variation: any force becomes small when it is scaled down
+            scaled = by_axis * force
+            left = motion.unexplained(scaled) * variation / still.unexplained(scaled)
+        else:
+            left = _Motion(by_axis * rate, step_s).unexplained(force)
+        yield _Explanation(
+            left,
+            f"{sensor}_{_AXES[axis]} is {1 / factor:g} times what the motion in the other columns shows: check its "
+            f"unit, and multiply it by {factor:g}",
+        )
+
+
+def _of_delays(measurements: Measurements) -> Iterator[_Explanation]:
+    """One sensor is later than the other."""
     period_s = float(np.median(np.diff(measurements.time_s)))
     for delay_s in _DELAYS_S:
         rows = round(delay_s / period_s)
         kept = len(measurements) - rows
         if not 0 < rows < kept:
             continue
-        for order, of_accel, of_gyro in ((("accel_*", "gyro_*"), rows, 0), (("gyro_*", "accel_*"), 0, rows)):
+        for late, other, of_accel, of_gyro in (("accel", "gyro", rows, 0), ("gyro", "accel", 0, rows)):
             moved = replace(
                 measurements[:kept],
                 accel_m_s2=measurements.accel_m_s2[of_accel : of_accel + kept],
@@ -102,7 +146,11 @@ def _delayed(measurements: Measurements) -> Iterator[tuple[tuple[str, str], floa
             )
             if (windows := _windows(moved)) is not None:
                 step_s, force, rate = windows
-                yield order, delay_s, _Motion(rate, step_s).unexplained(force)
+                yield _Explanation(
+                    _Motion(rate, step_s).unexplained(force),
+                    f"{late}_* comes later than {other}_* by {delay_s:g} s, by the motion that both describe: were "
+                    "columns of two logs joined? Correct the times of one",
+                )
 
 
 def _silent(gyro: Floats, accel: Floats) -> str:
@@ -114,31 +162,6 @@ def _silent(gyro: Floats, accel: Floats) -> str:
     names = "gyro_*" if same.all() else " and ".join(f"gyro_{_AXES[i]}" for i in np.flatnonzero(same))
     values = " and ".join(dict.fromkeys(f"{gyro[0, i] + 0.0:g}" for i in np.flatnonzero(same)))
     return f"{names} is {values} in all rows: the gyro gives no reading there, or the column is of another quantity"
-
-
-def _sentence(names: list[str]) -> str:
-    """Names the first of the changes that explain the motion equally well."""
-    name = names[0]
-    if name == "-1":
-        return "gyro_* states the reverse of the rotation of gravity: its sign is wrong"
-    if name in _exchanges():
-        how = f" ({name})" if len(names) == 1 else ""
-        return f"accel_* and gyro_* do not have the same axes{how}: were columns exchanged, or an axis reversed?"
-    if " comes later than " in name:
-        return f"{name}, by the motion that both describe: were columns of two logs joined? Correct the times of one"
-    if name in _SCALES:
-        column, factor_text = name.split(" times ")
-        return (
-            f"{column} is {1 / float(factor_text):g} times what the motion in the other columns shows: check its unit, "
-            f"and multiply it by {factor_text}"
-        )
-    factor = float(name)
-    if name == f"{1 / _DEGREES:g}":
-        return f"gyro_* states 57 times the rotation of gravity: is it in °/s? multiply it by {1 / _DEGREES:.7f}"
-    return (
-        f"gyro_* states {1 / factor:.4g} times the rotation of gravity: check the range (gyro_range_deg_s) and the "
-        f"unit, and multiply it by {factor:.4g}; or, if time_s is wrong, multiply that by {factor:.4g}"
-    )
 
 
 @functools.cache

@@ -20,7 +20,7 @@ from linkpose.recording.capture_source import CaptureSource
 from linkpose.recording.survey import Survey
 from linkpose.recording.table import Progress
 from linkpose.recording.table_source import TableSource
-from linkpose.recording.units import UNIT_ROWS, is_negated, suspicions
+from linkpose.recording.units import UNIT_ROWS, Suspicion, is_negated, suspicions
 from linkpose.sensors import mpu6050
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.rig import Rig
@@ -113,7 +113,7 @@ class RecordingFile:
         self._kept: list[Measurements] | None = []  # the checked blocks of a short recording
         self._monitor = self._new_monitor(self._source.sensors)
         self.survey = Survey(self._source.rate_hz)
-        self._remarks_on_values: list[str] = []
+        self._remarks_on_values: list[Suspicion] = []
         self._changes: list[Change] = []  # the first of each sensor
         self._change_counts: dict[str, int] = {}
         self._read_all(progress)
@@ -121,7 +121,7 @@ class RecordingFile:
             del self._monitor.sensors[sensor]
         self.health = self._monitor.as_dict()  # state and counts by sensor (sensors.health)
         self.unusable = "" if self._monitor.is_usable else self._monitor.why_unusable  # why no filter can use it
-        self.remarks = [*self._source.remarks(), *self._remarks_on_values, *self._faults()]
+        self.remarks = [*self._source.remarks(), *self._value_remarks(), *self._faults()]
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -175,7 +175,8 @@ class RecordingFile:
         """Remarks on what contradicts the rig, from the first block."""
         joint = rig.joint.known_j2s_m if rig is not None else None
         block = next(self.blocks(), None)
-        is_explained = any("gyro_" in remark for remark in self._remarks_on_values)  # by a fault that looks like this
+        # A fault of the gyro looks like this.
+        is_explained = any(found.quantity == "gyro" for found in self._remarks_on_values)
         if joint is None or block is None or is_explained or not is_negated(block, joint):
             return []
         return [
@@ -213,13 +214,16 @@ class RecordingFile:
                 self._changes.append(change)
 
     def _judge_units(self, first: list[Measurements]) -> None:
-        found = suspicions(_joined(first), self._source.stated_rate_hz)
-        self._remarks_on_values = [f"{self.path}: {suspicion}" for suspicion in found]
+        self._remarks_on_values = suspicions(_joined(first), self._source.stated_rate_hz)
+
+    def _value_remarks(self) -> list[str]:
+        """What is implausible in the values, as remarks."""
+        return [f"{self.path}: {found.sentence}" for found in self._remarks_on_values]
 
     def _faults(self) -> list[str]:
         """The changes of sensors' states, as remarks."""
         sensors = set(self.sensors)
-        if any("pressure_Pa" in remark for remark in self._remarks_on_values):  # another unit, not a faulty sensor
+        if any(found.quantity == "pressure" for found in self._remarks_on_values):  # another unit, not a faulty sensor
             sensors.discard("baro")
         changes = sorted((c for c in self._changes if c.sensor in sensors), key=lambda change: change.time_s)
         remarks = [f"{self.path}: {change}" for change in changes[:MOST_CHANGES]]

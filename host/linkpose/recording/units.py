@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,48 +58,56 @@ _LONGEST_STEP_S = 0.5
 _FEWEST_SUCCESSIVE = 10.0
 
 
-def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list[str]:
-    """One sentence, with its cure, for each quantity whose values are implausible in the unit of its column.
+class Suspicion(NamedTuple):
+    """What is implausible in a recording: the quantity, as its columns are named, and a sentence with the cure."""
+
+    quantity: str
+    sentence: str
+
+
+def suspicions(measurements: Measurements, rate_hz: float | None = None) -> list[Suspicion]:
+    """One for each quantity whose values are implausible in the unit of its column, or beside the others.
 
     The first UNIT_ROWS samples are judged. `rate_hz` is the sample rate in the file's metadata, if it has one.
     """
     measurements = measurements[:UNIT_ROWS]
     is_next = (measurements.flags[1:] & GAP_BEFORE) == 0  # a step over a gap says nothing of the unit
     time = _time(_median(np.diff(measurements.time_s)[is_next]), rate_hz)
+    pressure_pa, is_fresh = measurements.pressure_Pa, measurements.baro_fresh
     found = [
         *_imu(measurements, bool(time)),
         *_second_imu(measurements, bool(time)),
-        _upright(measurements),
-        _disordered(measurements),
-        time,
-        _pressure(_median(measurements.pressure_Pa)),
-        _repeated("baro_fresh", "pressure_Pa", measurements.baro_fresh, measurements.pressure_Pa[:, None]),
-        _repeated("mag_fresh", "mag_*", measurements.mag_fresh, measurements.mag_uT),
-        _temperature("imu_temp_degC", _median(measurements.imu_temp_degC)),
-        _temperature("baro_temp_degC", _median(measurements.baro_temp_degC)),
+        Suspicion("accel", _upright(measurements)),
+        Suspicion("gyro", _disordered(measurements)),
+        Suspicion("time", time),
+        Suspicion("pressure", _pressure(_median(pressure_pa))),
+        Suspicion("pressure", _repeated("baro_fresh", "pressure_Pa", is_fresh, pressure_pa[:, None])),
+        Suspicion("mag", _repeated("mag_fresh", "mag_*", measurements.mag_fresh, measurements.mag_uT)),
+        Suspicion("imu_temp", _temperature("imu_temp_degC", _median(measurements.imu_temp_degC))),
+        Suspicion("baro_temp", _temperature("baro_temp_degC", _median(measurements.baro_temp_degC))),
     ]
-    return [suspicion for suspicion in found if suspicion]
+    return [suspicion for suspicion in found if suspicion.sentence]
 
 
-def _imu(measurements: Measurements, is_time_wrong: bool) -> list[str]:
-    """Remarks on the accelerometer and on the gyro; "" for none."""
+def _imu(measurements: Measurements, is_time_wrong: bool) -> list[Suspicion]:
+    """On the accelerometer and on the gyro; an empty sentence for none."""
     force_m_s2 = np.linalg.norm(measurements.accel_m_s2, axis=1)
     unit = _of_usual_size("accel_*", _median(force_m_s2), STANDARD_GRAVITY, _ACCEL_UNITS)
     force = unit or _force(measurements)
     rate = _rate(measurements.gyro_rad_s) or ("" if is_time_wrong or force else contradiction(measurements))
-    return [force or _gravity(measurements, force_m_s2), rate]
+    return [Suspicion("accel", force or _gravity(measurements, force_m_s2)), Suspicion("gyro", rate)]
 
 
-def _second_imu(measurements: Measurements, is_time_wrong: bool) -> list[str]:
-    """Remarks on the second inertial sensor, and on whether it is another one than the first."""
+def _second_imu(measurements: Measurements, is_time_wrong: bool) -> list[Suspicion]:
+    """On the second inertial sensor, and on whether it is another one than the first."""
     if not measurements.has_imu2:
         return []
     accel, gyro = measurements.accel2_m_s2, measurements.gyro2_rad_s
     found = _imu(replace(measurements, accel_m_s2=accel, gyro_rad_s=gyro), is_time_wrong)
     return [
-        *(re.sub(r"\b(?=(accel|gyro)_[*xyz])", "imu2_", text) for text in found),
-        _copied("accel", measurements.accel_m_s2, accel),
-        _copied("gyro", measurements.gyro_rad_s, gyro),
+        *(Suspicion(f"imu2_{name}", re.sub(r"\b(?=(accel|gyro)_[*xyz])", "imu2_", text)) for name, text in found),
+        Suspicion("imu2_accel", _copied("accel", measurements.accel_m_s2, accel)),
+        Suspicion("imu2_gyro", _copied("gyro", measurements.gyro_rad_s, gyro)),
     ]
 
 
