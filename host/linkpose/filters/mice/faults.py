@@ -29,6 +29,9 @@ _FAULT_Z = 4.75
 # Cost of each mouse in F: −2 log of its likelihood as noise of ±1 m/s at 5 mm/s resolution is about 16.
 # Doubled: a fault needs a larger contradiction.
 _EXCLUSION = 16.0
+# χ² of the others, beyond which one mouse does not explain a contradiction to the gyro (95 % of four degrees of
+# freedom). Doubled: a slip of all mice in a turn may pass for a fault of one of them.
+_ALONE = 9.5
 # A mouse without a count for this long (s) while others move is probably lifted; so much less does it cost in F.
 _SILENT_S, _SILENT_BONUS = 0.04, 25.0
 # How much cheaper than the second a hypothesis must be, or for how long (s) the best one may be undecided.
@@ -114,9 +117,6 @@ def _find_fault(state: Record, mice: Records, candidates: int, span: float, turn
     least = _cost(state, mice, candidates, NOBODY, span, turn)
     if not least > fault_limit(2 * count - (2 if has_gyro else 3)):
         return NOBODY
-    # Three mice that agree with each other and not with the gyro share one cause: the robot slips or is lifted.
-    if count > 2 and not _cost(state, mice, candidates, NOBODY, span, math.nan) > fault_limit(2 * count - 3):
-        return candidates
     best, second, worst = math.inf, math.inf, NOBODY
     for left_out in range(1, 1 << state.count):
         if left_out & ~candidates or (left_out == candidates and not has_gyro):
@@ -126,6 +126,12 @@ def _find_fault(state: Record, mice: Records, candidates: int, span: float, turn
             best, second, worst = cost, best, left_out
         else:
             second = min(second, cost)
+    # Three mice that agree with each other and not with the gyro share one cause, unless one mouse explains it: the
+    # robot slips or is lifted.
+    share_cause = count > 2 and not _cost(state, mice, candidates, NOBODY, span, math.nan) > fault_limit(2 * count - 3)
+    if share_cause and not best < _EXCLUSION + _ALONE:
+        state.is_decisive = True
+        return candidates
     state.is_decisive = second - best > _DECISIVE
     return worst
 

@@ -6,8 +6,9 @@ gyro, and a second pose follows the mice alone from the last agreement on. Until
 two poses is part of the stated standard deviation.
 
 A jump adds the same rate whatever the robot does. Mice that slip, or saturate, or have another scale or angle than
-assumed, err in proportion to the turn, with one share to the left and one to the right, or to the way. The residuals of
-both models, fitted to blocks of 0.2 s since the last agreement, decide as soon as the motion of the robot has changed.
+assumed, err in proportion to the turn, with one share to the left and one to the right, or to the way, where the share
+of a mouse whose scale drifts grows with time. The residuals of both models, fitted to blocks of 0.2 s since the last
+agreement, decide as soon as the motion of the robot has changed.
 
 Source of the change detection: E. S. Page, "Continuous inspection schemes", Biometrika 41 (1954).
 """
@@ -22,7 +23,7 @@ from linkpose.filters.mice.faults import number, trusted
 from linkpose.filters.mice.least_squares import ROUNDING, fit, squared_speed
 from linkpose.filters.mice.plane import dot, scaled, square, turned, turned_mean, unit
 from linkpose.filters.mice.state import NOBODY, Record, Records
-from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, SCALE, VX, VY, WZ, X, Y
+from linkpose.filters.planar.state import ANGLE, BIAS, CAUSES, HEADING, MICE, OF_MOUSE, SCALE, VX, VY, WZ, X, Y
 
 _BLOCK_S = 0.2  # one comparison (s). Doubled: a jump is found 0.2 s later, and half as large.
 # Cumulative sums of the difference over its σ, less this much per block; beyond the second number, the models are
@@ -42,11 +43,12 @@ _FEWEST_BLOCKS = 8
 _CALM_BLOCKS, _CALM_Z, _SHOWS_Z = 4, 1.5, 4.0
 # Blocks after which hypotheses that both fit badly are dropped (10 s): neither a jump nor a slip.
 _PATIENCE_BLOCKS = 50
-# Errors of the mice: the share of each motion that they lose, and the turn that they show per way of the robot (rad/m),
-# both 1σ. Of two mice 0.2 m apart, one that is turned by 10° shows 0.9 rad/m, one that is turned by 90° 5 rad/m. With
-# 0.1 rad/m, mice that were turned, or whose scale drifted, passed for jumps of the gyro, and the heading was lost.
-# Doubled: no change; a jump is found once the speed or the turn has changed.
-_LOST_STD, _VEERING_STD = 0.25, 5.0
+# Errors of the mice: the share of each motion that they lose, the turn that they show per way of the robot (rad/m), and
+# by how much that grows in a second (rad/m/s), all 1σ. Of two mice 0.2 m apart, one that is turned by 10° shows 0.9
+# rad/m, one that is turned by 90° 5 rad/m, and one that loses 20 % of its scale in a minute 0.017 rad/m more each
+# second. With 0.1 rad/m, or without the last, mice that were turned, or whose scale drifted, passed for jumps of the
+# gyro, and the heading was lost. Doubled: no change; a jump is found once the speed or the turn has changed.
+_LOST_STD, _VEERING_STD, _DRIFTING_STD = 0.25, 5.0, 0.03
 # Mice whose resolution has changed show the same share of the gyro's turn in two turns in a row: each of at least so
 # much turning (rad²/s), equal within the second number, off by more than the third. A turn ends below the fourth
 # (rad/s). Doubled second: two slips in a row pass for a resolution. Its σ is the last number.
@@ -321,7 +323,7 @@ def _is_over(state: Record, z: float, std: float) -> bool:
 
 @inner
 def _add_block(state: Record, off: float, variance: float, span: float) -> None:
-    """Add the terms of both fits: off = J span (a jump), off = c turn + d |turn| + e way (errors of the mice).
+    """Add the terms of both fits: off = J span (a jump), off = c turn + d |turn| + (e + f age) way (by the mice).
 
     With c and d, mice may lose one share of turns to the left, and another one of those to the right.
     """
@@ -334,16 +336,11 @@ def _add_block(state: Record, off: float, variance: float, span: float) -> None:
     weight = 1.0 / variance
     dispute.jump_square += weight * span * span
     dispute.jump_product += weight * span * off
-    way = dispute.block_way
-    dispute.turn_square += weight * turn * turn
-    dispute.turn_way += weight * turn * way
-    dispute.turn_size += weight * turn * abs(turn)
-    dispute.size_way += weight * abs(turn) * way
-    dispute.way_square += weight * way * way
-    dispute.turn_off += weight * turn * off
-    dispute.size_off += weight * abs(turn) * off
-    dispute.way_off += weight * way * off
-    dispute.off_square += weight * off * off
+    terms, way = dispute.terms, dispute.block_way
+    terms[0], terms[1], terms[2], terms[3], terms[4] = turn, abs(turn), way, way * dispute.span, off
+    for i in range(CAUSES + 1):
+        for k in range(CAUSES + 1):
+            dispute.sums[i, k] += weight * terms[i] * terms[k]
 
 
 @inner
@@ -359,7 +356,7 @@ def _decide(state: Record, m: Record) -> None:
     if dispute.blocks < _FEWEST_BLOCKS or dispute.jump_square == 0.0:
         return
     jump = dispute.jump_product / dispute.jump_square
-    by_jump = dispute.off_square - jump * dispute.jump_product
+    by_jump = dispute.sums[CAUSES, CAUSES] - jump * dispute.jump_product
     by_mice = _cost_of_mice(dispute)
     variance = 1.0 / dispute.jump_square + _variance_of_calibration(state) / (dispute.span * dispute.span)
     is_jump = by_mice - by_jump > _BETTER and by_jump < _MOST_CHI2 * dispute.blocks
@@ -376,21 +373,28 @@ def _decide(state: Record, m: Record) -> None:
 def refute_jump(state: Record) -> None:
     """End the dispute with the pose of the gyro: the mice have erred since it began. The way is uncertain by it."""
     dispute = state.dispute
-    lost = dispute.turn_off / (dispute.turn_square + 1.0 / _LOST_STD**2)
+    lost = dispute.sums[0, CAUSES] / (dispute.sums[0, 0] + 1.0 / _LOST_STD**2)
     widen_way(state, min(abs(lost), 1.0), complex(state.at.x, state.at.y) - dispute.start)
     agree(state)
 
 
 @inner
 def _cost_of_mice(dispute: Record) -> float:
-    """χ² of the best fit of off = c turn + d |turn| + e way, by elimination of e."""
-    way, turn = dispute.way_square + 1.0 / _VEERING_STD**2, dispute.turn_square + 1.0 / _LOST_STD**2
-    by_turn, by_size, by_off = dispute.turn_way / way, dispute.size_way / way, dispute.way_off / way
-    a, d = turn - by_turn * dispute.turn_way, turn - by_size * dispute.size_way
-    b = dispute.turn_size - by_turn * dispute.size_way
-    x, y = dispute.turn_off - by_turn * dispute.way_off, dispute.size_off - by_size * dispute.way_off
-    by_both = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
-    return float(dispute.off_square - by_off * dispute.way_off - by_both)
+    """χ² of the best fit of off = c turn + d |turn| + (e + f age) way, by elimination of the four."""
+    left = dispute.left
+    for i in range(CAUSES + 1):
+        for k in range(CAUSES + 1):
+            left[i, k] = dispute.sums[i, k]
+    left[0, 0] += 1.0 / _LOST_STD**2
+    left[1, 1] += 1.0 / _LOST_STD**2
+    left[2, 2] += 1.0 / _VEERING_STD**2
+    left[3, 3] += 1.0 / _DRIFTING_STD**2
+    for j in range(CAUSES):
+        for i in range(j + 1, CAUSES + 1):
+            share = left[i, j] / left[j, j]
+            for k in range(j, CAUSES + 1):
+                left[i, k] -= share * left[j, k]
+    return float(left[CAUSES, CAUSES])
 
 
 @inner
@@ -419,9 +423,9 @@ def _forget(dispute: Record) -> None:
     """Forget the blocks so far."""
     dispute.span = 0.0
     dispute.jump_square = dispute.jump_product = 0.0
-    dispute.turn_square = dispute.turn_way = dispute.way_square = 0.0
-    dispute.turn_size = dispute.size_way = dispute.size_off = 0.0
-    dispute.turn_off = dispute.way_off = dispute.off_square = 0.0
+    for i in range(CAUSES + 1):
+        for k in range(CAUSES + 1):
+            dispute.sums[i, k] = 0.0
     dispute.blocks = 0
     for i in range(len(dispute.by_scale)):
         dispute.by_scale[i] = dispute.by_angle[i] = 0.0

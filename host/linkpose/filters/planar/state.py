@@ -62,6 +62,8 @@ _RESOLUTION = np.dtype(
     align=True,
 )
 
+CAUSES = 4  # terms of the turn by which mice err: turn, |turn|, way, way times age
+
 # Gyro and mice that turn by different amounts: sums since the last agreement, see `gyro`.
 _DISPUTE = np.dtype(
     [
@@ -87,15 +89,9 @@ _DISPUTE = np.dtype(
         ("span", "f8"),  # s
         ("jump_square", "f8"),
         ("jump_product", "f8"),
-        ("turn_square", "f8"),
-        ("turn_size", "f8"),  # size: |turn|
-        ("turn_way", "f8"),
-        ("size_way", "f8"),
-        ("way_square", "f8"),
-        ("turn_off", "f8"),
-        ("size_off", "f8"),
-        ("way_off", "f8"),
-        ("off_square", "f8"),
+        ("sums", "f8", (CAUSES + 1, CAUSES + 1)),  # weighted products of the terms of the mice's errors, and of `off`
+        ("left", "f8", (CAUSES + 1, CAUSES + 1)),  # of them after an elimination
+        ("terms", "f8", (CAUSES + 1,)),
         # Change of the turn by the mice with the scale and the angle of each (rad).
         ("by_scale", "f8", (MOST,)),
         ("by_angle", "f8", (MOST,)),
