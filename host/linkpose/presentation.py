@@ -188,7 +188,7 @@ def length_text(value_m: float, std_m: float) -> str:
     if not math.isfinite(value_m):
         return "–"
     decimals = _digits(std_m).of_value
-    return minus(f"{round(value_m, decimals) + 0.0:.{decimals}f} m")  # + 0.0: no "−0.00"
+    return minus(f"{value_m:z.{decimals}f} m")  # z: no "−0.00"
 
 
 def aligned_length(value_m: float, std_m: float) -> str:
@@ -215,7 +215,7 @@ def _digits(std_m: float) -> _Digits:
 def same_digits(first: float, *others: float) -> list[str]:
     """Errors as texts that end at the same digit, the third one of the first."""
     decimals = max(0, min(_MOST_ERROR_DECIMALS, 2 - math.floor(math.log10(first)))) if first > 0 else 0
-    return [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in (first, *others)]  # + 0.0: no "-0.00"
+    return [f"{value:z.{decimals}f}" for value in (first, *others)]  # z: no "-0.00"
 
 
 def minus(number: str) -> str:

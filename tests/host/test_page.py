@@ -154,6 +154,51 @@ def test_the_page_shows_the_last_row_and_a_fault_in_red(browser: Browser, tmp_pa
         leave_without_error(browser)
 
 
+# Frames that the client draws while the browser has 30, with a clock that stands still: what draws for a while goes on.
+STOP_THE_CLOCK = "(() => { const later = performance.now() + 1e6; performance.now = () => later; })()"
+SCENE = "window.__viserMutable.scene.__r3f.root.getState()"
+FRAMES_OF_30 = f"""new Promise(resolve => {{
+  const counted = {SCENE}.gl.info.render, before = counted.frame;
+  const next = left => left ? requestAnimationFrame(() => next(left - 1)) : resolve(counted.frame - before);
+  next(30);
+}})"""
+# The width of the cone as drawn: three.js computes this matrix when it draws.
+CONE_RADIUS = """(() => {
+  let mesh;
+  window.__viserMutable.nodeRefFromName["/link/cone"].traverse(part => { mesh = mesh || (part.isMesh && part); });
+  return Math.hypot(...mesh.matrixWorld.elements.slice(0, 3));
+})()"""
+NEW_NODE = """new Promise(resolve => {
+  const look = () => "/new" in window.__viserMutable.nodeRefFromName ? resolve() : requestAnimationFrame(look);
+  look();
+})"""
+
+
+def test_without_a_graphics_card_an_update_takes_one_frame(browser: Browser) -> None:
+    """viser draws for 250 ms after each change: always, at the rate of the screen, and new values wait for it."""
+    rows = link_rows()
+    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
+        page.show(rows[:50], status())
+        browser.open(page.url)
+        browser.wait_for_text(f"{rows[49, 1]:.3f} m ±2.0 cm")
+        browser.wait_for("Object.keys(window.__viserTestpoints?.uplots ?? {}).length == 3")
+        page._has_ended = True  # the updates are made here
+        browser.evaluate(STOP_THE_CLOCK)
+        rows[60, [4, 6]] = 10.0
+        page.show(rows[60], status())
+        page._loop.call_soon_threadsafe(page._redraw)
+        page._loop.call_soon_threadsafe(page._update)
+        browser.wait_for_text(f"{rows[60, 1]:.3f} m ±2.0 cm")
+        assert browser.evaluate(FRAMES_OF_30) < 15
+        length = float(np.linalg.norm(J2S_M))
+        assert browser.evaluate(CONE_RADIUS) == pytest.approx(geometry.cone_radius(length, 10.0), rel=1e-3)
+        assert browser.evaluate("window.__viserMutable.backgroundMaterial.visible") is False
+        page._server.scene.add_icosphere("/new")  # viser's way: such a change is complete only after a while
+        browser.evaluate(NEW_NODE)
+        assert browser.evaluate(FRAMES_OF_30) > 25
+        leave_without_error(browser)
+
+
 @contextlib.contextmanager
 def command(*typed: object) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """linkpose in a process of its own, and the address of the page that it serves."""
@@ -458,9 +503,10 @@ def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
         assert any(f"{row[1]:.3f} m ±2.0 cm" in str(m.get("updates")) for m in messages)
         turn = next(m["wxyz"] for m in messages if m.get("name") == "/link" and "wxyz" in m)
         assert turn == pytest.approx(geometry.attitude(row[3], row[5], 0.0))
-    charts = [(array, m["updates"]["data"]) for messages, array in sent for m in messages if "data" in str(m)]
-    assert len(charts) == 3 * 3  # with the first, the tenth and the nineteenth row
-    array, (time, low, high, height) = charts[6]
+    charts = [[(array, m["updates"]["data"]) for m in messages if "data" in str(m)] for messages, array in sent]
+    # All with the first row, to whom opens the page; then one an update, from the one after the tenth row on.
+    assert [len(of_update) for of_update in charts] == [3] + 9 * [0] + 3 * [1] + 6 * [0] + [1]
+    array, (time, low, high, height) = charts[19][0]
     assert array(time) == pytest.approx(rows[:19, 0])
     assert array(height) == pytest.approx(rows[:19, 1])
     assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(19), rel=1e-4)

@@ -11,9 +11,9 @@ from linkpose import plotting
 from linkpose.localization.surroundings import Surroundings
 from linkpose.outputs import new_file
 from linkpose.page.changes import Changes
+from linkpose.page.client import titled
 from linkpose.page.drawing import Drawing
 from linkpose.page.history import Replay
-from linkpose.page.origin import titled
 from linkpose.page.page import LOOPBACK, free_port, serve
 from linkpose.page.tables import rig_of, rows_of
 from linkpose.recording.table import Table

@@ -19,8 +19,9 @@ class History:
 
     def __init__(self, columns: Sequence[str]) -> None:
         self._most = round(SPAN_S / POINT_INTERVAL_S) + 1
-        # Rows [start, end) are kept. At the end of the array, the kept rows move to its beginning.
-        self._rows: Floats = np.empty((4 * self._most, len(columns)))
+        # Rows [start, end) are kept. At the end of the array, the kept rows move to its beginning. Each column is one
+        # piece of memory: the charts read a few of them.
+        self._rows: Floats = np.empty((4 * self._most, len(columns)), order="F")
         self._start = self._end = 0
         self._path: list[Floats] = []
         self._step = 1  # rows between two of the path
@@ -66,7 +67,7 @@ class History:
     def window(self) -> Floats:
         """The rows (N, columns) of the last SPAN_S seconds; a view that the next `add` may change."""
         rows: Floats = self._rows[self._start : self._end]
-        return rows[rows[:, 0] >= rows[-1, 0] - SPAN_S] if len(rows) and rows[0, 0] < rows[-1, 0] - SPAN_S else rows
+        return rows[int(np.searchsorted(rows[:, 0], rows[-1, 0] - SPAN_S)) :] if len(rows) else rows
 
     def path(self) -> Floats:
         """Rows (N, columns) along the whole path, with the newest as the last."""

@@ -16,6 +16,8 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import urlsplit
 
+from linkpose.page.client import adapted
+
 # Browsers open connections in advance and close them unused, which websockets logs as an error with a traceback. It is
 # printed only where the program that uses linkpose has asked for logs.
 _LOG = logging.getLogger("linkpose.page")
@@ -45,15 +47,10 @@ def _is_address(name: str) -> bool:
     return True
 
 
-def titled(page: str) -> str:
-    """viser's page with linkpose's title; viser has no parameter for it."""
-    return page.replace("<title>Viser</title>", "<title>linkpose</title>", 1)
-
-
-def _with_title(answer: Any) -> Any:
-    """An answer of viser's server; the page among them gets its title."""
+def _adapted(answer: Any) -> Any:
+    """An answer of viser's server; the page among them becomes linkpose's."""
     if answer is not None and answer.headers.get("Content-Type", "").startswith("text/html"):
-        answer.body = titled(answer.body.decode()).encode()
+        answer.body = adapted(answer.body.decode()).encode()
         del answer.headers["Content-Length"]
         answer.headers["Content-Length"] = str(len(answer.body))
     return answer
@@ -70,9 +67,9 @@ def own_requests_only(host: str) -> Iterator[None]:
         async def process(connection: Any, request: Any) -> Any:
             if not is_own(request.headers, host):
                 return connection.respond(HTTPStatus.FORBIDDEN, "This page is not open to other pages.\n")
-            request.headers.pop("Accept-Encoding", None)  # `_with_title` needs the page's text
+            request.headers.pop("Accept-Encoding", None)  # `_adapted` needs the page's text
             answer = process_request(connection, request) if process_request is not None else None
-            return _with_title(await answer if inspect.isawaitable(answer) else answer)
+            return _adapted(await answer if inspect.isawaitable(answer) else answer)
 
         return serve(*args, process_request=process, logger=_LOG, **options)
 

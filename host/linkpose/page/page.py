@@ -37,7 +37,7 @@ FIRST_PORT = 8080
 # frame that it draws and the next one, and the sum is to stay below 0.1 s. An update costs about half a millisecond of
 # CPU (tests/bench/page.py).
 UPDATE_INTERVAL_S = 0.055
-CHART_INTERVAL = 9  # updates between two of the charts and of a path, which are the largest messages
+CHART_INTERVAL = 9  # updates between two of the same chart and of a path, which are the largest messages
 STATUS_INTERVAL = 25  # blocks between two updates of the health, which sums over all sensors
 J2S_GOAL_M = 0.03  # 1σ in the worst direction below which the guide requests no other motion
 FAREWELL_S = 1.0  # that the end of a run waits for the last update of the page, at most
@@ -228,7 +228,7 @@ class Page:
             return
         if self._replay is not None:
             self._advance(self._replay)
-        if self._is_changed or is_full:  # charts catch up with the last rows
+        if self._is_changed or is_full or self._panel.has_due_charts:  # charts catch up with the last rows
             self._is_changed = False
             self._draw(is_full)
 
@@ -285,8 +285,10 @@ class Page:
             self._panel.draw_headline(row[name], name)
             if is_full:
                 self._panel.draw_details(row[name])
-                self._panel.draw_charts(self._history.window(), name)
                 self._drawing.draw_slow(row, name, self._history)
+                self._panel.renew_charts(self._history.window(), name)
+            if self._updates == 1 or not is_full:
+                self._panel.draw_charts(is_whole=self._updates == 1)
         self._changes.broadcast(self._clients)
 
     def _draw_status(self, time_s: float | None, status: PageStatus) -> None:

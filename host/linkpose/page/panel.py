@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -68,6 +69,7 @@ class Panel:
         self._charts: dict[Quantity, viser.GuiUplotHandle] = {}
         self._curves: dict[str, _Curves] = {}
         self._charted = ""  # the filter whose charts are visible
+        self._due: deque[tuple[Quantity, Floats, NDArray[np.float32]]] = deque()  # charts with their time and lines
 
     def add_charts(self) -> None:
         """Adds the charts below what the panel has already."""
@@ -103,8 +105,8 @@ class Panel:
             padding=_CHART_PADDING,
         )
 
-    def draw_charts(self, window: Floats, name: str) -> None:
-        """Draws the rows (N, columns) of the last seconds as the filter `name` estimates them."""
+    def renew_charts(self, window: Floats, name: str) -> None:
+        """Computes the charts of the rows (N, columns) of the last seconds as the filter `name` estimates them."""
         if name not in self._curves:
             self._curves[name] = self._curves_of(name)
         curves = self._curves[name]
@@ -112,19 +114,28 @@ class Panel:
             self._charted = name
             for quantity, chart in self._charts.items():
                 chart.visible = quantity in curves.quantities
+        self._due.clear()
         if not curves.quantities:
             return
         rows = with_gap_rows(window)
-        lines = curves.lines(rows)
-        time = self._changes.array(rows[:, 0])
-        is_whole = np.asarray(np.isfinite(lines).all(axis=2))
-        for at, quantity in enumerate(curves.quantities):
+        time, lines = rows[:, 0].copy(), curves.lines(rows)
+        self._due.extend(zip(curves.quantities, (time for _ in lines), lines, strict=True))
+
+    @property
+    def has_due_charts(self) -> bool:
+        """Whether charts are computed and not drawn yet."""
+        return bool(self._due)
+
+    def draw_charts(self, is_whole: bool) -> None:
+        """Draws one of the charts that are due, or with `is_whole` all of them.
+
+        A browser takes some milliseconds for one, after which it shows the newest row.
+        """
+        for _ in range(len(self._due) if is_whole else min(1, len(self._due))):
+            quantity, time, lines = self._due.popleft()
             count = 3 + (quantity.column in self._columns)
-            data = [
-                self._changes.array(lines[at, line]) if is_whole[at, line] else _with_gaps(lines[at, line])
-                for line in range(count)
-            ]
-            self._changes.plot(self._charts[quantity], [time, *data])
+            data = [self._changes.array(at) if np.isfinite(at).all() else _with_gaps(at) for at in lines[:count]]
+            self._changes.plot(self._charts[quantity], [self._changes.array(time), *data])
 
     def _curves_of(self, name: str) -> _Curves:
         columns = self._of_filter.get(name, {})
