@@ -250,8 +250,8 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
     rows, recording = tmp_path / "rows.csv", tmp_path / "rec.csv"
     command = ["estimate", "--live", "--port", "sim://link", "--filter", "joint", "--filter", "tilt"]
     with rows.open("wb") as stdout, Terminal(*command, "--record", recording, stdout=stdout) as terminal:
-        terminal.until(lambda text: "HEIGHT over joint" in text and "▸ joint" in text)
-        assert "m mark   f next filter   q stop" in terminal.text
+        shown = ("HEIGHT over joint", "▸ joint", "m mark   f next filter   q stop")
+        terminal.until(lambda text: all(part in text for part in shown))
         terminal.press("m")
         terminal.until(lambda text: "mark at " in text)
         terminal.press("f")
