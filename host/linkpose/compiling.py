@@ -28,7 +28,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -320,6 +320,15 @@ _the_cache = functools.cache(lambda: cache_folder(name=_the_name()))
 _the_installed = functools.cache(lambda: installed_folder(name=_the_name()))
 
 
+def _call_template(resolve: Callable[..., Any], args: Sequence[Any], kws: dict[str, Any]) -> Any:
+    """Numba's answer to a call from compiled code, with the types of constants in place of the constants.
+
+    Numba takes the constant 16 and an integer for two types, and would compile the function for both.
+    """
+    plain = {name: numba.types.unliteral(each) for name, each in kws.items()}
+    return resolve([numba.types.unliteral(each) for each in args], plain)
+
+
 def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     # Division by zero gives inf, as in the hardware: a check at each would cost more than the arithmetic.
     options = {"error_model": "numpy", **options}
@@ -327,6 +336,8 @@ def _decorator(keep: bool, **options: Any) -> Callable[[Function], Function]:
     def decorate(function: Function) -> Function:
         counts = function.__module__.split(".")[1:2] != [_ALLOCATE_NOTHING]
         made: Any = numba.njit(_nrt=counts, **options)(function)
+        if not _config.DISABLE_JIT:
+            made.get_call_template = functools.partial(_call_template, made.get_call_template)
         if keep and (_the_cache() or _the_installed()):
             made._cache = _KeptCode(function, _the_cache(), _the_installed())
         return cast(Function, made)

@@ -22,14 +22,51 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from llvmlite.binding import Linkage, executionengine
-from numba.core import base, typed_passes, types, untyped_passes
+from numba.core import base, interpreter, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.ir_utils import build_definitions
+from numba.core.rewrites.static_binop import DetectStaticBinops
+from numba.core.rewrites.static_getitem import RewriteConstGetitems, RewriteConstSetitems
+from numba.core.rewrites.static_raise import RewriteConstRaises
 from numba.core.ssa import reconstruct_ssa
 
 from linkpose.lean_lowering import Lower
+
+
+class _Interpreter(interpreter.Interpreter):  # type: ignore[misc]
+    """Byte code as numba's statements, without the searches for what is not supported here, such as `with`."""
+
+    def post_process(self, peepholes: list[Any], func_ir: Any) -> Any:
+        return func_ir
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _Translate(untyped_passes.TranslateByteCode):  # type: ignore[misc]
+    """Translates byte code to numba's statements."""
+
+    _name = "lean_translate_bytecode"
+
+    def run_pass(self, state: Any) -> bool:
+        state.func_ir = _Interpreter(state.func_id).interpret(state.bc)
+        return True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _MarkConstants(untyped_passes.GenericRewrites):  # type: ignore[misc]
+    """Marks constant indices, powers and exceptions. Lifetimes, which numba's pass finds too, serve generators."""
+
+    _name = "lean_mark_constants"
+
+    def run_pass(self, state: Any) -> bool:
+        blocks = state.func_ir.blocks
+        for kind in (RewriteConstGetitems, RewriteConstSetitems, RewriteConstRaises, DetectStaticBinops):
+            rewrite = kind(state)
+            for key in blocks:
+                while rewrite.match(state.func_ir, blocks[key], None, None):
+                    blocks[key] = rewrite.apply()
+        return True
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -44,7 +81,7 @@ class _Prune(untyped_passes.DeadBranchPrune):  # type: ignore[misc]
 
 @register_pass(mutates_CFG=False, analysis_only=False)
 class _AssignOnce(untyped_passes.ReconstructSSA):  # type: ignore[misc]
-    """Gives each assignment a variable of its own. Lifetimes, which numba's pass finds too, serve generators."""
+    """Gives each assignment a variable of its own. Numba's pass finds lifetimes again."""
 
     _name = "lean_reconstruct_ssa"
 
@@ -89,11 +126,10 @@ class _Lowering(typed_passes.NativeLowering):  # type: ignore[misc]
 
 
 _PASSES = (
-    untyped_passes.TranslateByteCode,
+    _Translate,
     untyped_passes.FixupArgs,
-    untyped_passes.IRProcessing,
     _Prune,
-    untyped_passes.GenericRewrites,  # constant indices of tuples
+    _MarkConstants,
     _AssignOnce,
     typed_passes.NopythonTypeInference,
     _StripPhis,
@@ -144,14 +180,14 @@ _has_loc = functools.cache(base._has_loc)  # whether a function of numba has a p
 @contextlib.contextmanager
 def _remembering() -> Iterator[None]:
     """Within this context, numba remembers what depends on nothing that changes. Numba's lock admits one thread."""
-    inspected = base._has_loc
+    # A callee is compiled within its caller's context, which goes on afterwards.
+    before = _functions.get_call_type, base._has_loc, _records.__repr__
     _functions.get_call_type, base._has_loc = _remembered_call_type, _has_loc
     _records.__repr__ = _remembered_description
     try:
         yield
     finally:
-        _functions.get_call_type, base._has_loc = _resolve, inspected
-        _records.__repr__ = _describe
+        _functions.get_call_type, base._has_loc, _records.__repr__ = before
 
 
 _make_usable = JITCodeLibrary._finalize_specific

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from linkpose import lean_compiler
 from linkpose.compiling import compiled, inner
 
 PART = np.dtype([("place", np.complex128), ("counts", np.int32, (4,)), ("is_on", np.bool_)], align=True)
@@ -123,3 +124,27 @@ def test_calls_hand_on_results_and_exceptions():
     for _ in range(2):
         with pytest.raises(ValueError, match="negative"):
             calls(-0.5)
+
+
+@inner
+def power(base: float, exponent: int) -> float:
+    return base**exponent
+
+
+@compiled
+def powers(base: float, exponent: int) -> float:
+    return power(base, 3) + power(base, exponent) + power(base=base, exponent=2)
+
+
+def test_constants_and_numbers_are_one_type() -> None:
+    assert powers(2.0, 4) == 8.0 + 16.0 + 4.0
+    assert len(power.signatures) == 1
+
+
+def test_a_caller_remembers_what_it_knew_before_its_callee_was_compiled() -> None:
+    before = lean_compiler._functions.get_call_type
+    with lean_compiler._remembering():
+        with lean_compiler._remembering():
+            pass
+        assert lean_compiler._functions.get_call_type is lean_compiler._remembered_call_type
+    assert lean_compiler._functions.get_call_type is before
