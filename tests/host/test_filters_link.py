@@ -10,6 +10,7 @@ import pytest
 
 from linkpose import filters
 from linkpose.errors import LinkposeError
+from linkpose.filters import tilt
 from linkpose.sensors.devices import Sensors
 from linkpose.sensors.measurements import Measurements
 from linkpose.sensors.mpu6050 import STANDARD_GRAVITY
@@ -58,6 +59,21 @@ def test_static_tilt(name, roll, pitch):
     assert estimate[-1, 1] > 0
     if name in INERTIAL:  # with a bias that is unknown, the first second is less certain than the first sample
         assert estimate[-1, 1] < estimate[0, 1]
+
+
+def test_arrays_of_any_layout_and_whole_numbers_need_no_other_machine_code():
+    """The compiler would take seconds for each other type."""
+    usual = measurements(np.arange(50) / 100, np.tile([0.0, 0.0, 9.8], (50, 1)), np.zeros((50, 3)))
+    expected = filters.create("tilt", Rig(joint=Joint((0.0, 0.0, 1.0), 0.0))).process(usual)
+    types = list(tilt._process.signatures)
+    read_only = usual.gyro_rad_s.copy()
+    read_only.flags.writeable = False
+    other = replace(
+        usual, accel_m_s2=np.asfortranarray(usual.accel_m_s2), gyro_rad_s=read_only, flags=usual.flags.astype(np.int64)
+    )
+    for block in (other, replace(other, gyro_rad_s=read_only.astype(np.float32))):
+        assert np.array_equal(filters.create("tilt", Rig(joint=Joint((0, 0, 1), 0))).process(block), expected)
+    assert list(tilt._process.signatures) == types
 
 
 @pytest.mark.parametrize("name", ["tilt", "joint"])

@@ -14,6 +14,10 @@ from linkpose.wire.messages import SampleFlags
 
 Floats = NDArray[np.float64]
 
+# Types of the arrays of Measurements.
+_FLOAT = np.dtype(np.float64)
+_DTYPES = {"baro_fresh": np.dtype(np.bool_), "mag_fresh": np.dtype(np.bool_), "flags": np.dtype(np.uint32)}
+
 
 @lru_cache(maxsize=16)
 def _absent(size: int) -> dict[str, NDArray[Any]]:
@@ -61,12 +65,18 @@ class Measurements:
     mag_fresh: NDArray[np.bool_] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        """Absent sensors become rows of NaN, without memory of their own."""
+        """Absent sensors become rows of NaN, without memory of their own; other arrays get the type of their field.
+
+        The filters are compiled for this one type: another one, as a transposed array has, would wait for the compiler.
+        """
         for name, values in _absent(len(self.time_s)).items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, values)
-        if self.flags.dtype != np.uint32:  # one type: the filters are compiled for it
-            object.__setattr__(self, "flags", self.flags.astype(np.uint32))
+        for name in self.__slots__:
+            values, dtype = getattr(self, name), _DTYPES.get(name, _FLOAT)
+            is_as_compiled = values.dtype == dtype and values.flags.c_contiguous and values.flags.writeable
+            if not is_as_compiled and 0 not in values.strides:
+                object.__setattr__(self, name, np.array(values, dtype, order="C"))
 
     @property
     def has_imu2(self) -> bool:

@@ -48,6 +48,12 @@ class Joint:
     j2s_m: Vector | None = None  # J2S in the sensor's frame (m); None if unknown
     j2s_std_m: float | Vector = 0.0001  # its standard deviation (m), one for all axes or one for each
 
+    def __post_init__(self) -> None:
+        """Numbers become floats: the filters are compiled for them, and would be compiled again for integers."""
+        if self.j2s_m is not None:
+            x, y, z = self.j2s_m
+            object.__setattr__(self, "j2s_m", (float(x), float(y), float(z)))
+
     @property
     def known_j2s_m(self) -> Vector | None:
         """J2S; None if it is unknown or only an initial value."""
@@ -67,7 +73,8 @@ class Joint:
     def std_of_axes_m(self) -> Vector:
         """Standard deviation along each axis (m)."""
         std = self.j2s_std_m
-        return std if isinstance(std, tuple) else (std, std, std)
+        x, y, z = std if isinstance(std, tuple) else (std, std, std)
+        return float(x), float(y), float(z)
 
 
 # An unknown J2S, at most some metres long. Filters with the capability "guess" estimate it.
