@@ -51,7 +51,7 @@ def predicted(model, state, parameters, size, grid=None):
 
 
 def moved(motion, state, control, noise, interval):
-    out = np.empty(len(state))
+    out, state, noise = np.empty(len(state)), np.ascontiguousarray(state), np.ascontiguousarray(noise)
     models.propagate(motion.model, state, control, noise, interval, out)
     return out
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import re
 from collections.abc import Callable, Iterator
@@ -512,7 +513,7 @@ def test_each_remark_of_the_program_is_on_the_page() -> None:
     """What the commands report, and the sentences of the library from which remarks come."""
     page = PAGE.read_text(encoding="utf-8").replace("`", "")
     rows = [row.strip("| ").split(" | ")[0] for row in page.splitlines() if row.startswith("| ")]
-    found = dict(sources())
+    found = sources()
     assert len(found) > 90
     missing = {
         of: where
@@ -566,7 +567,13 @@ class Functions:
             self.left.append((path, function))
 
 
-def sources() -> Iterator[tuple[str, str]]:
+@functools.cache
+def sources() -> dict[str, str]:
+    """Text and place of each remark; reading the whole program takes seconds."""
+    return dict(found_sources())
+
+
+def found_sources() -> Iterator[tuple[str, str]]:
     """The texts of remarks, `…` for what is put in, and where they are."""
     functions = Functions()
     for path, tree in functions.trees.items():
@@ -619,7 +626,6 @@ def texts(path: Path, node: ast.AST) -> Iterator[tuple[str, str]]:
 
 def test_the_sources_are_found() -> None:
     """Reported at once, through a function, added to a list, and yielded."""
-    found = {of for of, _ in sources()}
     for sentence in (
         "The residual is large. Check that each sensor is firm on its own link.",
         "Offset and scale of the accelerometer are unchanged: … recorded, … that determine all axes needed.…",
@@ -627,4 +633,4 @@ def test_the_sources_are_found() -> None:
         "…: single counts while the robot rests. They are not taken for motion. Check the surface",
         "gyro_* states the reverse of the rotation of gravity: its sign is wrong",
     ):
-        assert sentence in found, sentence
+        assert sentence in sources(), sentence

@@ -1,7 +1,7 @@
 """The main job as a user does it: the firmware's own .hex behind a port, `linkpose` in front of it.
 
-The board goes by a clock that waits for a busy or suspended machine, and `linkpose` by the board's; only the test of
-the board's drift needs the wall clock.
+The board goes by a clock that waits for a busy or suspended machine, and `linkpose` by the board's. The test of the
+board's drift goes by the wall clock; those in which nothing may be lost want the machine for themselves.
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from linkpose.sensors.conversion import GAP_BEFORE
 from linkpose.simulation.chain import ChainRun
 from linkpose.simulation.link import PAPER_J2S_M, LinkRun
 from virtual_uno import VirtualUno
-
-pytestmark = pytest.mark.realtime
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "host")}
 LINK_FILTERS = [word for name in ("joint", "tilt", "imu-baro", "baro") for word in ("--filter", name)]
@@ -58,6 +56,7 @@ def rows_of(path: Path) -> list[str]:
     return [line for line in path.read_text().splitlines() if not line.startswith("#")]
 
 
+@pytest.mark.realtime
 def test_live_estimates_from_the_real_firmware(served: PtyServer, tmp_path: Path) -> None:
     """Nothing lost, heights near the truth, and the replay gives the same digits.
 
@@ -111,6 +110,7 @@ def test_info_tells_what_the_board_is(served: PtyServer) -> None:
 BUDGET_S = 0.05  # the drift is that of the board as long as the machine runs it in time
 
 
+@pytest.mark.realtime
 def test_info_tells_how_fast_the_boards_clock_is(board: Callable[..., WireLink], tmp_path: Path) -> None:
     """An emulated board goes as the wall clock does."""
     with PtyServer(board().uno, tmp_path / "port") as server:
@@ -120,6 +120,7 @@ def test_info_tells_how_fast_the_boards_clock_is(board: Callable[..., WireLink],
     assert abs(info["clock_drift_ppm"]) < 5 * info["clock_drift_std_ppm"] + 100, lateness(server, BUDGET_S)
 
 
+@pytest.mark.realtime
 def test_a_board_that_is_reset_while_it_is_recorded_goes_on(served: PtyServer, tmp_path: Path) -> None:
     """The real HELLO after a real reset: the stream is started again and the gap is marked."""
     path = tmp_path / "r.csv"
@@ -152,6 +153,7 @@ dip_deg = 54.5
 """
 
 
+@pytest.mark.realtime
 def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_path: Path) -> None:
     """Two inertial sensors, a barometer, a magnetometer, mice at 100 Hz: nothing lost; the field holds the yaw."""
     uno = board(imu2={}, magnetometer="qmc5883l", mice=MICE[:3]).uno
@@ -182,6 +184,7 @@ def test_everything_that_a_board_can_carry(board: Callable[..., WireLink], tmp_p
     assert table.columns["mag_fresh"][settled].mean() > 0.95
 
 
+@pytest.mark.realtime
 def test_the_angle_of_a_chain_from_two_sensors_on_one_board(board: Callable[..., WireLink], tmp_path: Path) -> None:
     """Two MPU-6050 on a thigh and a shank: recorded by the firmware, estimated with unknown mounting."""
     uno = board(imu2={}).uno

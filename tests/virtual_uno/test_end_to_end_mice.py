@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from measuring import MICE
 from pty_server import PatientClock, PtyServer
 from rig_signals import RigFeed
@@ -15,8 +14,6 @@ from wire_link import WireLink
 
 from linkpose.recording.table import read_table
 from linkpose.simulation.mice import MiceRun
-
-pytestmark = pytest.mark.realtime
 
 
 def test_live_velocities_from_three_mice(board: Callable[..., WireLink], tmp_path: Path) -> None:
