@@ -14,7 +14,6 @@ from linkpose.filters.mice.state import Record, Records
 from linkpose.filters.planar import linear, sigma
 from linkpose.filters.planar.acceleration import forget, watch_acceleration
 from linkpose.filters.planar.gyro import (
-    ON_STRAIGHTS,
     accept_share,
     agree,
     is_turning,
@@ -55,6 +54,9 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
+# The difference is accepted with this share of it as σ. Doubled: where all mice lose more in faster turns, what they
+# lose after that goes into their scale on straights. Halved: a floor of which a turn has shown too little stays so.
+_FLOOR_STD = 0.1
 # Another floor shows in two turns in a row, each of at least this much turning (rad²/s), equal within this share.
 # A turn ends below this rate (rad/s). A slip lasts for one turn. Doubled: a floor is found later. Doubled share: a
 # floor that varies is taken for another one.
@@ -138,7 +140,7 @@ def _collect(state: Record, m: Record, mice: Records, rig: Records, sample: Reco
 
 
 @inner
-def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
+def _watch_floor(state: Record, m: Record, mice: Records) -> None:
     """Widen the common scale of the mice where they turn by another amount than the gyro: another floor."""
     if state.at_rest or m.missed > 0.0 or m.is_saturated or number(m.used) < 2 or not math.isfinite(m.mean_rate):
         return
@@ -171,8 +173,7 @@ def _watch_floor(state: Record, m: Record, mice: Records, p: Record) -> None:
         return
     for at in range(MICE, state.size, OF_MOUSE):
         _restart(state, at + POSITION, at + OF_MOUSE, 0.0)
-    accept_share(state, 1.0 + off, p.floor_scale)
-    _correct_way(state, off)
+    _correct_way(state, off, accept_share(state, 1.0 + off, math.hypot(noise, _FLOOR_STD * off)))
     restart_turns(state)
     state.floors += 1
 
@@ -310,14 +311,15 @@ def _compare_turns(state: Record, off: float, by_scales: float) -> None:
 
 
 @inner
-def _correct_way(state: Record, off: float) -> None:
-    """The mice count by the share `off` too much; probably since the last turn in which they did not.
+def _correct_way(state: Record, off: float, on_straights: float) -> None:
+    """The mice count by the share `off` too much in turns, and `on_straights` times as much as assumed on straights.
 
-    On straights they may have counted right: a part of it is corrected, as in `accept_share`.
+    Probably since the last turn in which they did not.
     """
     way = complex(state.at.x, state.at.y) - state.floor_start
-    state.at.x -= ON_STRAIGHTS * off * way.real
-    state.at.y -= ON_STRAIGHTS * off * way.imag
+    back = 1.0 - 1.0 / on_straights
+    state.at.x -= back * way.real
+    state.at.y -= back * way.imag
     widen_way(state, off, way)
     state.floor_start = complex(state.at.x, state.at.y)
 
@@ -592,7 +594,7 @@ def _step(
     _add_saturated_way(state, m, dt)
     watch_limit(state, m, mice)
     watch_acceleration(state, m, mice, sample.accel)
-    _watch_floor(state, m, mice, q)
+    _watch_floor(state, m, mice)
     watch_gyro(state, m, mice, p)
     _calibrate(state, m, mice, rig)
 

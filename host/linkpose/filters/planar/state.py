@@ -62,7 +62,7 @@ _RESOLUTION = np.dtype(
     align=True,
 )
 
-CAUSES = 4  # terms of the turn by which mice err: turn, |turn|, way, way times age
+CAUSES = 5  # terms of the turn by which mice err, see `gyro`
 
 # Gyro and mice that turn by different amounts: sums since the last agreement, see `gyro`.
 _DISPUTE = np.dtype(
@@ -91,7 +91,7 @@ _DISPUTE = np.dtype(
         ("jump_product", "f8"),
         ("sums", "f8", (CAUSES + 1, CAUSES + 1)),  # weighted products of the terms of the mice's errors, and of `off`
         ("left", "f8", (CAUSES + 1, CAUSES + 1)),  # of them after an elimination
-        ("terms", "f8", (CAUSES + 1,)),
+        ("terms", "f8", (CAUSES + 1,)),  # of the last block
         # Change of the turn by the mice with the scale and the angle of each (rad).
         ("by_scale", "f8", (MOST,)),
         ("by_angle", "f8", (MOST,)),
@@ -298,8 +298,6 @@ class PlanarParameters(NamedTuple):
     # varies. A slip of 10 % over 2 m of a drive of 24 m is 2.4 σ. Doubled: σ of the position on sound floors doubles.
     slip: float = 0.01
     slip_m: float = 3.0
-    # Another floor: change of the common scale once the gyro has shown one.
-    floor_scale: float = 0.05
 
 
 def fresh_state(mice: int, p: PlanarParameters, gyro_variance: float) -> Any:
