@@ -246,6 +246,20 @@ def test_the_hinge_angle_counts_from_the_start_and_its_std_holds() -> None:
     assert np.mean(np.abs(error) < 2 * estimates["chain_angle_std_deg"][late]) > 0.9
 
 
+@pytest.mark.parametrize("seed", [1004, 1007, 1018])
+def test_a_wrong_heading_after_a_rest_leaves_no_error_in_the_zero_of_the_angle(seed: int) -> None:
+    """It turned the tilts of the first pose by 3°, for ever and with a σ of 1°."""
+    run = ChainRun("hinge", seed, 60.0)
+    measured = run.measurements()
+    angle = run.truth_columns(measured.time_s)["angle_deg"]
+    chain = ChainFilter(Rig(chain=Chain("hinge")))
+    found = dict(zip(chain.columns, chain.process(measured).T, strict=True))
+    late = measured.time_s > 35
+    error = min((sign * found["chain_angle_deg"] - angle for sign in (1, -1)), key=lambda e: np.std(e[late]))[late]
+    assert np.sqrt(np.mean(error**2)) < 0.6
+    assert np.mean(np.abs(error) < 2 * found["chain_angle_std_deg"][late]) > 0.9
+
+
 def test_a_hypothesis_that_knows_nothing_yet_does_not_end_those_that_do() -> None:
     run = ChainRun("hinge", 2, 15.0)  # the leg of the notebook
     measured = run.measurements()

@@ -16,7 +16,7 @@ from linkpose.compiling import compiled, inner
 from linkpose.filters import _vector as vec
 from linkpose.filters._imu import GRAVITY, ImuSamples
 from linkpose.filters.chain.angles import report_angles, set_frame
-from linkpose.filters.chain.first_pose import begin_path, begin_start, end_step, follow_path, trace_variance
+from linkpose.filters.chain.first_pose import begin_path, begin_rest, begin_start, end_step, follow_path, trace_variance
 from linkpose.filters.chain.hinge import follow_axis, hinge_angle, hinge_angle_std, update_axis
 from linkpose.filters.chain.joint import update_fixed_joint, update_joint
 from linkpose.filters.chain.level import begin_level, follow_level, misalignment_variance
@@ -103,7 +103,7 @@ def _begin(bank: Record, states: Record, gyro: Floats, accel: Floats, q: Record)
     begin_path(bank, -1 if bank.begun else 0)
     if bank.hinge < 0 and not bank.begun:
         set_frame(bank, states[0].rotation[0, 2])
-    bank.rests = int(not bank.begun)
+    bank.rests, bank.rested = int(not bank.begun), 0
     bank.begun, bank.spread, bank.best = 1, 0, 0
     if bank.hinge >= 0 and states[0].has_axis > 0.0:  # axes in both sensors give the heading
         _spread(bank, states, 0.0, gyro, q)
@@ -444,11 +444,10 @@ def _step(bank: Record, states: Record, gyro: Floats, accel: Floats, h: float, q
             if due:
                 _update(s, bank, gyro, bank.since_update, q, noise)
                 if bank.rests and min(bank.still_s[0], bank.still_s[1]) > q.rest_s:
-                    begin_start(s, bank.length)  # at rest, the attitudes come closer to those at the first sample
-                    begin_path(bank, -1)
+                    begin_rest(bank, s)
     if due:
         bank.since_update = 0.0
-        end_step(bank, states)
+        end_step(bank, states, q)
         _select(bank, states, q)
         follow_misfit(bank, states, q.period_s, q)
         if not bank.spread and states[0].heading_share > 0.0:

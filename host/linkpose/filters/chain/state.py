@@ -32,7 +32,7 @@ MAX_SIZE = BALL_SIZE + HINGE_SIZE + 3
 # Initial headings of sensor 2 relative to sensor 1, evenly spaced. With 5, a slow start of the robot arm in
 # openaxes_robot converges to a wrong heading; with 12 the start costs more and no trial gains.
 HYPOTHESES = 8
-PATH = 256  # updates over which the first pose can be traced back: 10 s
+PATH = 768  # updates over which the first pose can be traced back: 30 s
 
 
 class ChainParameters(NamedTuple):
@@ -201,6 +201,7 @@ STATE = np.dtype(
         ("rotation_variance", "f8", 2),
         ("path_square", "f8", 2),  # ∫ ‖ω‖² dt since the first sample,
         ("traced_square", "f8"),  # and of both sensors, over which S_k has been traced back (rad²/s)
+        ("is_traced", "i8"),  # whether it has been since a first rest
         ("velocity_variance", "f8", 2),
         ("force_rate_square", "f8", 2),  # mean ‖ω × f‖²
         # Memory of the measurement models.
@@ -253,6 +254,7 @@ STATE = np.dtype(
         ("c", *_V3),
         ("m", "f8", (3, 3)),
         ("by_bias", "f8", (2, 3, 3)),
+        ("traced", "f8", (2, 4)),
         ("relative", *_Q),
         ("first", *_Q),
     ],
@@ -282,6 +284,8 @@ BANK = np.dtype(
         ("new_gyro", "f8", (2, 3)),  # readings of the present sample, calibrated
         ("new_accel", "f8", (2, 3)),
         ("last_readings", "f8", (2, MEMORY)),  # of `frozen.is_frozen`
+        ("rested", "i8"),  # whether S_k are of the end of such a rest,
+        ("rest_force", "f8", (2, 3)),  # and the readings of either accelerometer there
         ("path_length", "i8"),
         ("path_s", "f8"),
         ("path_sum", "f8", (2, 3)),
