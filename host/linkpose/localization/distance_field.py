@@ -7,8 +7,9 @@ is interpolated bilinearly.
 Two kinds of map need two zeros. In a map that was made of scans, the echoes of a wall scatter about the centre of its
 cells. In a map that was drawn, walls are thick and beams end at their faces; there the field is signed, with the zero
 at the face and negative distances inside. A map counts as drawn where nearly all wall cells have another one behind.
-A wall that was drawn has two faces. A noisy beam may end nearer to the one that its laser cannot see; `seen_distance`
-returns the distance from the other one.
+A wall has two faces, in a map of scans with unknown cells between them. A beam may end nearer to the one that its laser
+cannot see, because of its noise or of a pose that is off by half the wall's thickness; `seen_distance` returns the
+distance from the other one. For this, the distances between two faces are negative in a map of scans, too.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.localization.grid import FREE, OCCUPIED, GridMap
+from linkpose.localization.grid import FREE, OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.linalg import Floats
 
 Field = NDArray[np.int16]
@@ -29,6 +30,12 @@ Field = NDArray[np.int16]
 FARTHEST_M = 3.0
 # One count of the field (m): 3 m in 16 bits. A map of 2 km x 2 km then takes 0.8 GB.
 COUNT_M = FARTHEST_M / 32767
+# The faces of one wall in a map of scans are at most so far apart (m), as seen along a beam. Doubling it takes more time
+# for beams that end at nothing that the map has.
+HOLLOW_M = 0.6
+# The distance changes by at most 1.4 m/m along a cell's diagonal. A steeper change is where cells behind a face border
+# on other unknown ones.
+STEEPEST = 3.0
 # Share of the wall cells beside free ones that have a wall cell behind, from which on a map counts as drawn: 1.0 in the
 # simulated office, 0.58 and 0.62 in two buildings mapped by GMapping, 0.90 in an old map with smeared walls.
 DRAWN_SHARE = 0.97
@@ -42,7 +49,7 @@ class DistanceField:
 
     `geometry` is the map's: cell size m, x and y of the lower left corner m, rotation rad. `wall_std_m` is how
     uncertain the map is about where a beam ends in a wall: smeared walls are thicker than real ones. `is_drawn` states
-    that the distances are signed.
+    that the zero is at the faces of the walls.
     """
 
     counts: Field
@@ -67,7 +74,27 @@ class DistanceField:
         if is_drawn:
             wall_std_m = 0.0
             counts = np.where(wall, half - inside, counts - half).astype(np.int16)
+        else:
+            np.negative(counts, out=counts, where=_behind_faces(grid, counts))
         return DistanceField(counts, grid.geometry, wall_std_m, is_drawn)
+
+    @property
+    def reach_m(self) -> float:
+        """How far a beam is followed back to the face that it sees."""
+        return FARTHEST_M if self.is_drawn else HOLLOW_M
+
+    @property
+    def inside_m(self) -> float:
+        """The distance below which a point is in a wall: half a cell on either side of the centres of its cells."""
+        return 0.0 if self.is_drawn else 0.6 * float(self.geometry[0])
+
+
+def _behind_faces(grid: GridMap, counts: Field) -> NDArray[np.bool_]:
+    """The unknown cells that are behind a face: the nearest free cell is farther than the nearest wall, by a cell."""
+    cell = float(grid.geometry[0])
+    to_free = np.empty(counts.shape, np.int16)
+    fill_distances(np.where(grid.blocked == FREE, OCCUPIED, FREE).astype(np.uint8), cell, False, to_free)
+    return np.asarray((grid.blocked == UNKNOWN) & (to_free - round(0.5 * cell / COUNT_M) > counts))
 
 
 def _blocks(wall: NDArray[np.bool_], inside: Field, cell: float) -> NDArray[np.bool_]:
@@ -162,6 +189,9 @@ def distance_at(counts: Field, geometry: Floats, x: float, y: float, out: Floats
     p, q = u - column, v - row
     d00, d01 = float(counts[row, column]), float(counts[row, column + 1])
     d10, d11 = float(counts[row + 1, column]), float(counts[row + 1, column + 1])
+    low = min(d00, d01, d10, d11)
+    if low < 0.0 and max(d00, d01, d10, d11) - low > STEEPEST * cell / COUNT_M:  # no face is between these cells
+        d00, d01, d10, d11 = abs(d00), abs(d01), abs(d10), abs(d11)
     below, above = d00 + p * (d01 - d00), d10 + p * (d11 - d10)
     along_u = ((1.0 - q) * (d01 - d00) + q * (d11 - d10)) * COUNT_M / cell
     along_v = (above - below) * COUNT_M / cell

@@ -33,11 +33,14 @@ CLEAR_M = 0.3
 
 
 class Walls(NamedTuple):
-    """A map's distance field, and how far (m) a beam may end behind the face that it sees: 0 in an unsigned field."""
+    """A map's distance field, how far (m) a beam may end behind the face that it sees, and the distance (m) below which
+    a point is in a wall.
+    """
 
     counts: Field
     geometry: Floats
     reach: float
+    inside: float
 
 
 class Weighted(NamedTuple):
@@ -82,7 +85,6 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     cell = walls.geometry[0]
-    inside = 0.0 if walls.reach > 0.0 else 0.6 * cell  # a point nearer to a wall is in it (half a cell on its sides)
     at = np.empty(3)
     for i in range(beams.shape[0]):
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
@@ -94,7 +96,7 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
         left, crosses = beams[i, 4] - CLEAR_M, False  # m of the beam before its end
         while left > beside and not crosses:
             distance_at(walls.counts, walls.geometry, x - left * ux, y - left * uy, at)
-            crosses = at[0] < inside
+            crosses = at[0] < walls.inside
             left -= max(at[0] - cell, 0.5 * cell)
         if not crosses:
             weights[i] = 0.0

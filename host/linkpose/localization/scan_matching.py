@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import FARTHEST_M, DistanceField, Field, distance_at
+from linkpose.localization.distance_field import DistanceField, Field, distance_at
 from linkpose.localization.events import Scan
 from linkpose.localization.global_search import likely_poses, nearby_poses
 from linkpose.localization.grid import GridMap
@@ -100,7 +100,7 @@ class ScanMatcher:
         """`growth` is that of a range's standard deviation with the range (m/m)."""
         self.grid, self.growth = grid, growth
         self.field = DistanceField.of(grid)
-        self.walls = Walls(self.field.counts, self.field.geometry, FARTHEST_M if self.field.is_drawn else 0.0)
+        self.walls = Walls(self.field.counts, self.field.geometry, self.field.reach_m, self.field.inside_m)
         self.beam_std_m = max(BEAM_STD_M, self.field.wall_std_m)
 
     def correct(self, run: KalmanFilter, beams: Floats, expected: float = -math.inf) -> Fit:
