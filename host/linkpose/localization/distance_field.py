@@ -30,7 +30,7 @@ Field = NDArray[np.int16]
 FARTHEST_M = 3.0
 # One count of the field (m): 3 m in 16 bits. A map of 2 km x 2 km then takes 0.8 GB.
 COUNT_M = FARTHEST_M / 32767
-# The faces of one wall in a map of scans are at most so far apart (m), as seen along a beam. Doubling it takes more time
+# The faces of one wall in a map of scans are at most so far apart (m), seen along a beam. Doubling it takes more time
 # for beams that end at nothing that the map has.
 HOLLOW_M = 0.6
 # The distance changes by at most 1.4 m/m along a cell's diagonal. A steeper change is where cells behind a face border

@@ -33,6 +33,8 @@ _STEP_S, _LAGS_S, _LEAST_LAG_S, _CLEARER, _FEWEST_STEPS = 0.2, np.arange(-50, 51
 # theirs, and both belong together (correlation beyond _RELATED): wheels slip and floors differ by a few tenths.
 _LEAST_FACTOR, _RELATED = 0.6, 0.5
 _LEAST_DEG = 5.0  # between motion and heading, which wheels do not have; less may be a laser that was put on by hand
+# A scale error of the laser's ranges that is named: data sheets state less than 1 %.
+_LEAST_SCALE = 0.01
 
 
 def doubts(log: Log, settings: Settings, track: Track, free: tuple[str, ...]) -> list[str]:
@@ -94,12 +96,20 @@ class _Steps(NamedTuple):
 
 
 def scan_doubts(log: Log, track: Track) -> list[str]:
-    """A sentence on the clock, on the signs and on the units of an odometry that the path of the scans contradicts."""
+    """A sentence on the laser's ranges, and on the clock, the signs and the units of an odometry that the path of the
+    scans contradicts.
+    """
+    found = []
+    if abs(track.range_scale - 1.0) > _LEAST_SCALE:
+        longer = 1.0 / track.range_scale - 1.0
+        found.append(
+            f"the laser's ranges are {abs(longer):.1%} {'longer' if longer > 0.0 else 'shorter'} than the distances in "
+            "the map and were corrected by as much: check the scanner, and the resolution in the map's YAML file"
+        )
     steps = _steps(log, track)
     if steps is None:
-        return []
+        return found
     lag = _lag(steps)
-    found = []
     if lag:
         late, other = ("scans are", "the odometry") if lag > 0.0 else ("odometry is", "the scans")
         found.append(

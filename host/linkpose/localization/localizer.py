@@ -291,6 +291,7 @@ class Localizer:
             self.relocated,
             self.consistency,
             self.laser.rivals() if self.laser else None,
+            1.0 + self.laser.ranges.share if self.laser else 1.0,
         )
 
     def _row(self) -> Row:

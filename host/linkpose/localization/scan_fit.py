@@ -148,6 +148,30 @@ def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Float
 
 
 @compiled
+def range_equations(walls: Walls, scan: Weighted, pose: Floats, hessian: Floats, slope: Floats) -> None:
+    """Fills Σ v w K Kᵀ (5, 5) and Σ v w K d (5,) at `pose`, where K has the slopes by the pose, by a share of which the
+    ranges are too short, and by a length (m).
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    beams, scale2 = scan.beams, scan.scale * scan.scale
+    at, row = np.empty(3), np.empty(5)
+    hessian[:] = 0.0
+    slope[:] = 0.0
+    for i in range(beams.shape[0]):
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        weight = scan.weights[i] / (1.0 + scan.weights[i] * at[0] * at[0] / scale2)
+        row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
+        row[4] = at[1] * ux + at[2] * uy
+        row[3] = beams[i, 4] * row[4]
+        for j in range(5):
+            slope[j] += weight * row[j] * at[0]
+            for k in range(5):
+                hessian[j, k] += weight * row[j] * row[k]
+
+
+@compiled
 def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -> float:
     """Σ v_i v_j √(w_i w_j) d_i d_j / Σ v_i v_j (m²) over the beams i and j = i − lag, seen from `pose`.
 

@@ -136,7 +136,7 @@ class ScanMatcher:
         # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
         d2 = _condition(run, at, best, covariance, prior + hessians[0] / self.beam_std_m**2)
         pull = np.empty(3)
-        weighted = self._weighted(beams, best, LOSS_SCALE * self.beam_std_m)
+        weighted = self.weighted(beams, best)
         off_m2 = misfit(self.walls, weighted, best, int(self.field.is_drawn), pull)
         return Fit(share, log_likelihood, seen_likelihood, d2, len(beams), hessians[1], pull, off_m2)
 
@@ -165,12 +165,12 @@ class ScanMatcher:
         narrow = LOSS_SCALE * self.beam_std_m
         if not is_near:
             for scale in (max(WIDE_SCALE_M, narrow), narrow):
-                fit_scan(self.walls, self._weighted(beams, pose, scale), Prior(mean, prior), pose, hessians)
+                fit_scan(self.walls, self.weighted(beams, pose, scale), Prior(mean, prior), pose, hessians)
         for beside in BESIDE_M:
-            seen = self._weighted(beams, pose, narrow)
+            seen = self.weighted(beams, pose)
             drop_short(self.walls, beams, pose, beside, seen.weights)
             fit_scan(self.walls, seen, Prior(mean, prior), pose, hessians)
-        seen = self._weighted(beams, pose, narrow)
+        seen = self.weighted(beams, pose)
         return pose, hessians, whole_cost(self.walls, seen, Prior(mean, prior), pose, True)
 
     def _seen(self, beams: Floats, pose: Floats, log_likelihood: float) -> float:
@@ -182,8 +182,10 @@ class ScanMatcher:
             return log_likelihood
         return self.compare(np.ascontiguousarray(seen), pose)[1]
 
-    def _weighted(self, beams: Floats, pose: Floats, scale: float) -> Weighted:
-        """The scan with the weights that its beams have from `pose`."""
+    def weighted(self, beams: Floats, pose: Floats, scale: float | None = None) -> Weighted:
+        """The scan with the weights that its beams have from `pose`, and the scale (m) of the loss."""
+        if scale is None:
+            scale = LOSS_SCALE * self.beam_std_m
         weights = np.empty(len(beams))
         beam_weights(self.walls, beams, pose, self.growth, self.beam_std_m, weights)
         return Weighted(beams, weights, 1.0 / self.beam_std_m**2, scale)

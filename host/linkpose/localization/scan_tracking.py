@@ -12,6 +12,7 @@ from linkpose.localization.grid import GridMap
 from linkpose.localization.hypotheses import INCUMBENT, Contest, Hypothesis
 from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats
+from linkpose.localization.range_scale import RangeScale
 from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beams_of
 from linkpose.localization.track import Rivals
 
@@ -71,6 +72,7 @@ class ScanTracker:
         self.least_std_m = LEAST_DRAWN_STD_M if self.matcher.field.is_drawn else LEAST_WALL_STD_M
         self.map_error = np.diag(GRID_ERROR**2)
         self.misfit2 = LEAST_WALL_STD_M**2  # the usual one (m²)
+        self.ranges = RangeScale()
 
     def _below(self, falls: float) -> float:
         """The log-likelihood so many falls below the usual."""
@@ -88,7 +90,7 @@ class ScanTracker:
 
     def correct(self, run: KalmanFilter, scan: Scan, known: bool) -> Result:
         """Corrects with a scan. Until the pose is known, hypotheses from a search of the whole map compete."""
-        beams = beams_of(scan)
+        beams = self.ranges.corrected(beams_of(scan))
         if len(beams) < FEWEST_BEAMS:
             return Result(run, known)
         self.now_s, self.last_beams = scan.time_s, beams
@@ -96,6 +98,8 @@ class ScanTracker:
             return self._continue(self.contest, run, beams)
         if not known:
             return self._open(run, beams, [])
+        at = np.ix_(run.pose_indices, run.pose_indices)
+        prediction: Floats = np.asarray(np.linalg.inv(run.covariance[at]), dtype=np.float64)
         fit = self.matcher.correct(run, beams, self._below(SUSPECT))
         self.was_known = True
         self.bad = self.bad + 1 if fit.seen_likelihood < self._below(BAD) else 0
@@ -104,6 +108,8 @@ class ScanTracker:
             if found and self.matcher.compare(beams, found[0])[1] > fit.log_likelihood + BETTER:
                 return self._open(run, beams, [run.copy()], found)
             self.bad, self.wait = 0, min(2 * self.wait, MOST_BAD_SCANS)
+        pose = _pose_of(run)
+        self.ranges.learn(self.matcher.walls, self.matcher.weighted(beams, pose), pose, prediction)
         self._bind(fit)
         self._adapt(fit.seen_likelihood)
         return Result(run, True, round(fit.share * fit.beams), fit.beams, 0, fit)

@@ -39,7 +39,7 @@ class Track:
     and beacon of each range and each landmark outside the gate. `widened` counts how often the standard deviations of
     the pose were raised because most measurements were rejected, `relocated` how often the pose was found again.
     `consistency` holds the normalised innovations squared by sensor, `rivals` what was left of a search of the map that
-    never decided.
+    never decided. `range_scale` is the factor by which the laser's ranges were corrected.
     """
 
     names: tuple[str, ...]
@@ -53,6 +53,7 @@ class Track:
     relocated: int = 0
     consistency: Consistency = field(default_factory=Consistency)
     rivals: Rivals | None = None
+    range_scale: float = 1.0
 
     def check_applied(self, origin: str, name: str, remark: str = "") -> None:
         """Raises NothingApplied where the filter applied no measurement, so that its path is dead reckoning.
