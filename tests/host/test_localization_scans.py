@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from linkpose.errors import LinkposeError, MapMismatch, NothingApplied, UndecidedStart
 from linkpose.localization.carmen import as_log
 from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceField, distance_at, seen_distance
-from linkpose.localization.doubts import scan_doubts
+from linkpose.localization.doubts import scan_doubts, with_doubtful_clock
 from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
 from linkpose.localization.localizer import estimate_track
@@ -455,6 +455,17 @@ def test_a_clock_a_sign_and_a_unit_of_the_odometry_that_the_scans_contradict_are
     found = scan_doubts(*winding(late_s, speed, turn))
     assert len(found) == (1 if sentence else 0), found
     assert all(re.search(sentence, remark) for remark in found)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.2, -0.2])
+def test_the_stated_deviations_hold_whichever_clock_is_right(late_s: float) -> None:
+    """In the odometry's time, the path is off by 0.1 m and 5 degrees (rms), at σ of 0.01 m and 0.3 degrees."""
+    log, track = winding(late_s, 1.0, 1.0)
+    widened = with_doubtful_clock(log, track)
+    true = winding(0.0, 1.0, 1.0)[1].state
+    errors = np.abs(widened.state - true)
+    assert (errors < 2.0 * widened.std + 0.02).mean(axis=0).min() > 0.95
+    assert (widened.covariance == track.covariance).all() == (late_s == 0.0)
 
 
 @pytest.mark.parametrize(

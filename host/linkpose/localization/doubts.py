@@ -6,6 +6,7 @@ odometry with another sign a noise as large as the motion. The path is then wron
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -122,6 +123,27 @@ def scan_doubts(log: Log, track: Track) -> list[str]:
         odometry = np.diff(np.interp(times, steps.odometry_s, total))
         found += _on_scale(verb, scans[steps.is_whole], odometry[steps.is_whole])
     return found
+
+
+def with_doubtful_clock(log: Log, track: Track) -> Track:
+    """The track, with the motion during the lag of its scans in the covariance of the pose.
+
+    Either clock may be the right one: the path is off by nothing or by all of that motion, with equal probability.
+    """
+    steps = _steps(log, track)
+    lag = _lag(steps) if steps is not None else 0.0
+    if not lag or track.heading_rad is None:
+        return track
+    known = track.known
+    times = track.time_s[known]
+    path = np.column_stack((track.position_m[known, :2], np.unwrap(track.heading_rad[known])))
+    late = np.column_stack([np.interp(times + lag, times, column) for column in path.T])
+    at = [track.names.index(name) for name in ("x_m", "y_m", "heading_rad")]
+    covariance = track.covariance.copy()
+    moved = np.zeros((len(times), len(track.names)))
+    moved[:, at] = late - path
+    covariance[known] += 0.5 * moved[:, :, np.newaxis] * moved[:, np.newaxis, :]
+    return replace(track, covariance=covariance)
 
 
 def _steps(log: Log, track: Track) -> _Steps | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from linkpose.errors import InvalidValue
-from linkpose.localization.doubts import doubts, scan_doubts
+from linkpose.localization.doubts import doubts, scan_doubts, with_doubtful_clock
 from linkpose.localization.events import Event, Log, LogFile, beacon_name, in_order
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import CONSTANT_VELOCITY
@@ -199,6 +199,7 @@ class PreparedLog:
                 share = track.applied / max(track.applied + track.rejected, 1)
                 on_map = check_map(self.log, self.grid, share, str(self.origin))
                 remarks += (*([on_map] if on_map else []), *scan_doubts(self.log, track))
+                track = with_doubtful_clock(self.log, track)
             track.check_applied(str(self.origin), method, on_map)
             if is_tuned and not tracks:
                 remarks += tuple(doubts(self.log, chosen, track, self.free))
