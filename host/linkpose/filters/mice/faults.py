@@ -129,7 +129,7 @@ def _find_fault(state: Record, mice: Records, candidates: int, span: float, turn
     # Three mice that agree with each other and not with the gyro share one cause, unless one mouse explains it: the
     # robot slips or is lifted.
     share_cause = count > 2 and not _cost(state, mice, candidates, NOBODY, span, math.nan) > fault_limit(2 * count - 3)
-    if share_cause and not best < _EXCLUSION + _ALONE:
+    if share_cause and not (number(worst) == 1 and best < _EXCLUSION + _ALONE):
         state.is_decisive = True
         return candidates
     state.is_decisive = second - best > _DECISIVE
