@@ -594,6 +594,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
             lambda: Page(("time_s", "tilt_height_m"), Rig(), "", host="192.0.2.1", port=8080)
         ),
         "… holds no estimates; type: linkpose estimate … -o OUT.csv": typed("plot --view {}/a.csv", a="time_s,b\n0,1\n1,1\n"),
+        "… holds a reference and no estimates; name a file of estimates as well": typed(
+            "plot --view {}/a.csv", a="time_s,height_m\n0,1\n1,1\n"
+        ),
     },
     "Simulation and Python values": {
         "there is no motion called …: take …": raises(lambda: LinkRun(motion="dance")),
@@ -639,6 +642,7 @@ FURTHER: dict[str, dict[str, Producer]] = {
         ),
         "choose one of --prebuilt and --hex": typed("flash --prebuilt --hex a.hex"),
         "--view-host and --view-port go with --view": typed("estimate --live --view-port 8080"),
+        "… is no address alone, such as 0.0.0.0; --view-port names the port": typed("plot --view a.csv --view-host a:80"),
         "--view shows a page; leave out --output": typed("plot --view {}/a.csv -o {}/a.png"),
         "… is not …, numbers separated by commas": typed("localize a.csv --start 1"),
         "… is neither off nor a probability between 0 and 1, such as 0.997": typed("localize a.csv --gate 2"),

@@ -38,7 +38,7 @@ from linkpose.page import Page, PageStatus, geometry
 from linkpose.page.changes import Changes, uncompressed_frame, websocket_frame
 from linkpose.page.history import PATH_POINTS, POINT_INTERVAL_S, SPAN_S, History
 from linkpose.page.origin import is_own
-from linkpose.page.page import j2s_text
+from linkpose.page.page import j2s_text, reachable_address
 from linkpose.page.panel import with_gap_rows
 from linkpose.quantities import by_filter
 from linkpose.rotations import product
@@ -573,6 +573,10 @@ def test_addresses_that_cannot_be_used_are_refused() -> None:
             Page(LINK, Rig(), "", port=taken.getsockname()[1])
     with pytest.raises(LinkposeError, match=r"cannot be served at 192\.0\.2\.1"):
         Page(LINK, Rig(), "", host="192.0.2.1")
+    # What a browser on another machine can open; "all addresses" is no place to go to.
+    assert reachable_address("127.0.0.1") == "127.0.0.1" and reachable_address("localhost") == "localhost"
+    for anywhere in ("0.0.0.0", "::"):
+        assert reachable_address(anywhere) not in ("0.0.0.0", "::", "")
     assert is_loopback("127.0.0.1") and is_loopback("::1") and is_loopback("localhost")
     assert not is_loopback("0.0.0.0") and not is_loopback("192.0.2.1")
 
@@ -583,7 +587,13 @@ def test_view_options_go_with_what_they_need(refused: Callable[..., str], tmp_pa
     assert "leave out --output" in refused("plot", "--view", tmp_path / "e.csv", "-o", tmp_path / "x.png")
     recording = tmp_path / "r.csv"
     recording.write_text("time_s,accel_x_m_s2\n0,1\n1,1\n")
-    assert "holds no estimates" in refused("plot", "--view", recording)
+    assert "holds no estimates; type: linkpose estimate" in refused("plot", "--view", recording)
+    truth = tmp_path / "truth.csv"
+    truth.write_text("time_s,height_m\n0,1\n1,1\n")  # of no use to `estimate`
+    assert "name a file of estimates as well" in refused("plot", "--view", truth)
+    assert "holds no estimates" in refused("plot", "--view", recording, "--view-host", "[::1]")  # is an address
+    for mistaken in ("127.0.0.1:9000", "http://localhost", ""):
+        assert "--view-port names the port" in refused("plot", "--view", recording, "--view-host", mistaken)
 
 
 def test_the_drawn_sensor_has_the_estimated_height() -> None:

@@ -389,7 +389,7 @@ REMARKS: dict[str, str | Producer] = {
     "chain: the attitudes started again … times after gaps of more than … s. Check that the times are in seconds.": chain_after_gaps,
     "chain: for … % of the samples the readings do not fit two links with one joint, so their estimates are blank. Check that the units are m/s² and rad/s, that both sensors are firm on links that share a joint, and that neither sensor has failed.": "test_filter_chain.py::test_readings_that_no_joint_gives_are_reported_and_have_no_estimate",
     "…: … estimates were not sent": unsent,
-    "warning: everybody who reaches … over the network can see the page and press stop": warned_of_network,
+    "warning: everybody who reaches this address over the network can see the page and press stop": warned_of_network,
     "… with saturated readings left out; record them with a larger range.": imu_calibration(saturated=True),
     "Offset and scale of the accelerometer are unchanged: … recorded, … that determine all axes needed.…": imu_calibration(
         saturated=False

@@ -291,8 +291,11 @@ def test_rows_on_the_terminal_itself_are_whole(output: str) -> None:
     lines = [line for line in terminal.text.splitlines() if line]
     assert lines[0] == "Running: tilt"
     rows = [line for line in lines if re.match(r'\{"time_s"|\d+\.\d{6},', line)]
-    assert len(rows) == 200 and all(line.endswith("}") if "{" in line else line.count(",") == 4 for line in rows)
-    assert lines.index(rows[-1]) - lines.index(rows[0]) == 199 and "HEIGHT" not in terminal.text
+    # On a loaded machine the fitted rate of the board's clock may make two seconds one sample longer or shorter.
+    counted = int(re.search(r", (\d+) samples, ", terminal.text)[1])  # type: ignore[index]
+    assert len(rows) == counted == pytest.approx(200, abs=2)
+    assert all(line.endswith("}") if "{" in line else line.count(",") == 4 for line in rows)
+    assert lines.index(rows[-1]) - lines.index(rows[0]) == counted - 1 and "HEIGHT" not in terminal.text
 
 
 def test_the_lines_after_the_view_break_between_words() -> None:

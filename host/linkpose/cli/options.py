@@ -26,6 +26,18 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 ERROR_LEVELS = ("calibrated", "datasheet", "none")
 
 
+class AddressType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
+    """An address or a name of this computer, without a port; an IPv6 address may stand in brackets, as in a browser."""
+
+    name = "ADDRESS"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        address = str(value).strip().removeprefix("[").removesuffix("]")
+        if not address or "/" in address or address.count(":") == 1:
+            self.fail(f"{value!r} is no address alone, such as 0.0.0.0; --view-port names the port", param, ctx)
+        return address
+
+
 class VectorType(click.ParamType):  # type: ignore[type-arg]  # generic only in newer releases of click
     """A J2S: three numbers, X,Y,Z (m)."""
 
@@ -136,7 +148,12 @@ def page(function: Function) -> Function:
         help="TCP port of the page. Default: from 8080 on.",
     )(function)
     function = click.option(
-        "--view-host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="Serve the page at this address."
+        "--view-host",
+        type=AddressType(),
+        default="127.0.0.1",
+        show_default=True,
+        metavar="ADDRESS",
+        help="Serve the page at this address; 0.0.0.0: at all of this computer, for others in the network.",
     )(function)
     return click.option(
         "--view",

@@ -61,7 +61,7 @@ class PageOptions:
             surroundings=surroundings,
         ) as page:  # fmt: skip
             if not is_loopback(self.host):
-                report(f"warning: everybody who reaches {self.host} over the network can see the page and press stop")
+                report("warning: everybody who reaches this address over the network can see the page and press stop")
             report(f"page: {page.url}")
             yield page
 

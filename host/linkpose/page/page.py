@@ -94,7 +94,8 @@ class Page:
         self._marks: list[float] = []
         self._is_changed = self._is_status_changed = True  # since the last update
         self._server = serve(host, port or free_port(host), is_named=port is not None)
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        reachable = reachable_address(host)
+        self.url = f"http://{f'[{reachable}]' if ':' in reachable else reachable}:{self._server.get_port()}"
         self._build(rig, surroundings or Surroundings())
         self._is_ending = self._has_ended = False
         self._error: Exception | None = None
@@ -323,6 +324,20 @@ def j2s_text(found: FoundJ2s) -> str:
         others = " or ".join(axis for axis in "xyz" if axis != found.worst_axis)
         text += f"; not excited yet: J2S along the sensor's {found.worst_axis} axis. Turn the link about {others}."
     return text
+
+
+def reachable_address(host: str) -> str:
+    """The address that a browser can open: for "all addresses" (0.0.0.0, ::), that of this machine in its network."""
+    anywhere = {"0.0.0.0": (socket.AF_INET, "192.0.2.1"), "::": (socket.AF_INET6, "2001:db8::1")}
+    if host not in anywhere:
+        return host
+    family, far_away = anywhere[host]  # an address for documentation (RFC 5737, RFC 3849), to which nothing is sent
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as route:
+            route.connect((far_away, 9))
+            return str(route.getsockname()[0])
+    except OSError:  # no network
+        return "localhost"
 
 
 def free_port(host: str) -> int:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from linkpose import quantities
 from linkpose.errors import LinkposeError
 from linkpose.evaluation.series import Series
 from linkpose.plotting.sources import gather, is_reference
@@ -59,4 +60,12 @@ def _first_estimate(tables: Sequence[Table]) -> Table:
         if by_filter(table.columns) and not is_reference(table) and len(table):
             return table
     names = ", ".join(str(table.path) for table in tables)
+    if all(map(_has_truth, tables)):
+        raise LinkposeError(f"{names} holds a reference and no estimates; name a file of estimates as well")
     raise LinkposeError(f"{names} holds no estimates; type: linkpose estimate {tables[0].path} -o OUT.csv")
+
+
+def _has_truth(table: Table) -> bool:
+    """Whether it holds quantities that filters estimate, and is made by none."""
+    parts = [quantities.split(column) for column in table.columns]
+    return any(part is not None and not part.prefix and not part.quantity.is_reading for part in parts)
