@@ -299,6 +299,19 @@ def test_monte_carlo_localization_is_seeded(drive):
         estimate_track(log, "mcl", Settings(), grid)
 
 
+def test_monte_carlo_localization_does_not_take_what_is_behind_a_wall_for_the_wall():
+    """Distances are negative behind the walls of a map of scans: beams that ended there fitted, 13 m off."""
+    blocked = np.full((200, 200), OCCUPIED, np.uint8)
+    blocked[60:140, 60:140] = 0
+    blocked[60:110, 100] = OCCUPIED
+    grid = GridMap(hollow(blocked), np.array([0.05, 0.0, 0.0, 0.0]))
+    poses = [(3.6 + 0.25 * i, 6.2, 0.0) for i in range(9)]
+    log: Log = [*scans_from(grid, poses), *(Event(0.1 * i, "odometry", (0.25, 0.0)) for i in range(81))]
+    settings = Settings(start=poses[0], start_std=(1.5, 2.0), particles=2000, seed=0)
+    track = estimate_track(sorted(log, key=lambda e: e.time_s), "mcl", settings, grid)
+    assert np.hypot(*(track.position_m[-1, :2] - poses[-1][:2])) < 0.05
+
+
 def test_scans_without_echo_change_nothing():
     grid = office_map()
     silent = Scan(1.0, np.full(181, np.nan), np.linspace(-1.5, 1.5, 181), (0.0, 0.0, 0.0), 80.0)

@@ -44,6 +44,9 @@ def localize_mcl(log: Log, settings: Settings, grid: GridMap) -> Track:
     particles = np.asarray(start, dtype=np.float64) + rng.normal(0.0, spread, (settings.particles, 3))
     weights = np.full(settings.particles, 1.0 / settings.particles)
     field = DistanceField.of(grid)
+    # The published model has the distance to the nearest wall on either side of it; `weigh` takes that in a drawn wall
+    # for 0.
+    counts = field.counts if field.is_drawn else np.abs(field.counts)
     odometry, updated, seen = np.zeros(3), np.zeros(3), False
     control, now = np.zeros(2), log[0].time_s
     rows: list[tuple[float, Floats, Floats]] = []
@@ -59,7 +62,7 @@ def localize_mcl(log: Log, settings: Settings, grid: GridMap) -> Track:
                 updated, seen = odometry.copy(), True
                 points = beams_of(event)
                 points = np.ascontiguousarray(points[:: max(1, math.ceil(len(points) / BEAMS))])
-                weigh(field.counts, field.geometry, points, particles, weights)
+                weigh(counts, field.geometry, points, particles, weights)
                 applied += len(points)
                 mean, covariance = _moments(particles, weights)
                 particles = particles[_low_variance(weights, rng.random())]
