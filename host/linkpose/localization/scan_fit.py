@@ -63,7 +63,7 @@ class Prior(NamedTuple):
 def see_beam(
     walls: Walls, beams: Floats, i: int, pose: Floats, c: float, s: float, at: Floats
 ) -> tuple[float, float, float, float]:
-    """Fills `at` with the distance of the end of beam i from the face that it sees, and its slope, as `seen_distance` does.
+    """Fills `at` with the distance of the end of beam i from the face that it sees, and its slope: `seen_distance`.
 
     Returns the end relative to the pose, and the beam's direction, in the map's axes. c and s are cos θ and sin θ.
     """
