@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from linkpose.compiling import compiled, inner
+from linkpose.compiling import compiled
 from linkpose.localization.distance_field import Field, distance_at, seen_distance
 from linkpose.localization.linalg import Floats, lower_cholesky, wrap_angle
 
@@ -59,20 +59,6 @@ class Prior(NamedTuple):
     information: Floats
 
 
-@inner
-def see_beam(
-    walls: Walls, beams: Floats, i: int, pose: Floats, c: float, s: float, at: Floats
-) -> tuple[float, float, float, float]:
-    """Fills `at` with the distance of the end of beam i from the face that it sees, and its slope: `seen_distance`.
-
-    Returns the end relative to the pose, and the beam's direction, in the map's axes. c and s are cos θ and sin θ.
-    """
-    rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
-    ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-    seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
-    return rx, ry, ux, uy
-
-
 @compiled
 def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: float, weights: Floats) -> None:
     """Fills w_i = σ² / (σ² + (k r_i cos β_i)²) for ranges r_i whose deviation grows by k (m/m); σ is `std` (m).
@@ -83,7 +69,9 @@ def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: 
     c, s = math.cos(pose[2]), math.sin(pose[2])
     at = np.empty(3)
     for i in range(beams.shape[0]):
-        _, _, ux, uy = see_beam(walls, beams, i, pose, c, s, at)
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         across = growth * beams[i, 4] * (at[1] * ux + at[2] * uy) / std
         weights[i] = 1.0 / (1.0 + across * across)
 
@@ -99,8 +87,10 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
     cell = walls.geometry[0]
     at = np.empty(3)
     for i in range(beams.shape[0]):
-        rx, ry, ux, uy = see_beam(walls, beams, i, pose, c, s, at)
-        x, y = pose[0] + rx, pose[1] + ry
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        x = pose[0] + c * beams[i, 0] - s * beams[i, 1]
+        y = pose[1] + s * beams[i, 0] + c * beams[i, 1]
+        seen_distance(walls.counts, walls.geometry, x, y, ux, uy, walls.reach, at)
         if abs(at[0]) <= beside:
             continue
         left, crosses = beams[i, 4] - CLEAR_M, False  # m of the beam before its end
@@ -125,7 +115,9 @@ def scan_cost(walls: Walls, scan: Weighted, pose: Floats, is_bounded: bool) -> f
     at = np.empty(3)
     total = 0.0
     for i in range(beams.shape[0]):
-        see_beam(walls, beams, i, pose, c, s, at)
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         square = scan.weights[i] * at[0] * at[0]
         total += square / (scale2 + square) if is_bounded else math.log1p(square / scale2)
     return 0.5 * scan.information * scale2 * total
@@ -142,7 +134,9 @@ def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Float
     hessians[:] = 0.0
     slope[:] = 0.0
     for i in range(beams.shape[0]):
-        rx, ry, _, _ = see_beam(walls, beams, i, pose, c, s, at)
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         weight = scan.weights[i]
         robust = 1.0 / (1.0 + weight * at[0] * at[0] / scale2)
         row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
@@ -164,7 +158,9 @@ def range_equations(walls: Walls, scan: Weighted, pose: Floats, hessian: Floats,
     hessian[:] = 0.0
     slope[:] = 0.0
     for i in range(beams.shape[0]):
-        rx, ry, ux, uy = see_beam(walls, beams, i, pose, c, s, at)
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         weight = scan.weights[i] / (1.0 + scan.weights[i] * at[0] * at[0] / scale2)
         row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
         row[4] = at[1] * ux + at[2] * uy
@@ -193,7 +189,9 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -
     total, weights = 0.0, 1e-12
     distances, robusts = np.empty(beams.shape[0]), np.empty(beams.shape[0])
     for i in range(beams.shape[0]):
-        rx, ry, ux, uy = see_beam(walls, beams, i, pose, c, s, at)
+        rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
+        ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
+        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         square = scan.weights[i] * at[0] * at[0]
         robust = 1.0 / (1.0 + square / scale2)
         facing = robust if at[1] * ux + at[2] * uy < 0.0 else -robust
