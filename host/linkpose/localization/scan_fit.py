@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from linkpose.compiling import compiled
-from linkpose.localization.distance_field import Field, distance_at, seen_distance
+from linkpose.localization.distance_field import Cells, Field, distance_at, seen_distance
 from linkpose.localization.linalg import Floats, lower_cholesky, wrap_angle
 
 # The fit ends when a step is smaller than this (m, and rad): a tenth of what a laser scanner resolves.
@@ -33,11 +33,12 @@ CLEAR_M = 0.3
 
 
 class Walls(NamedTuple):
-    """A map's distance field, how far (m) a beam may end behind the face that it sees, and the distance (m) below which
-    a point is in a wall.
+    """A map's distance field and the cells around each that are clear of negative ones, how far (m) a beam may end
+    behind the face that it sees, and the distance (m) below which a point is in a wall.
     """
 
     counts: Field
+    clear: Cells
     geometry: Floats
     reach: float
     inside: float
@@ -71,7 +72,7 @@ def beam_weights(walls: Walls, beams: Floats, pose: Floats, growth: float, std: 
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         across = growth * beams[i, 4] * (at[1] * ux + at[2] * uy) / std
         weights[i] = 1.0 / (1.0 + across * across)
 
@@ -90,7 +91,7 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
         x = pose[0] + c * beams[i, 0] - s * beams[i, 1]
         y = pose[1] + s * beams[i, 0] + c * beams[i, 1]
-        seen_distance(walls.counts, walls.geometry, x, y, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, x, y, ux, uy, walls.reach, at)
         if abs(at[0]) <= beside:
             continue
         left, crosses = beams[i, 4] - CLEAR_M, False  # m of the beam before its end
@@ -103,11 +104,10 @@ def drop_short(walls: Walls, beams: Floats, pose: Floats, beside: float, weights
 
 
 @compiled
-def scan_cost(walls: Walls, scan: Weighted, pose: Floats, is_bounded: bool) -> float:
-    """The first sum above, seen from `pose`.
+def bounded_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats) -> float:
+    """Both sums above, but a beam costs c²/(2 σ²) w d² / (c² + w d²), the loss of Geman and McClure (the same table).
 
-    `is_bounded`: a beam costs c²/(2 σ²) w d² / (c² + w d²) instead, the loss of Geman and McClure (the same table). A
-    beam that ends far from all walls then costs the same at each pose. With the Cauchy loss, many of them together
+    A beam that ends far from all walls then costs the same at each pose. With the Cauchy loss, many of them together
     prefer a pose that is nearer to them by decimetres.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -117,34 +117,41 @@ def scan_cost(walls: Walls, scan: Weighted, pose: Floats, is_bounded: bool) -> f
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         square = scan.weights[i] * at[0] * at[0]
-        total += square / (scale2 + square) if is_bounded else math.log1p(square / scale2)
-    return 0.5 * scan.information * scale2 * total
+        total += square / (scale2 + square)
+    return 0.5 * scan.information * scale2 * total + _prior_cost(prior, pose)
 
 
 @compiled
-def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Floats, slope: Floats) -> None:
+def normal_equations(walls: Walls, scan: Weighted, pose: Floats, hessians: Floats, slope: Floats) -> float:
     """Fills Σ v w J Jᵀ and Σ v J Jᵀ (2, 3, 3), and Σ v w J d (3,), at `pose`, with the Cauchy weight v = 1 / (1 + w
-    d²/c²).
+    d²/c²). Returns the first sum above.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     beams, scale2 = scan.beams, scan.scale * scan.scale
     at, row = np.empty(3), np.empty(3)
     hessians[:] = 0.0
     slope[:] = 0.0
+    total = 0.0
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         weight = scan.weights[i]
-        robust = 1.0 / (1.0 + weight * at[0] * at[0] / scale2)
+        square = weight * at[0] * at[0]
+        robust = 1.0 / (1.0 + square / scale2)
+        total += math.log1p(square / scale2)
         row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
         for j in range(3):
             slope[j] += robust * weight * row[j] * at[0]
-            for k in range(3):
+            for k in range(j + 1):
                 hessians[0, j, k] += robust * weight * row[j] * row[k]
                 hessians[1, j, k] += robust * row[j] * row[k]
+    for j in range(3):
+        for k in range(j):
+            hessians[0, k, j], hessians[1, k, j] = hessians[0, j, k], hessians[1, j, k]
+    return 0.5 * scan.information * scale2 * total
 
 
 @compiled
@@ -160,7 +167,7 @@ def range_equations(walls: Walls, scan: Weighted, pose: Floats, hessian: Floats,
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         weight = scan.weights[i] / (1.0 + scan.weights[i] * at[0] * at[0] / scale2)
         row[0], row[1], row[2] = at[1], at[2], at[2] * rx - at[1] * ry
         row[4] = at[1] * ux + at[2] * uy
@@ -191,7 +198,7 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -
     for i in range(beams.shape[0]):
         rx, ry = c * beams[i, 0] - s * beams[i, 1], s * beams[i, 0] + c * beams[i, 1]
         ux, uy = c * beams[i, 2] - s * beams[i, 3], s * beams[i, 2] + c * beams[i, 3]
-        seen_distance(walls.counts, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
+        seen_distance(walls.counts, walls.clear, walls.geometry, pose[0] + rx, pose[1] + ry, ux, uy, walls.reach, at)
         square = scan.weights[i] * at[0] * at[0]
         robust = 1.0 / (1.0 + square / scale2)
         facing = robust if at[1] * ux + at[2] * uy < 0.0 else -robust
@@ -209,11 +216,11 @@ def misfit(walls: Walls, scan: Weighted, pose: Floats, lag: int, pull: Floats) -
 def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians: Floats) -> None:
     """Improves `pose` (3,) in place and fills `hessians` as `normal_equations` does there."""
     slope, step, trial = np.empty(3), np.empty(3), np.empty(3)
+    trial_hessians, trial_slope = np.empty((2, 3, 3)), np.empty(3)
     matrix, lower = np.empty((3, 3)), np.empty((3, 3))
-    cost = whole_cost(walls, scan, prior, pose, False)
+    cost = normal_equations(walls, scan, pose, hessians, slope) + _prior_cost(prior, pose)
     damping = 0.0
     for _ in range(MOST_STEPS):
-        normal_equations(walls, scan, pose, hessians, slope)
         for j in range(3):
             step[j] = -scan.information * slope[j]
             for k in range(3):
@@ -228,7 +235,7 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
         shrink = min(shrink, LONGEST_TURN_RAD / (abs(step[2]) + 1e-12))
         for j in range(3):
             trial[j] = pose[j] + shrink * step[j]
-        trial_cost = whole_cost(walls, scan, prior, trial, False)
+        trial_cost = normal_equations(walls, scan, trial, trial_hessians, trial_slope) + _prior_cost(prior, trial)
         if trial_cost > cost:
             damping = 10.0 * damping + 0.1
             if damping > 1e3:
@@ -236,18 +243,10 @@ def fit_scan(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, hessians:
             continue
         damping *= 0.1
         cost = trial_cost
-        for j in range(3):
-            pose[j] = trial[j]
+        pose[:], slope[:], hessians[:] = trial, trial_slope, trial_hessians
         if abs(step[0]) + abs(step[1]) + abs(step[2]) < SMALL_STEP:
             break
     pose[2] = wrap_angle(pose[2])
-    normal_equations(walls, scan, pose, hessians, slope)
-
-
-@compiled
-def whole_cost(walls: Walls, scan: Weighted, prior: Prior, pose: Floats, is_bounded: bool) -> float:
-    """Both sums above; `is_bounded` as for `scan_cost`."""
-    return scan_cost(walls, scan, pose, is_bounded) + _prior_cost(prior, pose)
 
 
 @compiled

@@ -24,10 +24,10 @@ from linkpose.localization.scan_fit import (
     Walls,
     Weighted,
     beam_weights,
+    bounded_cost,
     drop_short,
     fit_scan,
     misfit,
-    whole_cost,
 )
 
 # Deviation of a beam's end from the wall that the map shows (m), at least: half a cell of 5 cm, and a scanner's 3 cm.
@@ -100,7 +100,8 @@ class ScanMatcher:
         """`growth` is that of a range's standard deviation with the range (m/m)."""
         self.grid, self.growth = grid, growth
         self.field = DistanceField.of(grid)
-        self.walls = Walls(self.field.counts, self.field.geometry, self.field.reach_m, self.field.inside_m)
+        field = self.field
+        self.walls = Walls(field.counts, field.clear, field.geometry, field.reach_m, field.inside_m)
         self.beam_std_m = max(BEAM_STD_M, self.field.wall_std_m)
 
     def correct(self, run: KalmanFilter, beams: Floats, expected: float = -math.inf) -> Fit:
@@ -171,7 +172,7 @@ class ScanMatcher:
             drop_short(self.walls, beams, pose, beside, seen.weights)
             fit_scan(self.walls, seen, Prior(mean, prior), pose, hessians)
         seen = self.weighted(beams, pose)
-        return pose, hessians, whole_cost(self.walls, seen, Prior(mean, prior), pose, True)
+        return pose, hessians, bounded_cost(self.walls, seen, Prior(mean, prior), pose)
 
     def _seen(self, beams: Floats, pose: Floats, log_likelihood: float) -> float:
         """The log-likelihood of the beams that do not end in free space; that of all, where these are too few."""
