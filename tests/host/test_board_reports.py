@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -299,6 +300,16 @@ def test_what_is_missing_when_the_user_ends_the_wait_for_the_board_counts(tmp_pa
         stream.close()
         check_missing_at_the_end(session, messages, "cable")
         assert session.timeline.lost >= 25
+
+
+def test_a_program_that_is_late_itself_does_not_call_the_board_silent() -> None:
+    """On a loaded computer the live view asked to check the cable of a healthy board."""
+    with Session("sim://link?speed=5", print) as session:
+        stream = session.stream()
+        next(stream)
+        time.sleep(0.4)  # without a turn: two seconds of the board's time are unread
+        assert session.health().silent_s < 0.1
+        stream.close()
 
 
 def check_missing_at_the_end(session: Session, messages: list[str], cause: str) -> None:

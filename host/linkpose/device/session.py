@@ -110,7 +110,7 @@ class Health:
     drift_std_ppm: float | None
     status: Status | None  # the board's own counters, as it last sent them
     sensors: dict[str, dict[str, Any]] = field(default_factory=dict)  # state and counts, by sensor (sensors.health)
-    silent_s: float = 0.0  # since the last sample arrived, or since the stream began
+    silent_s: float = 0.0  # waited for a sample since the last one; a busy computer's own delays do not count
 
 
 class Session:
@@ -138,8 +138,9 @@ class Session:
         self._arrived_s = math.nan  # s, the connection's clock: of the last sample, or of the stream's begin
         self._repeats = 0  # samples since the last one with a new number
         self._clock_faults: set[str] = set()  # reported
-        self._silent_s = 0.0  # waited for a sample since the last one
+        self._silent_s = 0.0  # waited for a sample since the last one, or since the stream was started (again)
         self._asked_s = 0.0  # of that, up to the last GET_INFO
+        self._silent_before_s = 0.0  # waited since the last sample before the stream was started again
         self._corrupt_before = Corrupt()
         try:
             self.hello = self._first_hello = self._handshake()
@@ -198,9 +199,8 @@ class Session:
 
     def _wait_for_sensors(self, hello: Hello) -> Hello:
         """Waits for sensors that are being set up and returns the latest HELLO."""
-        deadline = time.perf_counter() + SENSORS_TIMEOUT_S
-        while any(device.state == DeviceState.STARTING for device in hello.devices):
-            if time.perf_counter() > deadline:
+        for _ in range(math.ceil(SENSORS_TIMEOUT_S / SETTLE_S)):  # not by the clock: a suspended program has not asked
+            if all(device.state != DeviceState.STARTING for device in hello.devices):
                 break
             time.sleep(SETTLE_S)
             hello = self._ask_hello()
@@ -239,12 +239,11 @@ class Session:
 
         Notifies of the wait, and of each command that a mouse refused during its set-up.
         """
-        deadline = time.perf_counter() + MICE_TIMEOUT_S
-        notified = False
-        while self._mice_missing(count) and time.perf_counter() < deadline:
-            if not notified:
+        for attempt in range(math.ceil(MICE_TIMEOUT_S / ASK_INTERVAL_S)):  # as for the sensors
+            if not self._mice_missing(count):
+                break
+            if attempt == 0:
                 self.notify("Waiting for the mice, which are being set up or have not been found yet")
-                notified = True
             time.sleep(ASK_INTERVAL_S)
             self.hello = self._ask_hello()
         for remark in mouse_remarks(self.hello):
@@ -404,6 +403,7 @@ class Session:
         else:
             raise LinkposeError("the board is reset again and again before it streams; check its supply and its cable")
         self._pinged_at = time.perf_counter()
+        self._silent_before_s += self._silent_s
         self._silent_s = self._asked_s = 0.0
         self._unread_bytes = 0
 
@@ -463,7 +463,7 @@ class Session:
         self._report_repeats(timeline)
         if place is None:
             return []
-        self._silent_s = self._asked_s = 0.0
+        self._silent_s = self._asked_s = self._silent_before_s = 0.0
         self._unread_bytes = 0
         self._arrived_s = arrived_s
         return [Placement(sample, place)]
@@ -581,10 +581,12 @@ class Session:
             setattr(self._corrupt_before, part, getattr(self._corrupt_before, part) + count)
         obstacles: set[str] = set()
         while not timeline.is_over:
+            looked_s = time.perf_counter()
             time.sleep(RETRY_INTERVAL_S)
             yield []
             self._end_when_due(timeline)
             obstacle = self._open_again()
+            self._silent_before_s += time.perf_counter() - looked_s
             if obstacle is None:
                 return
             if obstacle and obstacle not in obstacles:
@@ -634,7 +636,7 @@ class Session:
             drift_ppm=self._clock.drift_ppm if self._clock.ready else None,
             drift_std_ppm=self._clock.drift_std_ppm if self._clock.ready else None,
             status=self.status,
-            silent_s=0.0 if math.isnan(self._arrived_s) else self._connection.now() - self._arrived_s,
+            silent_s=self._silent_before_s + self._silent_s,
         )
 
 
