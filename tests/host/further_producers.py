@@ -376,6 +376,9 @@ FURTHER: dict[str, dict[str, Producer]] = {
         "… is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link": raises(
             lambda: open_port("nonsense://x")
         ),
+        "… is no address of a serial server; type socket://HOST:PORT": raises(
+            lambda: open_port("socket://localhost:99999")
+        ),
         "cannot open …: speed must be 0 or more, and drift_ppm within 10000": raises(
             lambda: lp.open("sim://link?speed=-1")
         ),

@@ -362,10 +362,11 @@ def test_a_serial_server_that_serves_another_program_is_a_sentence(refused):
     assert "is gone" in output and "close other programs that use it, and check the network and try again" in output
 
 
-def test_what_a_serial_server_has_sent_arrives_at_once():
+@pytest.mark.parametrize("scheme", ["socket", "Socket"])  # a port is asked what it is, not its name
+def test_what_a_serial_server_has_sent_arrives_at_once(scheme):
     """Two bytes a turn took a quarter of a core at 500 Hz, and on a loaded machine the stream came 12 s late."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        connection = Connection(f"socket://127.0.0.1:{server.getsockname()[1]}")
+        connection = Connection(f"{scheme}://127.0.0.1:{server.getsockname()[1]}")
         with contextlib.closing(connection), server.accept()[0] as board:
             board.sendall(bytes(4000))
             sizes = []

@@ -20,6 +20,7 @@ from linkpose import quantities
 from linkpose.cli.characters import replacement
 from linkpose.cli.curve import Canvas, curve, path_map, time_axis
 from linkpose.cli.keys import Keys, Marker
+from linkpose.cli.live import health_line, progress_line
 from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator
@@ -341,6 +342,19 @@ def test_a_recording_is_marked_and_ended_by_ctrl_c(tmp_path: Path) -> None:
         assert terminal.wait() == 0, terminal.text
         assert "next: linkpose estimate" in terminal.text and terminal.reads_lines
     assert len(json.loads(recording.read_text().splitlines()[-1].removeprefix("# "))["marks"]) == 1
+
+
+@pytest.mark.parametrize("width", [100, 60, 49, 39, 29])
+def test_the_line_of_a_recording_never_loses_losses_and_faults(width: int) -> None:
+    """It was cut at its end, where gaps and faults are."""
+    ok = SimpleNamespace(
+        duration_s=8.9, samples=628, rate_hz=70.6, lost=261, corrupt=SimpleNamespace(total=0), gaps=[1], status=None,
+        silent_s=0.0, sensors={"imu": {"state": "silent", "invalid": {"silent": 30}}, "baro": {"state": "ok"}},
+    )  # fmt: skip
+    line = progress_line(ok, width)
+    assert "261 lost" in line and line.endswith("IMU not answering") and len(line) <= width
+    ok.silent_s, ok.sensors = 2.34, {"imu": {"state": "ok"}}
+    assert "NO SAMPLES (2.3 s)" in progress_line(ok, width) and "NO SAMPLES" not in health_line(ok)
 
 
 def test_without_a_terminal_there_are_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ import click
 from linkpose.cli.rendering import wrapped
 from linkpose.cli.streams import unfiltered
 from linkpose.errors import NamedTwice, printable
-from linkpose.presentation import counted
+from linkpose.presentation import counted, is_stale, state_text
 
 if TYPE_CHECKING:
     from linkpose.board import Board
@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 Block = TypeVar("Block")
 
 PROGRESS_INTERVAL_S = 0.2
+
+
+def progress_width() -> int:
+    """The most characters of a progress line; a carriage return would not undo a wrapped one."""
+    return shutil.get_terminal_size().columns - 1
 
 
 class Console:
@@ -68,7 +73,7 @@ class Console:
         now = time.perf_counter()
         if self.shows_progress and now - self._shown_at >= PROGRESS_INTERVAL_S:
             self._shown_at = now
-            text = printable(make_text())[: shutil.get_terminal_size().columns - 1]  # \r does not undo a wrapped line
+            text = printable(make_text())[: progress_width()]
             stream = unfiltered(sys.stderr)
             stream.write("\r" + text.ljust(self._width))
             stream.flush()
@@ -173,20 +178,45 @@ def show_summary(console: Console, health: Health, json_lines: bool, where: str)
 
 def health_line(health: Health) -> str:
     """How it goes, in a line."""
-    text = (
-        f"{health.duration_s:.1f} s, {counted(health.samples, 'sample')}, {health.rate_hz:.1f} Hz, {health.lost} lost"
-    )
-    text += f", {health.corrupt.total} corrupt"
+    return ", ".join(text for _, text in _health_parts(health))
+
+
+def progress_line(health: Health, width: int) -> str:
+    """How it goes now, in a line of at most `width` characters where losses and faults fit: they are never left out."""
+    parts = _health_parts(health)
+    if is_stale(health):
+        parts.append((_FAULT, f"NO SAMPLES ({health.silent_s:.1f} s)"))
+    while len(", ".join(text for _, text in parts)) > width and (least := min(parts))[0] < _FAULT:
+        parts.remove(least)
+    return ", ".join(text for _, text in parts)
+
+
+_FAULT = 9  # importance of a part of a line
+
+
+def _health_parts(health: Health) -> list[tuple[int, str]]:
+    """(importance, text) of each part of a line on the health; narrow lines leave out the least important ones."""
+    parts = [
+        (3, f"{health.duration_s:.1f} s"),
+        (0, counted(health.samples, "sample")),
+        (1, f"{health.rate_hz:.1f} Hz"),
+        (_FAULT, f"{health.lost} lost"),
+        (4 if health.corrupt.total else 2, f"{health.corrupt.total} corrupt"),
+    ]
     if health.gaps:
-        text += f", {counted(len(health.gaps), 'gap')}"
-    faults = [f"{name} {of['state']}" for name, of in health.sensors.items() if of["state"] not in ("ok", "absent")]
-    invalid = sum(sum(of.get("invalid", {}).values()) for of in health.sensors.values())
-    saturated = sum(of.get("saturated", 0) for of in health.sensors.values())
-    text += f", {invalid} invalid" * bool(invalid) + f", {saturated} saturated" * bool(saturated)
-    text += "".join(f", {fault}" for fault in faults)
+        parts.append((8, counted(len(health.gaps), "gap")))
+    sensors = health.sensors
+    invalid = sum(sum(of.get("invalid", {}).values()) for of in sensors.values())
+    saturated = sum(of.get("saturated", 0) for of in sensors.values())
+    parts += [(7, f"{invalid} invalid")] * bool(invalid) + [(6, f"{saturated} saturated")] * bool(saturated)
+    parts += [
+        (_FAULT, f"{name.upper()} {state_text(of)}")
+        for name, of in sensors.items()
+        if of["state"] not in ("ok", "absent")
+    ]
     if health.status and health.status.frames_dropped:
-        text += f", {health.status.frames_dropped} dropped by the board"
-    return text
+        parts.append((5, f"{health.status.frames_dropped} dropped by the board"))
+    return parts
 
 
 def refuse_same_file(*outputs: Path | None, source: Path | None = None) -> None:

@@ -99,10 +99,10 @@ class _Run:
 
     def follow(self, keys: Keys, block: Measurements) -> None:
         """Shows the progress and carries out the keys. Raises KeyboardInterrupt to end the recording."""
-        from linkpose.cli.live import health_line
+        from linkpose.cli.live import progress_line, progress_width
 
         self._marker.advance(block)
-        self._console.progress(lambda: health_line(self._board.health))
+        self._console.progress(lambda: progress_line(self._board.health, progress_width()))
         keys.follow({"m": self._marker})
 
     def mark(self, time_s: float) -> None:

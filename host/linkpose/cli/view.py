@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 import numpy as np
 
+from linkpose.cli.live import progress_width
 from linkpose.cli.rendering import wrapped
 from linkpose.cli.screen import Screen
 from linkpose.cli.streams import unfiltered
@@ -64,7 +64,7 @@ class View:
     def line(self, health: Health) -> str:
         """The faults and the headline in one line, where the view is not on the screen."""
         self._take_waiting()
-        return self._screen.line(health, shutil.get_terminal_size().columns - 1)
+        return self._screen.line(health, progress_width())
 
     def report(self, text: str) -> None:
         """Prints a line above the view, or where the view was."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import BinaryIO
 
-from linkpose.device.ports import PORT_FAILURES, is_network, open_port
+from linkpose.device.ports import PORT_FAILURES, counts_waiting_bytes, is_network, open_port
 from linkpose.errors import LinkposeError
 from linkpose.sensors.rig import Rig
 from linkpose.wire.frames import OtherProtocol, StreamDecoder, encode
@@ -48,6 +48,7 @@ class Connection:
         self.decoder = StreamDecoder(from_board=True)
         self._name = port
         self._port = open_port(port)
+        self._counts_waiting_bytes = counts_waiting_bytes(self._port)
         self._capture = capture
         self.now: Callable[[], float] = getattr(self._port, "clock", time.perf_counter)
         self.rig: Rig | None = getattr(self._port, "rig", None)
@@ -70,9 +71,9 @@ class Connection:
             arrived.put(error)
 
     def _waiting_bytes(self) -> bytes:
-        """What else has arrived. A socket's `in_waiting` is 1 at most: each pair of bytes would take a turn."""
+        """What else has arrived. Where the port does not count it, each pair of bytes would take a turn."""
         port = self._port
-        if not self._name.startswith("socket://"):
+        if self._counts_waiting_bytes:
             return bytes(port.read(min(port.in_waiting, READ_SIZE)))
         timeout, port.timeout = port.timeout, 0
         data = bytes(port.read(READ_SIZE))

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import serial
 from serial.tools import list_ports
@@ -203,7 +204,12 @@ def find_again(name: str, identity: UsbIdentity | None) -> str | None:
 
 def is_network(name: str) -> bool:
     """Whether a serial server is behind the name: nothing locks its port, and another program may take it away."""
-    return name.startswith(("socket://", "rfc2217://"))
+    return name.lower().startswith(("socket://", "rfc2217://"))
+
+
+def counts_waiting_bytes(port: serial.SerialBase) -> bool:
+    """Whether `port.in_waiting` is the number of bytes that have arrived; for pyserial's sockets it is 1 at most."""
+    return type(port).__module__ != "serial.urlhandler.protocol_socket"
 
 
 def open_port(name: str, baud: int = BAUD) -> serial.Serial:
@@ -220,11 +226,22 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
             raise PortBusy(name, user)
         if os.name == "posix":
             options["exclusive"] = True
+    elif is_network(name) and not _is_address(name):
+        raise PortError(name, f"{name} is no address of a serial server; type socket://HOST:PORT")
     try:
         port = serial.serial_for_url(name, **options)
     except _NOT_OPENED as error:
         raise _why_not(name, error) from error
     return port
+
+
+def _is_address(url: str) -> bool:
+    """Whether a URL has a host and the number of a TCP port."""
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname and parts.port)
+    except ValueError:  # a number above 65535, a bracket too many
+        return False
 
 
 def _is_no_terminal(name: str) -> bool:
@@ -251,7 +268,8 @@ def _why_not(name: str, error: Exception) -> PortError:
         return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
         return NotASerialPort(name)
-    return PortError(name, f"cannot open {name}: {error}")
+    reason = getattr(error.__context__, "strerror", None) or error  # pyserial's own text names the port twice
+    return PortError(name, f"cannot open {name}: {reason}")
 
 
 def _group(name: str) -> str:
