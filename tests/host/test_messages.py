@@ -11,6 +11,7 @@ import sys
 from binascii import crc_hqx
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import click
@@ -334,7 +335,8 @@ def test_each_message_of_the_page_is_produced(tmp_path: Path, monkeypatch: pytes
         assert re.fullmatch(pattern(message), text.replace("`", "")), f"{text!r} is not {message!r}"
         found.append(text.replace("`", ""))
         kinds |= {type(error), type(getattr(error, "reason", None))}
-    missing = {of: where for of, where in sentences() if not any(re.search(pattern(of), text) for text in found)}
+    text = "\n".join(found)  # which `.` does not cross
+    missing = {of: where for of, where in sentences() if not re.search(pattern(of), text)}
     assert not missing, f"host/docs/messages.md has no row for {missing}"
     assert {kind.__name__ for kind in CURES} <= {kind.__name__ for kind in kinds}
 
@@ -470,12 +472,15 @@ SHORTEST = 16  # characters of a sentence; shorter texts are the names of argume
 WRONG_USAGE = {"UsageError", "BadParameter", "fail"}
 
 
-def sentences() -> Iterator[tuple[str, str]]:
+@cache
+def sentences() -> list[tuple[str, str]]:
     """The sentences of all errors in the program, `…` for what is put in, and where they are."""
-    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
-    kinds = error_classes(trees.values())
-    for path, tree in trees.items():
-        for node in ast.walk(tree):
+    sources = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+    nodes = {path: list(ast.walk(ast.parse(source))) for path, source in sources.items()}
+    kinds = error_classes(nodes.values())
+    found = []
+    for path, of_file in nodes.items():
+        for node in of_file:
             if isinstance(node, ast.ClassDef) and node.name in kinds:
                 calls = [each for each in ast.walk(node) if isinstance(each, ast.Call) and is_of_base(each)]
             elif isinstance(node, ast.Call) and name_of(node.func) in kinds | WRONG_USAGE:
@@ -484,15 +489,16 @@ def sentences() -> Iterator[tuple[str, str]]:
                 continue
             for text in (text_of(argument) for call in calls for argument in call.args):
                 if len(text) >= SHORTEST and " " in text:
-                    yield text.replace("`", ""), f"{path.relative_to(PACKAGE)}:{node.lineno}"
+                    found.append((text.replace("`", ""), f"{path.relative_to(PACKAGE)}:{node.lineno}"))
+    return found
 
 
-def error_classes(trees: Iterable[ast.Module]) -> set[str]:
-    """The names of LinkposeError and of all classes below it."""
+def error_classes(nodes: Iterable[list[ast.AST]]) -> set[str]:
+    """The names of LinkposeError and of all classes below it, among all nodes of files."""
     bases = {
         node.name: {name_of(base) for base in node.bases}
-        for tree in trees
-        for node in ast.walk(tree)
+        for of_file in nodes
+        for node in of_file
         if isinstance(node, ast.ClassDef)
     }
     found = {"LinkposeError"}
@@ -529,7 +535,7 @@ def test_every_form_of_a_sentence_is_found() -> None:
         "class Own(LinkposeError):\n def __init__(self): super().__init__(f'{self} is of its own')\n"
         "class Further(Own): pass\n"
     )
-    assert error_classes([tree]) == {"LinkposeError", "Own", "Further"}
+    assert error_classes([list(ast.walk(tree))]) == {"LinkposeError", "Own", "Further"}
     (call,) = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and is_of_base(node)]
     assert [text_of(argument) for argument in call.args] == ["… is of its own"]
     assert len({where.split(":")[0] for _, where in sentences()}) > 50
