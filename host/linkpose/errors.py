@@ -133,6 +133,10 @@ class PortError(LinkposeError):
         self.port = port
 
 
+class WrongAddress(PortError):
+    """The name of the port is no address that linkpose knows, or has a wrong part."""
+
+
 class PortNotFound(PortError):
     """There is no port of this name."""
 
@@ -219,7 +223,7 @@ class UnknownFilter(LinkposeError):
     """No filter has this `name`; `known` are the names there are."""
 
     def __init__(self, name: str, known: Sequence[str]) -> None:
-        near = difflib.get_close_matches(name, known, 1)
+        near = difflib.get_close_matches(name.lower(), known, 1)
         hint = f"did you mean {near[0]}?" if near else f"the filters are {', '.join(known)}"
         super().__init__(f"there is no filter {name!r}; {hint}")
         self.name, self.known = name, tuple(known)

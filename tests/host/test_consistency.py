@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -93,6 +94,7 @@ def test_filters_and_ports_are_completed(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(ports, "find_ports", lambda: [PortInfo("/dev/ttyACM0", "", 1, 1, "", True, False)])
     for option, typed, expected in (
         ("--filter", "joint", ["joint-inertial", "joint"]),
+        ("--filter", "joint_", ["joint-inertial"]),
         ("--port", "/dev/ttyA", ["/dev/ttyACM0"]),
         ("--port", "sim", ["sim://link", "sim://chain", "sim://mice"]),
     ):
@@ -101,6 +103,21 @@ def test_filters_and_ports_are_completed(monkeypatch: pytest.MonkeyPatch) -> Non
             parameter = next(each for each in command.params if option in each.opts)
             found = [item.value for item in parameter.shell_complete(click.Context(command), typed)]
             assert found == expected, (name, option)
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")
+def test_bash_completes_an_address_with_a_colon(tmp_path: Path) -> None:
+    """Bash breaks words at colons: sim://ch completed to nothing."""
+    program = tmp_path / "linkpose"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m linkpose "$@"\n')
+    program.chmod(0o755)
+    script = (
+        'eval "$(_LINKPOSE_COMPLETE=bash_source linkpose)"; COMP_LINE="linkpose record --port sim://ch x"; '
+        'COMP_POINT=$((${#COMP_LINE} - 2)); _linkpose_completion linkpose; echo "${COMPREPLY[@]}"'
+    )
+    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PYTHONPATH": str(HOST)}
+    found = subprocess.run(["bash", "-c", script], env=environment, capture_output=True, text=True, check=True)
+    assert found.stdout == "//chain\n", found.stderr
 
 
 @pytest.mark.parametrize(
@@ -113,6 +130,8 @@ def test_filters_and_ports_are_completed(monkeypatch: pytest.MonkeyPatch) -> Non
         ("estimate r.csv --live", "leave out r.csv, or leave out --live"),
         ("estimate", "name a RECORDING, or add --live"),
         ("estimate --live --port sim://link?speed=0 --filter joint-inertal", "did you mean joint-inertial?"),
+        ("estimate --live --port sim://link?speed=0 --filter JOINT", "did you mean joint?"),
+        ("info --port sim://lnk", "did you mean sim://link?"),
         ("record --port sim://link --rate 333", "choose from 50, 64, 80, 100, 125, 128, 160, 200, 250"),
         ("record --port sim://link --duration 0", "not a number of seconds above 0"),
         ("record --view-port 9000", "go with --view"),

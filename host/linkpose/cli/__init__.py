@@ -98,6 +98,10 @@ def main() -> None:
 def _run() -> int:
     """Run the command; its exit status."""
     try:
+        if "_LINKPOSE_COMPLETE" in os.environ:  # a shell asks for completions
+            from linkpose.cli import completion
+
+            completion.register()
         status = group.main(prog_name="linkpose", standalone_mode=False)
         sys.stdout.flush()
     except click.exceptions.Abort:

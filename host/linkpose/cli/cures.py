@@ -59,8 +59,8 @@ CURES: dict[type[errors.LinkposeError], Callable[[Any], str]] = {
     ),
 }
 
-# Errors that are wrong usage: a name on the command line that does not exist.
-WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture, errors.NamedTwice)
+# Errors that are wrong usage: a name on the command line that cannot exist.
+WRONG_USAGE = (errors.UnknownFilter, errors.UnknownPicture, errors.NamedTwice, errors.WrongAddress)
 
 
 def _nearest_port(name: str) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
+from click.shell_completion import CompletionItem
 
 from linkpose.errors import CannotWrite
 from linkpose.sensors.rig import LONGEST_LINK_M, UNKNOWN_JOINT, Joint, Rig, as_rig
@@ -118,7 +119,7 @@ def complete_filter(_ctx: click.Context, _param: click.Parameter, incomplete: st
     """Names of filters for the shell's completion."""
     from linkpose.filters import NAMES
 
-    return [name for name in NAMES if name.startswith(incomplete)]
+    return [name for name in NAMES if name.startswith(incomplete.replace("_", "-"))]
 
 
 def complete_port(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
@@ -218,6 +219,10 @@ class ErrorsType(click.ParamType):  # type: ignore[type-arg]
         if Path(value).suffix == ".toml":
             return Rig.load(value)
         return self.fail(f"{value!r} is neither {', '.join(ERROR_LEVELS)} nor a rig file (.toml)", param, ctx)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        levels = [CompletionItem(level) for level in ERROR_LEVELS if level.startswith(incomplete)]
+        return levels or [CompletionItem(incomplete, type="file")]
 
 
 def sensor_errors_or_rig(function: Function) -> Function:

@@ -16,6 +16,7 @@ import serial
 from serial.tools import list_ports
 
 from linkpose.errors import (
+    LinkposeError,
     NoBoardFound,
     NotASerialPort,
     PermissionDenied,
@@ -23,6 +24,7 @@ from linkpose.errors import (
     PortError,
     PortNotFound,
     SeveralBoardsFound,
+    WrongAddress,
 )
 from linkpose.wire.messages import BAUD
 
@@ -227,7 +229,7 @@ def open_port(name: str, baud: int = BAUD) -> serial.Serial:
         if os.name == "posix":
             options["exclusive"] = True
     elif is_network(name) and not _is_address(name):
-        raise PortError(name, f"{name} is no address of a serial server; type socket://HOST:PORT")
+        raise WrongAddress(name, f"{name} is no address of a serial server; type socket://HOST:PORT")
     try:
         port = serial.serial_for_url(name, **options)
     except _NOT_OPENED as error:
@@ -265,9 +267,11 @@ def _why_not(name: str, error: Exception) -> PortError:
     if code in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in text:
         return PortBusy(name)
     if "no handler" in text or "invalid url" in text:
-        return PortError(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
+        return WrongAddress(name, f"{name} is not a port; name a device such as /dev/ttyACM0 or COM3, or sim://link")
     if code in (errno.ENOTTY, errno.ENODEV, errno.EISDIR) or "could not configure" in text:
         return NotASerialPort(name)
+    if isinstance(error.__cause__, LinkposeError):  # of a simulated board
+        return WrongAddress(name, f"cannot open {name}: {error}")
     reason = getattr(error.__context__, "strerror", None) or error  # pyserial's own text names the port twice
     return PortError(name, f"cannot open {name}: {reason}")
 
