@@ -22,6 +22,7 @@ from linkpose.localization.surroundings import Surroundings
 from linkpose.localization.tables import PathScore
 from linkpose.plotting import lines
 from linkpose.plotting.canvas import COLOURS, WIDTH_INCHES, label_time, legend_above, wrapped
+from linkpose.plotting.panels import error_limit
 from linkpose.recording.table import read_table
 
 PNG = b"\x89PNG"
@@ -44,6 +45,11 @@ def drawn(axes):
     """Labels of an axes' legend, in order."""
     legend = axes.get_legend()
     return [text.get_text() for text in legend.get_texts()] if legend else []
+
+
+def shown(axes):
+    """Labels of what the axes show, named by a legend or not."""
+    return list(dict.fromkeys(sorted(axes.get_legend_handles_labels()[1], key=lambda label: "±" in label)))
 
 
 def y_labels(figure):
@@ -118,7 +124,7 @@ def test_without_a_truth_the_difference_from_the_best_is_drawn(tmp_path):
     figure, _ = plotting.plot_tables(link_files(tmp_path)[:1])
     # The best filter's ±2σ has a panel of its own, where the others differ so much that it would look like a line.
     assert y_labels(figure) == ["height over the joint (m)", "±2σ (cm)", "from best (cm)", "roll (°)"]
-    assert drawn(figure.axes[1]) == ["joint-inertial", "±2σ joint-inertial"]
+    assert shown(figure.axes[1]) == ["joint-inertial", "±2σ joint-inertial"] and not drawn(figure.axes[1])
     assert drawn(figure.axes[2])[:2] == ["joint-inertial (best)", "joint 0.639 cm rms from it"]
 
 
@@ -127,7 +133,30 @@ def test_a_single_filter_without_a_truth_shows_its_deviation(tmp_path):
     path = write(tmp_path / "e.csv", {"time_s": t, "joint_height_m": np.sin(t), "joint_height_std_m": 0.01 + 0 * t})
     figure, _ = plotting.plot_tables([read_table(Path(path))])
     assert y_labels(figure) == ["height over the joint (m)", "±2σ (cm)"]
-    assert drawn(figure.axes[1]) == ["joint", "±2σ joint"]
+    assert shown(figure.axes[1]) == ["joint", "±2σ joint"] and not drawn(figure.axes[1])
+
+
+def test_a_legend_names_what_none_above_has_named(tmp_path):
+    """Stretches without a height were shaded in no panel, or in one without a legend."""
+    estimate, truth = link_files(tmp_path)
+    for name in estimate.columns:
+        if "height" in name:
+            estimate.columns[name][:60] = np.nan
+    for tables in ([estimate], [estimate, truth]):
+        named: set[str] = set()
+        for axes in plotting.plot_tables(tables)[0].axes:
+            assert ("no valid value" in shown(axes)) == (axes.get_ylabel() != "roll (°)")
+            named |= set(drawn(axes))
+            assert set(shown(axes)) <= named, axes.get_ylabel()
+
+
+def test_errors_of_a_filter_that_reports_itself_lost_do_not_set_the_scale():
+    """A start of a second flattened the errors of a minute."""
+    error, std = np.full(1000, 0.1), np.full(1000, 0.1)
+    error[:20], std[:20] = 100.0, 50.0
+    assert error_limit([error], [std]) == pytest.approx(0.24)
+    std[:20] = 0.1  # an error that σ does not announce is in view
+    assert error_limit([error], [std]) > 100.0
 
 
 def test_the_truth_is_in_view_where_no_filter_has_a_value(tmp_path):

@@ -164,6 +164,14 @@ def legend_above(axes: Axes, best_first: Sequence[str] = (), title: str = "") ->
         _fill_legend(axes, once, columns, title)
 
 
+def legend_of_new(axes: Axes, named: set[str], best_first: Sequence[str] = ()) -> None:
+    """A legend above the axes if they show anything that is not in `named` yet; adds all that they show to it."""
+    shown = set(axes.get_legend_handles_labels()[1])
+    if not shown <= named:
+        legend_above(axes, best_first)
+        named |= shown
+
+
 def _fill_legend(axes: Axes, handles: dict[str, Any], columns: int, title: str) -> None:
     """A legend above the axes with these labels row by row, in so many columns."""
     labels = _by_rows(list(handles), columns)

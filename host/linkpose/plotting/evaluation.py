@@ -17,8 +17,8 @@ from linkpose.plotting.canvas import (
     new_figure,
     without_formulas,
 )
-from linkpose.plotting.lines import band, draw, shade
-from linkpose.plotting.panels import bound_view, is_signed, others_hide_best, which_filters
+from linkpose.plotting.lines import band, draw
+from linkpose.plotting.panels import bound_view, is_signed, others_hide_best, shade_errors, which_filters
 from linkpose.plotting.sources import is_barometric, shortened
 from linkpose.presentation import minus, same_digits, with_unit
 from linkpose.quantities import HEIGHT, ROTATION, unit_text, words
@@ -133,8 +133,7 @@ def _errors(axes: Axes, scores: Sequence[Score], name: str, which: str) -> None:
             colour = str(line_style(score.filter)["color"])
             sign = "±" if is_signed(of.error) else ""
             band(axes, of.time_s, np.zeros(len(of.time_s)), stds[0], colour, f"{sign}2σ {score.filter}")
-    first = next(score.errors[name] for score in scores if name in score.errors)
-    shade(axes, first.time_s, ~np.isfinite(first.error))
+    shade_errors(axes, [score.errors[name] for score in scores if name in score.errors])
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
     finish(axes, f"{words(name)} error ({unit}){which}")

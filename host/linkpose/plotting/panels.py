@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import TRUTH, finish, legend_above, line_style
+from linkpose.plotting.canvas import TRUTH, finish, line_style
 from linkpose.plotting.lines import band, draw, shade
 from linkpose.plotting.sources import DrawnTrack, Sources, is_barometric, pairs
 from linkpose.presentation import with_unit
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from linkpose.evaluation.errors import Errors
 
+UNSETTLED = 5.0  # times the median σ, from which on errors do not set the scale: they flattened all that follows
 MOST_RATIO = 4.0  # of two filters' errors in one panel: the smaller one still takes a quarter of the height
 
 
@@ -27,21 +28,19 @@ def has(sources: Sources, *wanted: Quantity) -> bool:
     return any(track.has(q) for track in sources.tracks or sources.all for q in wanted)
 
 
-def labels(sources: Sources, quantity: Quantity) -> set[str]:
-    """Of the filters that have a quantity."""
-    return {track.label for track, _ in pairs(sources.tracks, quantity)}
-
-
-def shade_unknown(axes: Axes, tracks: Sequence[DrawnTrack]) -> None:
-    """Shades gaps of the first file, and where none of its filters gives a value."""
-    first = [track for track in tracks if track.file == tracks[0].file and track.values] if tracks else []
+def shade_unknown(axes: Axes, drawn: Sequence[tuple[DrawnTrack, Floats]]) -> None:
+    """Shades gaps of the first file, and where none of its filters has a value of what the panel shows."""
+    first = [(track.time_s, value) for track, value in drawn if track.file == drawn[0][0].file]
     if first:
-        known = np.logical_or.reduce([np.isfinite(v) for track in first for v in track.values.values()])
-        shade(axes, first[0].time_s, ~np.asarray(known, dtype=np.bool_))
+        known = np.logical_or.reduce([np.isfinite(value) for _, value in first])
+        shade(axes, first[0][0], ~np.asarray(known, dtype=np.bool_))
 
 
-def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, period: float | None = None) -> None:
-    """A quantity of all filters with the reference; ±2σ of the best filter. Worse filters lie behind better ones."""
+def values(axes: Axes, sources: Sources, quantity: Quantity, period: float | None = None) -> list[str]:
+    """A quantity of all filters with the reference; ±2σ of the best filter. Worse filters lie behind better ones.
+
+    Returns the labels for the legend, the best first, as the other panels do.
+    """
     drawn = list(pairs(sources.tracks, quantity))
     for track, value in reversed(drawn):
         draw(axes, track.time_s, value, period, label=track.label, **line_style(track.name, track.file))
@@ -56,10 +55,9 @@ def values(axes: Axes, sources: Sources, quantity: Quantity, legend: bool, perio
             value = _from_start_of(drawn[0][0], track) if drawn else _from_start(value)
         draw(axes, track.time_s, value, period, label=track.label, **TRUTH)
     view_values(axes, [value for _, value in drawn] + _reference_beside(sources, quantity, drawn))
-    shade_unknown(axes, [track for track, _ in drawn] or sources.tracks)
+    shade_unknown(axes, drawn)
     finish(axes, quantity.axis_label)
-    if legend:
-        legend_above(axes, [track.label for track, _ in drawn])
+    return [track.label for track, _ in drawn]
 
 
 def _reference_beside(sources: Sources, quantity: Quantity, drawn: Sequence[tuple[DrawnTrack, Floats]]) -> list[Floats]:
@@ -98,7 +96,7 @@ def view_values(axes: Axes, values_drawn: Sequence[Floats]) -> None:
         axes.set_ylim(low - margin, high + margin)
 
 
-def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> None:
+def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> list[str]:
     """Errors of a scored quantity with ±2σ about zero; the legend gives each filter's RMSE.
 
     A distance, which is never negative, has 2σ above zero.
@@ -120,9 +118,15 @@ def errors(axes: Axes, sources: Sources, name: str, best_only: bool = False) -> 
         order.append(text)
     axes.axhline(0.0, color="black", linewidth=0.6)
     bound_view(axes, drawn, stds)
-    shade_unknown(axes, sources.tracks)
+    shade_errors(axes, [of for track, of in scored if track.file == scored[0][0].file])
     finish(axes, f"{words(name)} error ({unit}){which_filters(best_only, hides_best(sources, name))}")
-    legend_above(axes, order)
+    return order
+
+
+def shade_errors(axes: Axes, found: Sequence[Errors]) -> None:
+    """Shades gaps, and where no filter has an error of what the panel shows."""
+    known = np.logical_or.reduce([np.isfinite(of.error) for of in found])
+    shade(axes, found[0].time_s, ~np.asarray(known, dtype=np.bool_))
 
 
 def which_filters(best_only: bool, best_is_apart: bool) -> str:
@@ -160,7 +164,7 @@ def differences_hide_best(sources: Sources, quantity: Quantity) -> bool:
     return others > MOST_RATIO * error_limit([], [best.std[quantity]] if quantity in best.std else []) > 0.0
 
 
-def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool = False) -> None:
+def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool = False) -> list[str]:
     """Without a reference: differences from the best filter, and its ±2σ, in the unit of errors."""
     drawn = [(track, value) for track, value in pairs(sources.tracks, quantity) if track.file == 0]
     best, middle = drawn[0]
@@ -180,9 +184,9 @@ def from_best(axes: Axes, sources: Sources, quantity: Quantity, best_only: bool 
         band(axes, best.time_s, 0 * middle, scale * best.std[quantity], colour, f"±2σ {best.label}")
     stds = [scale * best.std[quantity]] if quantity in best.std else []
     bound_view(axes, differences, stds)
-    shade_unknown(axes, sources.tracks)
+    shade_unknown(axes, drawn[:1] if is_alone else drawn)
     finish(axes, f"±2σ ({unit})" if is_alone else f"from best ({unit})")
-    legend_above(axes, order)
+    return order
 
 
 def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> None:
@@ -193,9 +197,20 @@ def bound_view(axes: Axes, errors: Sequence[Floats], stds: Sequence[Floats]) -> 
         axes.set_ylim(-limit if are_signed else 0.0, limit)
 
 
+def _settled(error: Floats, std: Floats) -> Floats:
+    """The errors but those of a filter that reports itself to be lost: as it starts, or without its sensor."""
+    known = std[np.isfinite(std)]
+    return error[~(std > UNSETTLED * np.median(known))] if len(known) and len(std) == len(error) else error
+
+
 def error_limit(errors: Sequence[Floats], stds: Sequence[Floats]) -> float:
-    """Largest value to show: 99.5 % of the errors and 90 % of ±2σ, so that a short transient flattens nothing."""
-    sizes = [np.quantile(known, 0.995) for value in errors if len(known := np.abs(value[np.isfinite(value)]))]
+    """Largest value to show: 99.5 % of the errors and 90 % of ±2σ, so that a short transient flattens nothing.
+
+    `stds` has the σ of the first of the errors, if any.
+    """
+    seen = [_settled(error, std) for error, std in zip(errors[:1], stds, strict=False)]
+    seen += errors[len(seen) :]
+    sizes = [np.quantile(known, 0.995) for value in seen if len(known := np.abs(value[np.isfinite(value)]))]
     sizes += [2 * np.quantile(known, 0.9) for std in stds if len(known := std[np.isfinite(std)])]
     return 1.2 * max(map(float, sizes), default=0.0)
 

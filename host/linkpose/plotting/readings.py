@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, finish, legend_above
+from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, finish
 from linkpose.plotting.lines import draw, shade
 from linkpose.quantities import Column, split
 from linkpose.recording.table import Table
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _SENSORS = {"": "", "imu2": " of sensor 2"}
 
 
-def time_panels(table: Table) -> list[tuple[float, Callable[[Axes], None]]]:
+def time_panels(table: Table) -> list[tuple[float, Callable[[Axes], list[str]]]]:
     """Share of the height and what draws it, of each panel that has a reading."""
     panels: dict[str, list[tuple[str, Column]]] = {}
     for column, value in table.columns.items():
@@ -29,13 +29,15 @@ def time_panels(table: Table) -> list[tuple[float, Callable[[Axes], None]]]:
     return [(1.8, _panel(table, name, columns)) for name, columns in panels.items()]
 
 
-def _panel(table: Table, name: str, columns: list[tuple[str, Column]]) -> Callable[[Axes], None]:
+def _panel(table: Table, name: str, columns: list[tuple[str, Column]]) -> Callable[[Axes], list[str]]:
     return lambda axes: _draw(axes, table, name, columns)
 
 
-def _draw(axes: Axes, table: Table, name: str, columns: list[tuple[str, Column]]) -> None:
+def _draw(axes: Axes, table: Table, name: str, columns: list[tuple[str, Column]]) -> list[str]:
+    """Draws the readings; the labels for the legend, none for a panel of one line, which its axis names."""
     time_s = table.columns["time_s"]
     unknown = np.ones(len(time_s), np.bool_)
+    labels: list[str] = []
     mice = list(dict.fromkeys(part.prefix for _, part in columns))
     for i, (column, part) in enumerate(columns):
         label, colour, dashes = part.quantity.label, AXES_COLOURS.get(part.quantity.label, OTHERS[i % len(OTHERS)]), "-"
@@ -44,8 +46,8 @@ def _draw(axes: Axes, table: Table, name: str, columns: list[tuple[str, Column]]
             dashes = "-" if columns[i - 1][1].prefix != part.prefix or i == 0 else ":"
         value = table.columns[column] * part.quantity.value.scale
         unknown &= ~np.isfinite(value)
-        draw(axes, time_s, value, label=label, color=colour, linewidth=0.8, linestyle=dashes)
+        labels += [label] * (len(columns) > 1)
+        draw(axes, time_s, value, label=labels[-1] if labels else None, color=colour, linewidth=0.8, linestyle=dashes)
     shade(axes, time_s, unknown)
     finish(axes, f"{name} ({columns[0][1].quantity.value.unit})")
-    if len(columns) > 1:
-        legend_above(axes)
+    return labels

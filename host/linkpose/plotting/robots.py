@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from linkpose.localization.surroundings import Surroundings
-from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, SMALL_LETTERING, TRUTH, finish, legend_above, line_style
+from linkpose.plotting.canvas import AXES_COLOURS, OTHERS, SMALL_LETTERING, TRUTH, finish, line_style
 from linkpose.plotting.lines import MOST_POINTS, band, broken, draw
 from linkpose.plotting.panels import errors, hides_best, shade_unknown, view_values
 from linkpose.plotting.sources import DrawnTrack, Sources
-from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, VX, VY, X, Y
+from linkpose.quantities import CHAIN_ROTATION, EXCLUDED, HEADING, HEIGHT, QW, VX, VY, X, Y
 from linkpose.rotations import rotation_vectors
 from linkpose.sensors.devices import MAX_MICE
 from linkpose.sensors.measurements import Floats
@@ -29,10 +29,10 @@ _TICKS_APART = 1.4  # lengths of a tick between two, at least: those of a robot 
 _MOST_CELLS = 3000  # of a map, along a side
 _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the whole width
 
-TimePanel = tuple[float, Callable[["Axes"], None]]
+TimePanel = tuple[float, Callable[["Axes"], list[str]]]
 
 
-def path_panel(sources: Sources, scene: Surroundings | None, wide: bool) -> Callable[[Axes], None] | None:
+def path_panel(sources: Sources, scene: Surroundings | None, wide: bool) -> Callable[[Axes], list[str]] | None:
     """What draws the paths; None where there is none. A link's horizontal motion is no path."""
     tracks = _with_path(sources)
     return (lambda axes: _path(axes, tracks, scene or Surroundings(), wide)) if tracks else None
@@ -75,7 +75,7 @@ def time_panels(sources: Sources, wide: bool) -> list[TimePanel]:
     return found
 
 
-def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: bool) -> None:
+def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: bool) -> list[str]:
     _draw_scene(axes, scene)
     for track in reversed(tracks):
         style = line_style(track.name, track.file) if track.name else TRUTH
@@ -91,7 +91,7 @@ def _path(axes: Axes, tracks: Sequence[DrawnTrack], scene: Surroundings, wide: b
     finish(axes, "y (m)")
     axes.set_anchor("N")  # its top is that of the panels beside it
     axes.margins(_MARGIN)
-    legend_above(axes, [f"{band}{track.label}" for band in ("", "±2σ ") for track in tracks])
+    return [f"{band}{track.label}" for band in ("", "±2σ ") for track in tracks]
 
 
 def _draw_scene(axes: Axes, scene: Surroundings) -> None:
@@ -182,9 +182,9 @@ def _apart(places: Floats, least: float) -> list[int]:
     return kept
 
 
-def _position_errors(axes: Axes, sources: Sources, best_only: bool = False) -> None:
+def _position_errors(axes: Axes, sources: Sources, best_only: bool = False) -> list[str]:
     """Distances from the true position, and the best filter's 2σ of x and y together."""
-    errors(axes, sources, "position", best_only)
+    order = errors(axes, sources, "position", best_only)
     best = next((track for track in sources.tracks if X in track.std and Y in track.std), None)
     if best is not None:
         std = np.hypot(best.std[X], best.std[Y])
@@ -193,7 +193,7 @@ def _position_errors(axes: Axes, sources: Sources, best_only: bool = False) -> N
         known = std[np.isfinite(std)]
         top = axes.get_ylim()[1]
         axes.set_ylim(0.0, max(top, 2.2 * float(np.quantile(known, 0.9))) if len(known) else top)
-    legend_above(axes)
+    return order
 
 
 def _speed(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:
@@ -216,7 +216,7 @@ def _heading(track: DrawnTrack) -> tuple[Floats, Floats | None] | None:
 
 def _over_time(
     axes: Axes, sources: Sources, of: Callable[[DrawnTrack], tuple[Floats, Floats | None] | None], label: str
-) -> None:
+) -> list[str]:
     """A quantity of all tracks; ±2σ of the best."""
     drawn = [(track, found) for track in sources.tracks if (found := of(track)) is not None]
     for track, (value, _) in reversed(drawn):
@@ -228,15 +228,16 @@ def _over_time(
     if reference is not None and sources.reference is not None:
         draw(axes, sources.reference.time_s, reference[0], label=sources.reference.label, **TRUTH)
     view_values(axes, [value for _, (value, _) in drawn])
-    shade_unknown(axes, sources.tracks)
+    shade_unknown(axes, [(track, value) for track, (value, _) in drawn])
     finish(axes, label)
+    return [track.label for track, _ in drawn]
 
 
-def _mice_panel(track: DrawnTrack) -> Callable[[Axes], None]:
+def _mice_panel(track: DrawnTrack) -> Callable[[Axes], list[str]]:
     return lambda axes: _mice(axes, track)
 
 
-def _mice(axes: Axes, track: DrawnTrack) -> None:
+def _mice(axes: Axes, track: DrawnTrack) -> list[str]:
     """A bar for each stretch in which a mouse was left out."""
     bits = np.nan_to_num(track.values[EXCLUDED]).astype(np.int64)
     shown = max(int(bits.max()).bit_length(), 1)
@@ -249,9 +250,10 @@ def _mice(axes: Axes, track: DrawnTrack) -> None:
     axes.set_yticks(range(1, shown + 1), [f"mouse {mouse}" for mouse in range(1, shown + 1)])
     axes.set_ylim(0.4, shown + 0.6)
     finish(axes, f"left out by {track.label}")
+    return []
 
 
-def rotation(axes: Axes, sources: Sources) -> None:
+def rotation(axes: Axes, sources: Sources) -> list[str]:
     """The rotation of a ball joint as a rotation vector (°): its direction is the axis, its length the angle."""
     for track in sources.all:
         if not track.has(*CHAIN_ROTATION):
@@ -263,6 +265,6 @@ def rotation(axes: Axes, sources: Sources) -> None:
             if not track.name:
                 style, label = dict(TRUTH), track.label
             draw(axes, track.time_s, value, 360.0, label=label, **style)
-    shade_unknown(axes, sources.tracks)
+    shade_unknown(axes, [(track, track.values[QW]) for track in sources.tracks if track.has(*CHAIN_ROTATION)])
     finish(axes, "rotation of the joint (°)")
-    legend_above(axes)
+    return []

@@ -191,7 +191,7 @@ def _describe(table: Table) -> str:
     holes = whole.gaps if whole else len(gaps(time_s))
     closing = table.closing or {}
     lost = closing.get("lost")
-    if not isinstance(lost, int):
+    if not isinstance(lost, int) or (holes and not lost):  # rows were taken out of the file afterwards
         lost = whole.lost if whole else lost_samples(time_s)
     words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {counted(holes, 'gap')}")
     return "   ·   ".join(word for word in words if word)

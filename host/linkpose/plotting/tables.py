@@ -16,6 +16,7 @@ from linkpose.plotting.canvas import (
     WIDTH_INCHES,
     fit_legends,
     label_time,
+    legend_of_new,
     new_figure,
     without_formulas,
     wrapped,
@@ -47,10 +48,10 @@ _WIDE_PATH = 3.6  # height of a path above the panels
 
 @dataclass(frozen=True, slots=True)
 class PlotPanel:
-    """One panel over time: its share of the height, and what draws it."""
+    """One panel over time: its share of the height, and what draws it and returns its labels, the best filter first."""
 
     share: float
-    draw: Callable[[Axes], None]
+    draw: Callable[[Axes], list[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ class Section:
     """A part of the figure: panels with a common time axis, and for a robot a path beside or above them."""
 
     panels: list[PlotPanel]
-    path: Callable[[Axes], None] | None = None
+    path: Callable[[Axes], list[str]] | None = None
     is_wide: bool = False  # the path lies above the panels, over the whole width
 
     @property
@@ -99,7 +100,11 @@ def plot_tables(
 
 
 def _lay_out(part: SubFigure, section: Section) -> None:
-    """Panels below each other with one time axis; a path to the left of them or above."""
+    """Panels below each other with one time axis; a path to the left of them or above.
+
+    A panel has a legend where it shows what no legend above or beside has named.
+    """
+    named: set[str] = set()
     rows = len(section.panels)
     grid: Any
     below_each_other: list[Axes] = []
@@ -108,10 +113,11 @@ def _lay_out(part: SubFigure, section: Section) -> None:
     if section.path is not None and above:
         grid = part.add_gridspec(rows + 1, 1, height_ratios=[_WIDE_PATH, *shares])
         below_each_other.append(part.add_subplot(grid[0, 0]))
-        section.path(below_each_other[0])
+        legend_of_new(below_each_other[0], named, section.path(below_each_other[0]))
     elif section.path is not None:
         beside = part.add_gridspec(1, 2, width_ratios=[1.2, 1.0]) if rows else part.add_gridspec(1, 1)
-        section.path(part.add_subplot(beside[0, 0]))
+        axes = part.add_subplot(beside[0, 0])
+        legend_of_new(axes, named, section.path(axes))
         # A grid of its own: in a common one, all panels would be as far apart as the legends of one of them need.
         grid = beside[0, -1].subgridspec(max(rows, 1), 1, height_ratios=shares or [1.0])
     else:
@@ -121,7 +127,7 @@ def _lay_out(part: SubFigure, section: Section) -> None:
         axes = part.add_subplot(grid[row + above, 0], sharex=first)
         first = first or axes
         below_each_other.append(axes)
-        panel.draw(axes)
+        legend_of_new(axes, named, panel.draw(axes))
         axes.tick_params(labelbottom=row == rows - 1)
     if first is not None:
         label_time(axes)
@@ -129,12 +135,12 @@ def _lay_out(part: SubFigure, section: Section) -> None:
 
 
 def _link(sources: Sources) -> Section | None:
-    """Height (largest), its error, roll, pitch, yaw. A legend names what no panel above has named."""
+    """Height (largest), its error, roll, pitch, yaw."""
     if not panels.has(sources, HEIGHT, ROLL, PITCH):
         return None
     found = []
     if panels.has(sources, HEIGHT):
-        found.append(PlotPanel(3.0, lambda axes: panels.values(axes, sources, HEIGHT, legend=True)))
+        found.append(PlotPanel(3.0, _values(sources, HEIGHT)))
         if _scored(sources, HEIGHT):
             if panels.hides_best(sources, "height"):
                 found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "height", best_only=True)))
@@ -143,12 +149,7 @@ def _link(sources: Sources) -> Section | None:
             if panels.differences_hide_best(sources, HEIGHT):
                 found.append(PlotPanel(1.3, lambda axes: panels.from_best(axes, sources, HEIGHT, best_only=True)))
             found.append(PlotPanel(1.9, lambda axes: panels.from_best(axes, sources, HEIGHT)))
-    named = panels.labels(sources, HEIGHT)
-    for quantity in (ROLL, PITCH, YAW):
-        if panels.has(sources, quantity):
-            drawn = panels.labels(sources, quantity)
-            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found or not drawn <= named)))
-            named |= drawn
+    found += [PlotPanel(1.5, _values(sources, q)) for q in (ROLL, PITCH, YAW) if panels.has(sources, q)]
     return Section(found)
 
 
@@ -156,20 +157,16 @@ def _chain(sources: Sources) -> Section | None:
     """Angle of a hinge (largest) and its error, or the angles of a ball joint; error of the rotation; heights."""
     found = []
     if panels.has(sources, ANGLE):
-        found.append(PlotPanel(3.0, _values(sources, ANGLE, legend=True)))
+        found.append(PlotPanel(3.0, _values(sources, ANGLE)))
         if _scored(sources, ANGLE):
             found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "angle")))
-    for quantity in BALL_ANGLES:
-        if panels.has(sources, quantity):
-            found.append(PlotPanel(2.2, _values(sources, quantity, legend=not found)))
+    found += [PlotPanel(2.2, _values(sources, q)) for q in BALL_ANGLES if panels.has(sources, q)]
     if any(track.has(*CHAIN_ROTATION) for track in sources.tracks or sources.all):
         if not found:
             found.append(PlotPanel(3.0, lambda axes: robots.rotation(axes, sources)))
         if _scored(sources, ROTATION):
             found.append(PlotPanel(1.9, lambda axes: panels.errors(axes, sources, "rotation")))
-    for quantity in (HEIGHT1, HEIGHT2):
-        if panels.has(sources, quantity):
-            found.append(PlotPanel(1.5, _values(sources, quantity, legend=not found)))
+    found += [PlotPanel(1.5, _values(sources, q)) for q in (HEIGHT1, HEIGHT2) if panels.has(sources, q)]
     return Section(found) if found else None
 
 
@@ -186,8 +183,8 @@ def _readings(table: Table) -> Section | None:
     return Section(found) if found else None
 
 
-def _values(sources: Sources, quantity: Quantity, legend: bool) -> Callable[[Axes], None]:
-    return lambda axes: panels.values(axes, sources, quantity, legend, _wrap(quantity))
+def _values(sources: Sources, quantity: Quantity) -> Callable[[Axes], list[str]]:
+    return lambda axes: panels.values(axes, sources, quantity, _wrap(quantity))
 
 
 def _wrap(quantity: Quantity) -> float | None:
