@@ -206,7 +206,7 @@ MORE: dict[str, dict[str, Producer]] = {
         "…: the ranges cannot be metres (median …); divide millimetres by 1000, or centimetres by 100": carmen(
             "FLASER 3 2500 2600 2700 0 0 0 0 0 0 1 a 1\n"
         ),
-        "…: the heading of the odometry …": carmen(
+        "…: the heading of …": carmen(
             "".join(f"ODOM {math.cos(i / 9)} {math.sin(i / 9)} {-i / 9} 0 0 0 {i + 1} a 1\n" for i in range(60))
         ),
         "standard input line …: the clock jumps back from … to … s; restart the stream": raises(

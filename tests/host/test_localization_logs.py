@@ -444,3 +444,36 @@ def test_carmen_logs_in_other_units_and_axes_are_named(tmp_path, change, options
         return
     with pytest.raises(LinkposeError, match=reason):
         read_log(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda h: h, None),
+        (lambda h: h + math.pi, None),  # drives backwards
+        (lambda h: -h, "has the other sign"),
+        (lambda h: math.degrees(h) % 360, "is in degrees: multiply"),
+        (lambda h: -math.degrees(h), "is in degrees and has the other sign"),
+        (lambda h: 0.5 * math.pi - h, "clockwise from y"),
+        (lambda h: 90.0 - math.degrees(h), "of a compass, in degrees clockwise from y"),
+    ],
+)
+def test_headings_of_poses_and_of_a_true_path_in_other_units_and_axes_are_named(tmp_path, change, reason):
+    """They passed: the path turned the other way, or the heading of a right one was called wrong."""
+    truth, rows, x, y = "time_s,x_m,y_m,heading_rad\n", HEADER, 0.0, 0.0
+    for i in range(120):
+        heading = 0.6 + math.sin(0.1 * i)
+        x, y = x + 0.15 * math.cos(heading), y + 0.15 * math.sin(heading)
+        pose = f"{x:.4f},{y:.4f},{change(heading):.4f}"
+        truth += f"{0.5 * i},{pose}\n"
+        rows += f"{0.5 * i},pose,{pose}\n{0.5 * i},odometry,0.3,0,\n"
+    true_path, log = written(tmp_path, truth, "truth.csv"), written(tmp_path, rows)
+    for read, whose in (
+        (lambda: read_truth(true_path), "true path"),
+        (lambda: check_units(read_log(log).events, {}, "a.csv"), "poses"),
+    ):
+        if reason is None:
+            read()
+        else:
+            with pytest.raises(LinkposeError, match=f"the heading of the {whose} .*{reason}"):
+                read()

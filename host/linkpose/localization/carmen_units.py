@@ -1,4 +1,4 @@
-"""Recognises a CARMEN log in other units or axes than metres, radians and x forward, y left.
+"""Recognises a CARMEN log, and headings of a path, in other units or axes than metres, radians and x forward, y left.
 
 Laser and odometry check themselves: no scanner measures kilometres, no beam points beyond a turn, and wheels drive
 along their heading.
@@ -48,8 +48,11 @@ def check_ranges(scans: list[Floats], path: Path) -> None:
         )
 
 
-def check_headings(poses: Floats, path: Path) -> None:
-    """Raises LinkposeError where the wheels drive along another heading than that of `poses` (n, 3: x m, y m, rad)."""
+def check_headings(poses: Floats, path: Path, whose: str = "the odometry") -> None:
+    """Raises LinkposeError where the wheels drive along another heading than that of `poses` (n, 3: x m, y m, rad).
+
+    `whose` poses they are is for the message. A vehicle that drives in any direction passes.
+    """
     poses = _apart(poses)
     if len(poses) <= FEWEST_STEPS or _along(poses) > NOT_ALONG:
         return
@@ -57,10 +60,18 @@ def check_headings(poses: Floats, path: Path) -> None:
     for changed, text in (
         ((x, y, np.radians(heading)), "is in degrees: multiply it by 0.0174533 to give radians"),
         ((x, y, -heading), "has the other sign: angles are counterclockwise, x is forward and y left"),
-        ((y, x, heading), "fits exchanged columns of x and y: exchange them"),
+        ((x, y, np.radians(-heading)), "is in degrees and has the other sign: multiply it by -0.0174533"),
+        (
+            (y, x, heading),
+            "fits exchanged columns of x and y: exchange them, or subtract it from 1.570796 if it is clockwise from y",
+        ),
+        (
+            (y, x, np.radians(heading)),
+            "is that of a compass, in degrees clockwise from y: subtract it from 90, and multiply by 0.0174533",
+        ),
     ):
         if _along(np.column_stack(changed)) > ALONG:
-            raise LinkposeError(f"{path}: the heading of the odometry {text}")
+            raise LinkposeError(f"{path}: the heading of {whose} {text}")
 
 
 def _apart(poses: Floats) -> Floats:

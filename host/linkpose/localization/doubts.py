@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from linkpose.localization.events import NAMED, Event, Log, Scan
 from linkpose.localization.linalg import Floats
+from linkpose.localization.self_calibration import RobotErrors
 from linkpose.localization.settings import Settings
 from linkpose.localization.track import Track
 from linkpose.rotations import wrapped
@@ -123,6 +124,63 @@ def scan_doubts(log: Log, track: Track) -> list[str]:
         odometry = np.diff(np.interp(times, steps.odometry_s, total))
         found += _on_scale(verb, scans[steps.is_whole], odometry[steps.is_whole])
     return found
+
+
+def robot_doubts(errors: RobotErrors | None, applied: Floats) -> list[str]:
+    """A sentence for each error of the robot's constants that was `applied` (5,), as in `RobotErrors`, and for a place
+    of the laser that was not.
+    """
+    angle, ahead, left, way, turn = applied.tolist()
+    found = []
+    if angle:
+        side = "left" if angle > 0.0 else "right"
+        found.append(
+            f"the laser points {abs(np.degrees(angle)):.1f} degrees farther to the {side} than the log states, and was "
+            "corrected by as much: wheels do not drive sideways. Check the laser's direction on the robot, and the "
+            "beams' start angle"
+        )
+    if ahead or left:
+        found.append(
+            f"the laser is {_place(ahead, left)} on the robot than the log states, and was corrected by as "
+            "much: the robot turns about another point. Check the laser's place"
+        )
+    elif errors is not None and (errors.certain[1] or errors.certain[2]):
+        found.append(
+            f"the laser is {_place(*errors.certain[1:3].tolist())} than the point that the robot turns about, and "
+            "the log states no place for it: the path is that of the laser, and σ includes the distance. If the path "
+            "of the robot is meant, state the laser's place in the log"
+        )
+    found += [
+        f"the odometry {verb} {1.0 / (1.0 + share):.3f} times as far as the scans, and was corrected by as much: check "
+        "the diameter of the wheels and the distance between them"
+        for verb, share in (("drives", way), ("turns", turn))
+        if share
+    ]
+    return found
+
+
+def _place(ahead: float, left: float) -> str:
+    """In words, where a length is not 0."""
+    parts = [
+        f"{abs(length):.2f} m farther {words[length < 0.0]}"
+        for length, words in ((ahead, ("ahead", "back")), (left, ("left", "right")))
+        if length
+    ]
+    return " and ".join(parts)
+
+
+def with_doubtful_robot(track: Track) -> Track:
+    """The track, with the errors of the laser's mount that were not corrected, though they are likely, in the
+    covariance of the pose. The path is off by nothing or by all of them, with equal probability.
+    """
+    if track.robot_errors is None or track.heading_rad is None:
+        return track
+    angle, ahead, left = track.robot_errors.likely[:3].tolist()
+    off = np.zeros((len(track.time_s), len(track.names)))
+    at = [track.names.index(name) for name in ("x_m", "y_m", "heading_rad")]
+    c, s = np.cos(track.heading_rad), np.sin(track.heading_rad)
+    off[:, at] = np.column_stack((c * ahead - s * left, s * ahead + c * left, np.full(len(c), angle)))
+    return replace(track, covariance=track.covariance + 0.5 * off[:, :, np.newaxis] * off[:, np.newaxis, :])
 
 
 def with_doubtful_clock(log: Log, track: Track) -> Track:

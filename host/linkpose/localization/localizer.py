@@ -292,6 +292,7 @@ class Localizer:
             self.consistency,
             self.laser.rivals() if self.laser else None,
             1.0 + self.laser.ranges.share if self.laser else 1.0,
+            self.laser.calibration.found() if self.laser and self.vehicle is UNICYCLE else None,
         )
 
     def _row(self) -> Row:

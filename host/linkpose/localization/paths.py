@@ -10,8 +10,16 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
+import numpy as np
+
 from linkpose.errors import InvalidValue
-from linkpose.localization.doubts import doubts, scan_doubts, with_doubtful_clock
+from linkpose.localization.doubts import (
+    doubts,
+    robot_doubts,
+    scan_doubts,
+    with_doubtful_clock,
+    with_doubtful_robot,
+)
 from linkpose.localization.events import Event, Log, LogFile, beacon_name, in_order
 from linkpose.localization.grid import GridMap
 from linkpose.localization.kalman import CONSTANT_VELOCITY
@@ -25,6 +33,7 @@ from linkpose.localization.odometry import with_mice_odometry
 from linkpose.localization.options import LocalizationOptions
 from linkpose.localization.output import table_of, write_table
 from linkpose.localization.plausibility import check_units
+from linkpose.localization.self_calibration import CORRECTIONS, applicable, corrected, together
 from linkpose.localization.settings import Settings
 from linkpose.localization.tables import Beacons, PathScore, Truth, read_beacons, read_truth, score_track
 from linkpose.localization.track import Track
@@ -193,18 +202,33 @@ class PreparedLog:
                 remarks += (f"noises estimated from the log: {described(tuned, self.log)}",)
         tracks: dict[str, Track] = {}
         for method, chosen in settings.items():
-            track = estimate_track(self.log, method, chosen, self.grid, self.beacons, str(self.origin))
+            track, log, applied = self._calibrated(method, chosen)
             on_map = ""
             if method == "scan-match" and self.grid is not None:
                 share = track.applied / max(track.applied + track.rejected, 1)
-                on_map = check_map(self.log, self.grid, share, str(self.origin))
-                remarks += (*([on_map] if on_map else []), *scan_doubts(self.log, track))
-                track = with_doubtful_clock(self.log, track)
+                on_map = check_map(log, self.grid, share, str(self.origin))
+                remarks += (*([on_map] if on_map else []), *robot_doubts(track.robot_errors, applied))
+                remarks += tuple(scan_doubts(log, track))
+                track = with_doubtful_robot(with_doubtful_clock(log, track))
             track.check_applied(str(self.origin), method, on_map)
             if is_tuned and not tracks:
                 remarks += tuple(doubts(self.log, chosen, track, self.free))
             tracks[method] = track
         return Paths(tracks, self.origin, remarks, next(iter(settings.values())))
+
+    def _calibrated(self, method: Method, settings: Settings) -> tuple[Track, Log, Floats]:
+        """The track of a filter, from the log without the errors of the robot's constants that it shows; this log, and
+        the errors (5,), as in `RobotErrors`.
+        """
+        log, applied = self.log, np.zeros(5)
+        track = estimate_track(log, method, settings, self.grid, self.beacons, str(self.origin))
+        for _ in range(CORRECTIONS):
+            errors = applicable(log, track.robot_errors)
+            if not errors.any():
+                break
+            log, applied = corrected(log, errors), together(applied, errors)
+            track = estimate_track(log, method, settings, self.grid, self.beacons, str(self.origin))
+        return track, log, applied
 
 
 def prepare(

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 
 from linkpose.errors import LinkposeError
+from linkpose.localization.carmen_units import check_headings
 from linkpose.localization.events import NAMED, Event, Log
 from linkpose.localization.tables import Beacons
 
@@ -28,6 +30,9 @@ def check_units(log: Log, beacons: Beacons, origin: str) -> None:
     events = [event for event in log if isinstance(event, Event)]
     _check_ranges(events, beacons, origin)
     _check_times(log, origin)
+    poses = [event.values for event in events if event.kind == "pose"]
+    if poses:
+        check_headings(np.array(poses), Path(origin), "the poses")
     _check_angles(events, origin)
 
 

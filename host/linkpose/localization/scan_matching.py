@@ -59,6 +59,7 @@ NEARBY = 12  # starts of that fit
 # Weight of one scan when hypotheses are compared: its beams count as this many independent ones. Too many, and two
 # the map's errors decide between corridors that look alike.
 COMPARED_BEAMS = 10.0
+NEXT_TO_NOTHING = np.diag([1e-3, 1e-3, 1e-2])  # information of a pose that only the scan decides (1/m², 1/rad²)
 NO_WALL = 0.1  # probability that a beam meets what the map does not have
 
 
@@ -70,7 +71,8 @@ class Fit:
     `d2` is νᵀ S⁻¹ ν of the equivalent measurement of the pose, with 3 degrees of freedom. `walls` (3, 3) is Σ v J Jᵀ at
     the fitted pose, the information of walls whose places are uncertain by 1 m, and `pull` (3,) the effect of an error
     that all of them share. `misfit_m2` is the mean square of how far beams end from the walls that they hit (m²), in a
-    drawn map only the part that neighbouring beams share.
+    drawn map only the part that neighbouring beams share. `alone` (3,) is the pose at which the scan would fit best
+    without the prediction, to first order.
     """
 
     share: float
@@ -81,6 +83,7 @@ class Fit:
     walls: Floats
     pull: Floats
     misfit_m2: float
+    alone: Floats
 
 
 def beams_of(scan: Scan) -> Floats:
@@ -135,11 +138,15 @@ class ScanMatcher:
             covariance = np.asarray(np.linalg.inv(prior), dtype=np.float64)
             seen_likelihood = self._seen(beams, best, log_likelihood)
         # The beams count as independent here: the errors of the map that they share are in `scan_tracking.map_error`.
-        d2 = _condition(run, at, best, covariance, prior + hessians[0] / self.beam_std_m**2)
+        scanned = hessians[0] / self.beam_std_m**2
+        off = best - mean
+        off[2] = wrap_angle(float(off[2]))
+        alone = best + np.linalg.solve(scanned + NEXT_TO_NOTHING, prior @ off)
+        d2 = _condition(run, at, best, covariance, prior + scanned)
         pull = np.empty(3)
         weighted = self.weighted(beams, best)
         off_m2 = misfit(self.walls, weighted, best, int(self.field.is_drawn), pull)
-        return Fit(share, log_likelihood, seen_likelihood, d2, len(beams), hessians[1], pull, off_m2)
+        return Fit(share, log_likelihood, seen_likelihood, d2, len(beams), hessians[1], pull, off_m2, alone)
 
     def compare(self, beams: Floats, pose: Floats) -> tuple[float, float]:
         """Share of the beams that hit a wall from `pose`, and the log-likelihood of the scan there."""
@@ -147,10 +154,9 @@ class ScanMatcher:
 
     def search(self, beams: Floats, most: int) -> list[Floats]:
         """Poses (3,) of the whole map from which the scan fits, refined, best first."""
-        wide = np.diag([1e-3, 1e-3, 1e-2])  # next to no information: only the scan decides
         found: list[tuple[float, Floats]] = []
         for start in likely_poses(self.grid, self.field.counts, beams, 4 * most):
-            pose, _, _ = self._fit(beams, start, wide, start)
+            pose, _, _ = self._fit(beams, start, NEXT_TO_NOTHING, start)
             found.append((-self.compare(beams, pose)[1], pose))
         found.sort(key=lambda item: item[0])
         return [pose for _, pose in found[:most]]

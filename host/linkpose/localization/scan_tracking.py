@@ -14,6 +14,7 @@ from linkpose.localization.kalman import KalmanFilter
 from linkpose.localization.linalg import Floats
 from linkpose.localization.range_scale import RangeScale
 from linkpose.localization.scan_matching import FEWEST_BEAMS, MOST_BEAMS, Fit, ScanMatcher, beams_of
+from linkpose.localization.self_calibration import SelfCalibration
 from linkpose.localization.track import Rivals
 
 # The errors of a map do not average out over scans; they are added to the reported covariance. GRID_ERROR (m, m, rad)
@@ -73,6 +74,7 @@ class ScanTracker:
         self.map_error = np.diag(GRID_ERROR**2)
         self.misfit2 = LEAST_WALL_STD_M**2  # the usual one (m²)
         self.ranges = RangeScale()
+        self.calibration = SelfCalibration()
 
     def _below(self, falls: float) -> float:
         """The log-likelihood so many falls below the usual."""
@@ -80,6 +82,7 @@ class ScanTracker:
 
     def predict(self, run: KalmanFilter, interval_s: float, control: Floats, hold_s: Floats) -> None:
         """Predicts all hypotheses but `run`, which the caller predicts."""
+        self.calibration.move(interval_s, float(control[0]), float(control[-1]))
         if self.contest is None:
             return
         for hypothesis in self.contest.hypotheses:
@@ -110,7 +113,7 @@ class ScanTracker:
             self.bad, self.wait = 0, min(2 * self.wait, MOST_BAD_SCANS)
         pose = _pose_of(run)
         self.ranges.learn(self.matcher.walls, self.matcher.weighted(beams, pose), pose, prediction)
-        self._bind(fit)
+        self.calibration.learn(fit.alone, self._bind(fit))
         self._adapt(fit.seen_likelihood)
         return Result(run, True, round(fit.share * fit.beams), fit.beams, 0, fit)
 
@@ -128,8 +131,11 @@ class ScanTracker:
         if self.contest is not None:
             covariance[at] += self.contest.rivalry()
 
-    def _bind(self, fit: Fit) -> None:
-        """Estimates how the errors of the walls in this scan move the pose: the covariance of a fit to them alone."""
+    def _bind(self, fit: Fit) -> Floats:
+        """Estimates how the errors of the walls in this scan move the pose: the covariance of a fit to them alone.
+
+        Returns the part of it that is not common to all walls.
+        """
         self.misfit2 += (fit.misfit_m2 - self.misfit2) / RISE
         std = max(self.least_std_m, self.matcher.field.wall_std_m, math.sqrt(max(self.misfit2, 0.0)))
         shared = SHARED_BEAMS * fit.beams / MOST_BEAMS
@@ -137,6 +143,7 @@ class ScanTracker:
         error = np.asarray(np.linalg.inv(bound), dtype=np.float64)
         common = error @ fit.pull / (shared * std**2)  # what 1 m does that all walls are nearer
         self.map_error = error + np.outer(common, common) * std**2 + np.diag(GRID_ERROR**2)
+        return error
 
     def rivals(self) -> Rivals | None:
         """The poses that explain the scans alike, if the pose was never known. None after a log without scans."""
@@ -151,6 +158,7 @@ class ScanTracker:
         self, run: KalmanFilter, beams: Floats, others: list[KalmanFilter], found: list[Floats] | None = None
     ) -> Result:
         """Starts a contest of the poses that a search of the whole map finds, and of `others`."""
+        self.calibration.lose()
         candidates = list(others)
         for pose in self.matcher.search(beams, CANDIDATES) if found is None else found:
             candidate = run.copy()

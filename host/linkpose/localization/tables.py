@@ -10,6 +10,7 @@ import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.inputs import read_bytes
+from linkpose.localization.carmen_units import check_headings
 from linkpose.localization.events import beacon_name, read_number
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.track import Track
@@ -66,10 +67,17 @@ class Truth:
 
 
 def read_truth(path: Path) -> Truth:
-    """Reads `time_s,x_m,y_m[,z_m][,heading_rad]` among other columns. Raises LinkposeError with file, line and cure."""
+    """Reads `time_s,x_m,y_m[,z_m][,heading_rad]` among other columns.
+
+    Raises LinkposeError with file, line and cure, and where only a heading in degrees or of the other sign is along the
+    path.
+    """
     columns = _read_whole(path, "time_s", "x_m", "y_m").columns
     axes = [columns[name] for name in ("x_m", "y_m", "z_m") if name in columns]
-    heading = np.unwrap(columns["heading_rad"]) if "heading_rad" in columns else None
+    heading = None
+    if "heading_rad" in columns:
+        check_headings(np.column_stack((axes[0], axes[1], columns["heading_rad"])), path, "the true path")
+        heading = np.unwrap(columns["heading_rad"])
     return Truth(columns["time_s"], np.column_stack(axes), heading)
 
 

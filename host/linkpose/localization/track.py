@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from linkpose.errors import NothingApplied, UndecidedStart
 from linkpose.localization.consistency import Consistency
 from linkpose.localization.linalg import Floats
+from linkpose.localization.self_calibration import RobotErrors
 
 # The best of several poses that fit alike must explain such a share of the beams; else the map is another one. With the
 # map or the laser mirrored, the share is 0.03 to 0.25.
@@ -39,7 +40,8 @@ class Track:
     and beacon of each range and each landmark outside the gate. `widened` counts how often the standard deviations of
     the pose were raised because most measurements were rejected, `relocated` how often the pose was found again.
     `consistency` holds the normalised innovations squared by sensor, `rivals` what was left of a search of the map that
-    never decided. `range_scale` is the factor by which the laser's ranges were corrected.
+    never decided. `range_scale` is the factor by which the laser's ranges were corrected; `robot_errors` is what the
+    motion shows of the laser's mount and of the odometry's scales.
     """
 
     names: tuple[str, ...]
@@ -54,6 +56,7 @@ class Track:
     consistency: Consistency = field(default_factory=Consistency)
     rivals: Rivals | None = None
     range_scale: float = 1.0
+    robot_errors: RobotErrors | None = None
 
     def check_applied(self, origin: str, name: str, remark: str = "") -> None:
         """Raises NothingApplied where the filter applied no measurement, so that its path is dead reckoning.
