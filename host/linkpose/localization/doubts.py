@@ -171,7 +171,7 @@ def _place(ahead: float, left: float) -> str:
 
 def with_doubtful_robot(track: Track) -> Track:
     """The track, with the errors of the laser's mount that were not corrected, though they are likely, in the
-    covariance of the pose. The path is off by nothing or by all of them, with equal probability.
+    covariance of the pose. The path is off by all of them where the robot is meant, and by nothing where the laser is.
     """
     if track.robot_errors is None or track.heading_rad is None:
         return track
@@ -180,7 +180,7 @@ def with_doubtful_robot(track: Track) -> Track:
     at = [track.names.index(name) for name in ("x_m", "y_m", "heading_rad")]
     c, s = np.cos(track.heading_rad), np.sin(track.heading_rad)
     off[:, at] = np.column_stack((c * ahead - s * left, s * ahead + c * left, np.full(len(c), angle)))
-    return replace(track, covariance=track.covariance + 0.5 * off[:, :, np.newaxis] * off[:, np.newaxis, :])
+    return replace(track, covariance=track.covariance + off[:, :, np.newaxis] * off[:, np.newaxis, :])
 
 
 def with_doubtful_clock(log: Log, track: Track) -> Track:
