@@ -50,14 +50,16 @@ def run(
     signalled: tuple[str, int] | None = None,
     longest_s: float = LONGEST_S,
     most_bytes: int | None = None,
+    environment: dict[str, str] | None = None,
 ) -> Ended:
-    """Runs `linkpose WORDS` in a folder.
+    """Runs `linkpose WORDS` in a folder, with these variables of the environment changed.
 
     `streams` maps numbers of standard streams to "closed", "full" or "gone" (a pipe whose reader has ended).
     `signalled` names a function of the program, as MODULE.NAME, at whose first call this signal arrives. SIGPROF
     ends a command that takes longer (processor time). `most_bytes` bounds its memory beside what is imported.
     """
-    arguments = (str(folder), [str(word) for word in words], streams or {}, signalled, longest_s, most_bytes)
+    texts = [str(word) for word in words]
+    arguments = (str(folder), texts, streams or {}, signalled, longest_s, most_bytes, environment or {})
     process = _context().Process(target=_main, args=arguments)
     process.start()
     process.join()
@@ -72,8 +74,10 @@ def _main(
     signalled: tuple[str, int] | None,
     longest_s: float,
     most_bytes: int | None,
+    environment: dict[str, str],
 ) -> None:
     """In the child: the process becomes the command."""
+    os.environ.update(environment)
     signal.setitimer(signal.ITIMER_PROF, longest_s)
     signal.alarm(LONGEST_WAIT_S)
     if most_bytes is not None:

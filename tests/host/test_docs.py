@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import os
 import re
 import shlex
 import subprocess
@@ -11,6 +10,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import child
 import pytest
 from click.testing import CliRunner
 
@@ -50,21 +50,15 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", pages_with_commands())
 def test_the_commands_of_a_page_run(name: str, tmp_path: Path) -> None:
     """In one folder, in the order of the page. A simulated link, ten times as fast, stands in for the board."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "host"), "LINKPOSE_PORT": "sim://link?seed=1&speed=10"}
     for command in commands(DOCS / name):
         if command in HARDWARE:
             assert (ROOT / HARDWARE[command]).is_file()
             continue
-        program, *arguments = shlex.split(command)
+        program, *words = shlex.split(command)
         assert program == "linkpose", f"{name}: a console block shows linkpose commands only, not {command!r}"
-        done = subprocess.run(
-            [sys.executable, "-m", "linkpose", *arguments],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, f"{name}: {command}\n{done.stderr}"
+        words = [re.sub(r"^sim://\w+$", r"\g<0>?speed=10", word) for word in words]
+        done = child.run(tmp_path, words, environment={"LINKPOSE_PORT": "sim://link?seed=1&speed=10"})
+        assert done.status == 0, f"{name}: {command}\n{done.err}"
 
 
 def test_the_steps_to_other_programs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
