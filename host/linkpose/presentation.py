@@ -86,11 +86,15 @@ def best_filter(row: Row, filters: Iterable[str], quantity: Quantity) -> str | N
 
 
 def fault_lines(health: Health, exclusions: Exclusions) -> list[str]:
-    """One line for each sensor that does not work, with what to check, and for each mouse that is left out."""
+    """One line for each sensor that does not work, with what to check, and for each mouse that is left out.
+
+    Without samples nothing is known of the sensors.
+    """
     faulty = faulty_sensors(health)
-    lines = [_fault_line(name, health) for name in faulty]
     if is_stale(health):
-        lines.insert(0, f"NO SAMPLES ({health.silent_s:.1f} s): check the cable of the board")
+        lines = [f"NO SAMPLES ({health.silent_s:.1f} s): check the cable of the board"]
+    else:
+        lines = [_fault_line(name, health) for name in faulty]
     return lines + exclusions.lines(faulty)
 
 
@@ -118,6 +122,12 @@ def state_text(sensor: Mapping[str, Any]) -> str:
     """The state of a sensor in words; `sensor` is its part of Health.sensors."""
     state = str(sensor.get("state"))
     return "not answering" if state == "silent" else state
+
+
+def lost_since(name: str, health: Health, needed: Callable[[str], Iterable[str]]) -> float:
+    """When (s) a filter lost a sensor that it needs; infinite where it has all of them."""
+    faulty = set(faulty_sensors(health)).intersection(needed(name))
+    return min((health.sensors[sensor].get("since_s", math.inf) for sensor in faulty), default=math.inf)
 
 
 def lost_filters(names: Iterable[str], health: Health, needed: Callable[[str], Iterable[str]]) -> list[str]:

@@ -34,8 +34,8 @@ from linkpose.simulation.link import LinkRun
 OK = {"imu": {"state": "ok"}, "baro": {"state": "ok"}}
 
 
-def health(**sensors: dict[str, Any]) -> Any:
-    return SimpleNamespace(rate_hz=100.0, lost=0, sensors=OK | sensors, duration_s=30.0, silent_s=0.0)
+def health(silent_s: float = 0.0, **sensors: dict[str, Any]) -> Any:
+    return SimpleNamespace(rate_hz=100.0, lost=0, sensors=OK | sensors, duration_s=30.0, silent_s=silent_s)
 
 
 def table(interval_s: float, rows: Sequence[Row]) -> tuple[list[str], Floats]:
@@ -125,6 +125,7 @@ def test_a_faulty_sensor_blanks_the_estimates_that_need_it_and_says_since_when()
     assert lines[2].split("   ")[1] == "1.700 m ±30.0 cm"
     assert [line.split()[:3] for line in lines[-2:]] == [["joint", "–", "–"], ["▸", "baro", "1.700"]]
     frozen = screen.render(health(imu={"state": "frozen", "since_s": 29.0}), 80, 24).plain
+    assert "NOT ANSWERING" not in screen.render(health(imu={"state": "silent"}, silent_s=2.0), 80, 24).plain
     assert "IMU FROZEN (1.0 s): unplug the board and plug it in again" in frozen
     pulled = health()
     pulled.silent_s = 3.14
@@ -134,6 +135,21 @@ def test_a_faulty_sensor_blanks_the_estimates_that_need_it_and_says_since_when()
     assert [line.split()[-2:] for line in lines[-2:]] == [["–", "–"]] * 2
     pulled.silent_s = 0.9
     assert screen.render(pulled, 80, 24).plain == screen.render(health(), 80, 24).plain
+
+
+def test_a_curve_ends_where_a_sensor_failed() -> None:
+    """Filters predict on until the fault is found, and for a second more: the curve fell by a metre."""
+    heights = [1.5 + 0.03 * (at % 2) - 0.1 * max(at - 60, 0) for at in range(80)]
+    screen = screen_of("sim://link", 0.05, [{"joint": {quantities.HEIGHT: (h, 0.01)}} for h in heights])
+    for sensors in ({"imu": {"state": "silent", "since_s": 3.0}}, {}):  # the fault, and after it
+        curve_lines = [line for line in screen.render(health(**sensors), 80, 24).plain.splitlines() if "┤" in line]
+        assert float(curve_lines[-1].split("┤")[0]) > 1.4, curve_lines
+
+
+def test_an_empty_curve_gives_way_to_one_with_values() -> None:
+    angle = {quantities.ANGLE: (math.nan, math.nan)}
+    rows = [{"chain": angle, "joint": {quantities.HEIGHT: (1.5 + 0.001 * at, 0.1)}} for at in range(100)]
+    assert "┤" in screen_of("sim://chain", 0.05, rows).render(health(), 80, 12).plain
 
 
 def test_an_unplugged_mouse_does_not_disagree() -> None:

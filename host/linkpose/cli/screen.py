@@ -31,6 +31,7 @@ from linkpose.presentation import (
     joint_angle,
     joint_texts,
     length_with_std,
+    lost_since,
     minus,
     pose_text,
     signed_angle,
@@ -53,7 +54,7 @@ WIDEST = 78
 _LEAST_WIDTH = 20  # of a part of a line
 LEAST_HEIGHT_M = 0.02  # that the curve's axis covers: noise does not fill the screen
 LEAST_ANGLE_DEG = 5.0  # that the axis of a joint angle covers
-_FAULTS, _HEADLINE = 10, 8  # priorities of sections
+_FAULTS, _HEADLINE, _EMPTY = 10, 8, 0  # priorities of sections
 
 Points = deque[tuple[float, float]]  # time (s) and value
 
@@ -151,6 +152,7 @@ class Screen:
     def _sections(self, health: Health, width: int, status: str) -> list[tuple[int, list[tuple[str, str]]]]:
         """(priority, [(line, style), …]) from top to bottom."""
         self._row = current(self._newest, health, required_sensors)
+        self._end_curves(health)
         found = fault_lines(health, self._exclusions)
         faults = [(part, "bold red") for line in found for part in textwrap.wrap(line, width)]
         sections = [(9, [(line, "bold") for line in self._head(health, width)]), (_FAULTS, faults)]
@@ -164,6 +166,14 @@ class Screen:
             sections += self._robot_sections(robot, width)
         sections += [(9, [(status, "bold")] if status else []), (1, [(self._keys, "dim")] if self._keys else [])]
         return [section for section in sections if section[1]]
+
+    def _end_curves(self, health: Health) -> None:
+        """Takes off the curves what filters predicted since they lost a sensor: in numbers, it is blank too."""
+        for curves in (self._heights, self._angles):
+            for name, points in curves.items():
+                lost_s = lost_since(name, health, required_sensors)
+                while points and points[-1][0] >= lost_s:
+                    points.pop()
 
     def _link_sections(self, name: str, width: int) -> list[tuple[int, list[tuple[str, str]]]]:
         points = self._heights.get(name, ())
@@ -283,6 +293,7 @@ def _curve_sections(
     """The curve of the last seconds, whose axis covers at least `least`, and its time axis, which goes sooner."""
     times, values = [time for time, _ in points], [value for _, value in points]
     lines = curve(times, values, CURVE_S, width, CURVE_ROWS, least)
+    priority = priority if any(map(math.isfinite, values)) else _EMPTY
     axis = time_axis(CURVE_S, lines[0].find("┤"), width) if "┤" in lines[0] else ""
     return [(priority, [(line, "") for line in lines]), (2, [(axis, "dim")] if axis else [])]
 
