@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shutil
@@ -253,10 +254,23 @@ def test_a_dash_is_the_standard_output(tmp_path: Path) -> None:
 def test_a_terminal_without_greek_letters_gets_a_replacement(encoding: str) -> None:
     done = run("evaluate", "--help", PYTHONIOENCODING=encoding)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
-    assert b"has a standard deviation s," in b" ".join(done.stdout.split()) or "σ".encode(encoding, "replace") != b"?"
+    assert b"has a standard deviation sd," in b" ".join(done.stdout.split()) or "σ".encode(encoding, "replace") != b"?"
     assert b"?" not in done.stdout and done.stdout.decode(encoding)
     refused = run("estimate", "σ.csv", "--j2s", "σ", PYTHONIOENCODING=encoding)
     assert refused.returncode == 2 and b"Traceback" not in refused.stderr and refused.stderr.decode(encoding)
+
+
+def test_a_table_keeps_its_columns_on_any_code_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """σ became "s", which reads as seconds, and longer replacements shifted the cells beside them."""
+    shown = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", shown)
+    table = Table("error of", "in ±2σ", "worst")
+    table.add_row("roll (°)", "96 %", "0.1")
+    show_table(table)
+    shown.flush()
+    head, row = (line for line in shown.buffer.getvalue().decode().splitlines() if line.count("|") == 4)
+    assert "in +/-2sd" in head and "roll (deg)" in row
+    assert [at for at, char in enumerate(head) if char == "|"] == [at for at, char in enumerate(row) if char == "|"]
 
 
 def test_every_picture_format_is_in_the_help(linkpose) -> None:

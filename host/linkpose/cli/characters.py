@@ -13,8 +13,8 @@ ERRORS = "linkpose"  # name of the error handler, for `errors=` of a stream
 # ASCII under a name of our own. click writes UTF-8 to the file under a stream of a known ASCII encoding, past the
 # replacements of this module and past the failures that `streams` handles.
 ASCII = "linkpose_ascii"
-_ALIKE = str.maketrans("−–—─└├┤│▸·…σχλωαβκηπΔµ²³×√‖≤≥≈→«»“”’", "----`|||>-.sxlwabknpDu23xV|<>~><>\"\"'") | {
-    ord("±"): "+/-", ord("°"): " deg",
+_ALIKE = str.maketrans("−–—─└├┤│▸·…χλωαβκηπΔµ²³×‖≤≥≈→«»“”’", "----`|||>-.xlwabknpDu23x|<>~><>\"\"'") | {
+    ord("±"): "+/-", ord("°"): " deg", ord("σ"): "sd", ord("√"): "sqrt",
 }  # fmt: skip
 _FIRST_BRAILLE, _LAST_BRAILLE = 0x2800, 0x28FF
 # Dots of a Braille cell in its upper and lower half and its two middle rows, by bit.
@@ -24,6 +24,14 @@ _UPPER, _LOWER, _MIDDLE = 0x1B, 0xE4, 0x36
 def replacement(text: str) -> str:
     """The text in ASCII."""
     return "".join(_ascii(char) for char in text.translate(_ALIKE))
+
+
+def fitting(text: str, encoding: str | None) -> str:
+    """The text as a stream of this encoding would show it: a table lays out its columns by it."""
+    if encoding is None:
+        return text
+    register()
+    return text.encode(encoding, ERRORS).decode(encoding).replace("( deg", "(deg")
 
 
 def _ascii(char: str) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 
+from linkpose.cli.characters import fitting
 from linkpose.cli.streams import unfiltered
 from linkpose.errors import printable
 
@@ -59,7 +60,7 @@ def show_table(table: Table) -> None:
 
     class SafeConsole(Console):
         def render_str(self, text: str, **options: Any) -> Text:
-            return super().render_str(printable(text), **options)
+            return super().render_str(fitting(printable(text), sys.stdout.encoding), **options)
 
     console = SafeConsole(file=unfiltered(sys.stdout))
     console.width = max(console.width, _TABLE_WIDTH)
