@@ -210,7 +210,9 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     columns |= {"mice_excluded": np.where((t > 1) & (t < 2), 2.0, 0.0)}
     columns |= {"tilt_roll_deg": 0 * t, "tilt_height_m": np.full(400, np.nan)}  # J2S is unknown
     paths = (write(tmp_path / "e.csv", columns), write(tmp_path / "t.csv", {"time_s": t} | pose | motion, "truth"))
-    figure, remarks = plotting.plot_tables([read_table(Path(path)) for path in paths])
+    tables = [read_table(Path(path)) for path in paths]
+    tables[0].metadata["rig"] = {"mouse": [{}, {}, {}]}
+    figure, remarks = plotting.plot_tables(tables)
     path, error, speed, heading, mice = figure.axes
     assert remarks == ["not drawn beside a path: tilt (add --filter tilt)"]
     assert plotting.plot_tables([read_table(Path(paths[0]))], ["tilt"])[1] == []  # the user chose
@@ -224,6 +226,8 @@ def test_a_robot_shows_its_path_first_and_square(tmp_path):
     assert np.nanmax(heading.lines[0].get_ydata()) == pytest.approx(np.degrees(t[-1]))
     (bar,) = mice.collections[1].get_paths()  # of mouse 2
     assert bar.vertices[:, 0].min() == pytest.approx(1.01) and bar.vertices[:, 1].mean() == pytest.approx(2.0, abs=0.2)
+    assert [label.get_text() for label in mice.get_yticklabels()] == ["mouse 1", "mouse 2", "mouse 3"]
+    assert mice.yaxis_inverted()  # mouse 1 is at the top
 
 
 def test_a_long_straight_path_takes_the_whole_width(tmp_path):

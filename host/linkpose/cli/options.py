@@ -103,7 +103,7 @@ class FiniteRange(click.FloatRange):
         return number
 
 
-FILE = click.Path(path_type=Path)
+FILE = click.Path(path_type=Path, readable=False)  # what cannot be read is a failure of its own, not wrong usage
 
 
 def port(function: Function) -> Function:

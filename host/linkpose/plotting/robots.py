@@ -240,15 +240,15 @@ def _mice_panel(track: DrawnTrack) -> Callable[[Axes], list[str]]:
 def _mice(axes: Axes, track: DrawnTrack) -> list[str]:
     """A bar for each stretch in which a mouse was left out."""
     bits = np.nan_to_num(track.values[EXCLUDED]).astype(np.int64)
-    shown = max(int(bits.max()).bit_length(), 1)
-    for mouse in range(min(shown, MAX_MICE)):
+    shown = min(max(int(bits.max()).bit_length(), track.mice), MAX_MICE)
+    for mouse in range(shown):
         out = (bits >> mouse & 1).astype(np.int8)
         edges = np.flatnonzero(np.diff(np.concatenate([[0], out, [0]]))).reshape(-1, 2)
         last = len(out) - 1
         bars = [(track.time_s[a], track.time_s[min(b, last)] - track.time_s[a]) for a, b in edges.tolist()]
         axes.broken_barh(bars, (mouse + 0.6, 0.8), color=line_style(track.name)["color"])
     axes.set_yticks(range(1, shown + 1), [f"mouse {mouse}" for mouse in range(1, shown + 1)])
-    axes.set_ylim(0.4, shown + 0.6)
+    axes.set_ylim(shown + 0.6, 0.4)  # mouse 1 at the top
     finish(axes, f"left out by {track.label}")
     return []
 

@@ -34,6 +34,7 @@ class DrawnTrack:
     time_s: Floats  # (N,)
     values: dict[Quantity, Floats]  # (N,) each
     std: dict[Quantity, Floats]
+    mice: int = 0  # of the rig; 0 where the file does not state it
 
     def has(self, *wanted: Quantity) -> bool:
         """Whether all of these have a value somewhere."""
@@ -141,7 +142,14 @@ def _track(table: Table, name: str, columns: dict[Quantity, str], file: int, sev
         if sigma in table.columns and not q.std:
             std[q] = _shown_value(table, sigma or "", q)
     label = f"{name} ({table.path.stem})" if several else name
-    return DrawnTrack(name, label, file, table.columns["time_s"], values, std)
+    return DrawnTrack(name, label, file, table.columns["time_s"], values, std, _mice(table))
+
+
+def _mice(table: Table) -> int:
+    """How many mice the rig of an estimate has."""
+    rig = table.metadata.get("rig")
+    mice = rig.get("mouse") if isinstance(rig, dict) else None
+    return len(mice) if isinstance(mice, list) else 0
 
 
 def _shown_value(table: Table, column: str, quantity: Quantity) -> Floats:
