@@ -124,7 +124,7 @@ def test_an_estimate_is_drawn_with_its_errors_along_the_way(floor, number: str, 
     assert np.allclose(heading.lines[0].get_ydata(), drawn.error_m)
     labels = [" ".join(axes.get_ylabel().split()) for axes in (position, heading)]
     assert labels == ["position error (cm)", "heading error (°)"]
-    assert heading.get_xlabel() == "way (m)"
+    assert heading.get_xlabel() == "distance travelled (m)"
     band = position.collections[0].get_paths()[0].get_extents()
     assert band.y1 == pytest.approx(2 * 2.0)  # 2σ in cm
     within = 100 * np.mean(drawn.error_m <= 2 * drawn.std_m)

@@ -120,7 +120,7 @@ def _estimate(number: str, path: ComparedPath, grid: GridMap, largest: tuple[flo
     _from_above(above)
     legend_above(above)
     _errors(position, heading, path, path.way_m, largest)
-    heading.set_xlabel("way (m)")
+    heading.set_xlabel("distance travelled (m)")
     figure.align_ylabels([position, heading])
     return figure
 
@@ -192,7 +192,7 @@ def _detail(axes: Axes, number: int, section: WaySection, paths: Sequence[Compar
         axes.plot(path.way_m[inside], 100 * path.error_m[inside], label=path.label, **style)
     errors = " and ".join(f"{100 * rms_within(path, section):.1f}" for path in paths)
     axes.set_title(f"{number}: {errors} cm rms", fontsize=SMALL_LETTERING, loc="left")
-    axes.set_xlabel("way (m)")
+    axes.set_xlabel("distance travelled (m)")
     finish(axes, "")
 
 
