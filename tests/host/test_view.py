@@ -137,6 +137,11 @@ def test_a_faulty_sensor_blanks_the_estimates_that_need_it_and_says_since_when()
     assert screen.render(pulled, 80, 24).plain == screen.render(health(), 80, 24).plain
 
 
+def test_a_difference_that_rounds_to_zero_has_no_sign() -> None:
+    rows = [{"joint": {quantities.HEIGHT: (1.5, 0.01)}, "tilt": {quantities.HEIGHT: (1.5 - 2e-5, 0.01)}}] * 9
+    assert screen_of("sim://link", 0.1, rows).render(health(), 80, 24).plain.endswith("1.0 cm    0.0 mm")
+
+
 def test_a_curve_ends_where_a_sensor_failed() -> None:
     """Filters predict on until the fault is found, and for a second more: the curve fell by a metre."""
     heights = [1.5 + 0.03 * (at % 2) - 0.1 * max(at - 60, 0) for at in range(80)]
@@ -276,7 +281,8 @@ def test_keys_a_resize_and_a_redirected_stdout_on_a_terminal(tmp_path: Path) -> 
         terminal.resize(52, 20)
         wide = "difference"
         text = terminal.until(lambda text: "HEIGHT" in text and "▸ tilt" in text and wide not in text)
-        assert text.count("HEIGHT") == text.count(" lost") == 1, text
+        assert text.count("HEIGHT") == text.count(" lost") == text.count("mark at ") == 1, text
+        assert text.startswith("Running: joint, tilt"), text
         terminal.press("q")
         assert terminal.wait() == 0, terminal.text
         assert "HEIGHT" not in terminal.text and terminal.text.count("lowest") == 1

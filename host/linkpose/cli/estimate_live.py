@@ -105,7 +105,9 @@ class _LiveRun:
         )
         several = len(estimator.filters) > 1
         legend = "m mark   " + "f next filter   " * several + "q stop"
-        self._view = View(estimator.columns, console.shows_progress, _title(board), legend if keys.are_read else "")
+        self._view = View(
+            estimator.columns, console.shows_progress, _title(board), legend if keys.are_read else "", console.reported
+        )
         self._exit.callback(self._view.close)
         if self._view.is_shown:
             self._exit.enter_context(console.through(self._view.report))

@@ -8,6 +8,7 @@ import shutil
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 Block = TypeVar("Block")
 
 PROGRESS_INTERVAL_S = 0.2
+MOST_REPORTED = 10  # lines that a view prints again after it has cleared a terminal that was resized
 
 
 def progress_width() -> int:
@@ -42,6 +44,7 @@ class Console:
         """`prints_rows`: rows go to stdout. On the same terminal, a progress line or a view would overwrite them."""
         self.is_quiet, self._verbose = quiet, verbose
         self.shows_progress = sys.stderr.isatty() and not quiet and not (prints_rows and sys.stdout.isatty())
+        self.reported: deque[str] = deque(maxlen=MOST_REPORTED)  # the latest lines
         self._width = 0
         self._shown_at = 0.0
         self._print: Callable[[str], object] = lambda text: click.echo(wrapped(text, sys.stderr), err=True)
@@ -53,7 +56,8 @@ class Console:
         """Prints a line."""
         self.clear()
         if not self.is_quiet:
-            self._print(printable(text))
+            self.reported.append(printable(text))
+            self._print(self.reported[-1])
 
     @contextlib.contextmanager
     def through(self, print_line: Callable[[str], None]) -> Iterator[None]:

@@ -326,6 +326,8 @@ def final_table(summary: Summary, width: int) -> list[str]:
 
 def _signed_length(metres: float) -> str:
     size = abs(metres)
+    if size < 5e-5:
+        return " 0.0 mm"  # without a sign, as an angle
     if size < 0.01:
         return minus(f"{1e3 * metres:+.1f} mm")
     return minus(f"{1e2 * metres:+.1f} cm" if size < 1 else f"{metres:+.2f} m")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import click
@@ -29,8 +29,14 @@ REDRAW_INTERVAL_S = 0.1
 class View:
     """The live view on stderr. If stderr is not a terminal it shows nothing, and imports nothing to show it with."""
 
-    def __init__(self, columns: Sequence[str], is_shown: bool, title: str, keys: str = "") -> None:
-        """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys."""
+    def __init__(
+        self, columns: Sequence[str], is_shown: bool, title: str, keys: str = "", reported: Iterable[str] = ()
+    ) -> None:
+        """`title` names the port and the settings worth a glance, such as J2S; `keys` is the line about keys.
+
+        `reported` has the latest lines above the view.
+        """
+        self._reported = reported
         self._screen = Screen(title, columns, keys)
         self._waiting: list[Floats] = []  # rows (N, columns) since the screen was drawn
         self._replaces_all = False  # whether they replace all rows before
@@ -115,6 +121,8 @@ class View:
         if self._live is not None:
             self._live.stop()
             self._live.console.clear()
+            for line in self._reported:
+                self.report(line)
             self._start()
 
     def close(self) -> None:
