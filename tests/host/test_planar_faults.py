@@ -171,10 +171,20 @@ def test_a_slip_in_turns_to_one_side_is_no_jump_of_the_gyro():
     assert math.degrees(heading_errors(run, out).max()) < 2.0
 
 
-def test_a_slip_that_grows_with_the_turn_rate_is_corrected_in_turns_only():
-    """What turns showed after the correction went into the scale on straights: worse than the ten lines."""
+def test_a_slip_that_grows_with_the_turn_rate_is_corrected_at_the_rate_of_each_turn():
+    """One factor for all turns made slow ones too long, and went into the scale on straights: hardly any better."""
     ours, theirs = np.linalg.norm([slipping(share_by_turn_rate, seed)[3:] for seed in DRIVES[:4]], axis=0)
-    assert ours < theirs
+    assert ours < 0.7 * theirs
+
+
+def test_two_of_three_mice_that_slip_in_turns_do_not_shorten_the_way():
+    """They outvote the sound one, but not the gyro: the path was 1.4 times as wrong as that of the ten lines."""
+    for seed in (20, 23, 24):
+        run = robot(seed, drawn_legs(seed))
+        seen = np.where((np.abs(run.turn_rate) > 0.2)[:, np.newaxis] & np.array([True, True, False]), 0.8, 1.0)
+        _, out, ratio = estimated(run, rig(), measurements(run, counts(run, seen=seen), gyro(run)))
+        assert ratio < 0.9
+        assert share_within(run, out)[0] > 0.85 and math.degrees(heading_errors(run, out).max()) < 0.6
 
 
 @pytest.mark.parametrize("share", [share_in_turns, everywhere])
@@ -216,15 +226,18 @@ def test_one_of_three_mice_whose_scale_drifts_is_no_jump_of_the_gyro(seed):
     assert math.degrees(heading_errors(run, out).max()) < 1.0
 
 
-@pytest.mark.parametrize("seed", [35, 37])
-def test_mice_that_lose_counts_at_low_speed_are_no_jump_of_the_gyro(seed):
-    """In turns, they lose one rate whatever the turn rate: it passed for two jumps, with the heading off by 165°."""
+@pytest.mark.parametrize("seed", [35, 103])
+def test_mice_that_lose_counts_at_low_speed_do_not_turn_the_heading(seed):
+    """In turns, they lose one rate whatever the turn rate: it passed for two jumps, with the heading off by 165°.
+
+    Later, the pose followed the calibration that such mice contradict: 1.2°, and 0.1 m in a turn on the spot.
+    """
     run = robot(seed, drawn_legs(seed))
     speed = [np.hypot(run.speed - run.turn_rate * y, run.turn_rate * x) for x, y in TRIANGLE]
     seen = np.interp(np.array(speed).T, [0.05, 0.25], [0.5, 1.0])
     filter_, out, _ = estimated(run, rig(), measurements(run, counts(run, seen=seen), gyro(run)))
     assert filter_.gyro_jumps.times == 0
-    assert math.degrees(heading_errors(run, out).max()) < 1.5 and share_within(run, out)[0] > 0.95
+    assert math.degrees(heading_errors(run, out).max()) < 0.6 and share_within(run, out)[0] > 0.95
 
 
 # ---- mice ----

@@ -91,6 +91,8 @@ def read_counts(state: Record, mice: Records, sample: Record) -> None:
         state.sound &= ~at_limit
     _exclude_stuck(state, mice)
     state.used = state.sound & ~state.excluded
+    if state.is_saturated and state.used == 0:  # lower bounds are better than nothing
+        state.used = state.sound
 
 
 @inner

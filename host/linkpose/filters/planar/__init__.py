@@ -2,8 +2,9 @@
 
 In each step from one reading of the mice to the next, the gyro measures ω + b, each mouse its own velocity, and a rest
 shows b. The pose then advances on the arc of the updated velocity. `state` lists the state, `measure` holds the
-measurement and the update, `linear` and `sigma` the moments of the two filters, `rest` the zero-rate updates. The fault
-tests are those of the `mice` filter, with this filter's calibration and bias.
+measurement and the update, `linear` and `sigma` the moments of the two filters, `rest` the zero-rate updates, `slip`
+what the mice lose of the way in turns. The fault tests are those of the `mice` filter, with this filter's calibration
+and bias.
 
 Angles, relative scales and positions of the mice follow from any drive with turns. Two things cannot be observed: the
 angle common to all mice, which defines "ahead", and their common scale beyond what the gyro and the positions of the

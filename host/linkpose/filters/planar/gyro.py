@@ -75,23 +75,27 @@ _REPAIR_SHARE = 0.3  # of a correction of the heading or the position: its σ
 
 
 @inner
-def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> None:
-    """Compare gyro and mice over the last step; correct bias and pose after a jump, the heading after a dead gyro."""
+def watch_gyro(state: Record, m: Record, mice: Records, p: Record) -> int:
+    """Compare gyro and mice over the last step; correct bias and pose after a jump, the heading after a dead gyro.
+
+    Returns 1 where `m.fit` and `m.fit_turn` are the motion by the mice alone, 0 where they rest, −1 without one.
+    """
     if not m.step > 0.0:
-        return
+        return -1
     motion = _motion_by_mice(state, m, mice, p)
     if motion < 0 or m.missed > 0.0 or m.is_saturated:
         if state.dispute.up == 0.0 and state.dispute.down == 0.0:
             agree(state)  # the update of the bias at a rest corrects the heading of the past in one pose only
         else:
             _advance_other(state, complex(state.at.vx, state.at.vy), state.at.wz, m.step + m.missed)
-        return
+        return -1
     _watch_dead_gyro(state, m, motion)
     turn_rate = m.fit_turn if motion else 0.0
     _advance_other(state, m.fit if motion else 0j, turn_rate, m.step)
     if math.isfinite(m.mean_rate):
         _watch_resolution(state, m, turn_rate)
         _add_step(state, m, mice, turn_rate, motion)
+    return motion
 
 
 @inner

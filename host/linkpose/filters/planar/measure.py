@@ -10,7 +10,7 @@ import math
 from linkpose.compiling import inner
 from linkpose.filters.mice.plane import scaled, turned
 from linkpose.filters.mice.state import Floats, Record, Records
-from linkpose.filters.planar.state import BIAS
+from linkpose.filters.planar.state import BIAS, HEADING, VX, X
 
 # Residual motion at rest: m/s and rad/s. Doubled: no visible change.
 _REST_M_S, _REST_RAD_S = 1e-4, 1e-5
@@ -75,12 +75,14 @@ def compare(state: Record, rate: float) -> None:
 
 
 @inner
-def update(state: Record, limit: float, plausible: float) -> bool:
+def update(state: Record, limit: float, plausible: float, is_calibrating: bool) -> bool:
     """x += C S⁻¹ (z − ẑ), P −= C S⁻¹ Cᵀ, by elimination row by row. False where S is not positive definite.
 
     Where the χ² of the innovation exceeds `limit`, only the first `state.always` rows count; `state.rows` is then set
-    to their number. Where it exceeds `plausible`, bias and calibration keep their values and their covariance (a
-    Schmidt-Kalman update): a lift or a slip is no error of the calibration.
+    to their number. The velocity is always updated, the position if χ² is below `plausible`, bias, calibration and
+    heading if it is and `is_calibrating`; the rest keeps its value and its covariance (a Schmidt-Kalman update). A lift
+    or a slip is no error of the calibration, nor of the pose, which would follow the calibration by its covariance with
+    it. After a time without mice, the position is updated in any case: the first velocity shows how far the robot went.
     """
     n, x, p = state.size, state.mean, state.covariance
     r, s, c = state.residual, state.innovation, state.cross
@@ -100,15 +102,23 @@ def update(state: Record, limit: float, plausible: float) -> bool:
                 c[below, k] -= share * cross[k]
     if state.chi2 > limit:
         state.rows = state.always
-    learned = n if state.chi2 <= plausible else BIAS
+    first, end, held = VX, BIAS, HEADING
+    if state.chi2 <= plausible:
+        first, end = X, n if is_calibrating else BIAS
+        held = n if is_calibrating else HEADING
+    elif state.is_blind:
+        first = X
     for row in range(state.rows):
         cross = c[row]
         weight = 1.0 / s[row, row]
         for i in range(n):
             share = weight * cross[i]
-            if i < learned:
+            is_learned = first <= i < end and i != held
+            if is_learned:
                 x[i] += share * r[row]
-            for k in range(min(i + 1, learned)):
-                p[i, k] -= share * cross[k]
-                p[k, i] = p[i, k]
+            for k in range(i + 1):
+                if is_learned or (first <= k < end and k != held):
+                    p[i, k] -= share * cross[k]
+                    p[k, i] = p[i, k]
+    state.is_blind = state.rows == state.always and not state.at_rest
     return True

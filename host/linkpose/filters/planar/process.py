@@ -25,6 +25,7 @@ from linkpose.filters.planar.gyro import (
 from linkpose.filters.planar.limit import watch_limit
 from linkpose.filters.planar.measure import arm, update
 from linkpose.filters.planar.rest import watch_rest
+from linkpose.filters.planar.slip import correct_slip
 from linkpose.filters.planar.snapping import snapped_std, watch_snapping
 from linkpose.filters.planar.state import ANGLE, BIAS, HEADING, MICE, OF_MOUSE, POSITION, SCALE, VX, VY, WZ, X, Y
 
@@ -54,9 +55,9 @@ _RATE_CHANGE_RAD_S2 = 4.0
 # (rad²/s), forgotten after so long (s). Halving the share takes scale errors of the gyro for floors. A larger share
 # than the second one is no floor but a slip or a lift.
 _FLOOR_Z, _FLOOR_SHARE, _FLOOR_MOST, _FLOOR_TURN, _FLOOR_MEMORY_S = 4.0, 0.015, 0.2, 0.5, 30.0
-# The difference is accepted with this share of it as σ. Doubled: where all mice lose more in faster turns, what they
-# lose after that goes into their scale on straights. Halved: a floor of which a turn has shown too little stays so.
-_FLOOR_STD = 0.1
+# The difference is accepted with this share of it as σ. Tripled: where all mice lose more in faster turns, what they
+# lose after that goes into their scale on straights. What a turn has shown too little of it, `slip` corrects.
+_FLOOR_STD = 0.03
 # Another floor shows in two turns in a row, each of at least this much turning (rad²/s), equal within this share.
 # A turn ends below this rate (rad/s). A slip lasts for one turn. Doubled: a floor is found later. Doubled share: a
 # floor that varies is taken for another one.
@@ -423,7 +424,7 @@ def _correct(state: Record, tangent: Records, points: Records, rig: Records, m: 
     before = complex(state.at.vx, state.at.vy)
     is_calibrating = not (is_undecided(state) or state.is_off or m.is_saturated or state.snapped)
     is_patient = state.refused_s < _PATIENCE_S and not state.unconfirmed_s > 0.0
-    if not update(state, limit if is_patient else math.inf, limit if is_calibrating else 0.0):
+    if not update(state, limit if is_patient else math.inf, limit, is_calibrating):
         return False
     _watch_jump(state, m, before, dt)
     state.refused_s = state.refused_s + dt if state.chi2 > limit else 0.0
@@ -595,7 +596,7 @@ def _step(
     watch_limit(state, m, mice)
     watch_acceleration(state, m, mice, sample.accel)
     _watch_floor(state, m, mice)
-    watch_gyro(state, m, mice, p)
+    correct_slip(state, m, mice, rig, watch_gyro(state, m, mice, p))
     _calibrate(state, m, mice, rig)
 
 

@@ -195,5 +195,5 @@ def _use_oldest(state: Record) -> None:
     state.innovation[0, 0] = variance
     for k in range(state.size):
         state.cross[0, k] = state.covariance[BIAS, k]
-    update(state, math.inf, math.inf)
+    update(state, math.inf, math.inf, True)
     state.since_rest_s = 0.0

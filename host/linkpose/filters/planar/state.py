@@ -172,6 +172,13 @@ _FIELDS = [
     ("grip", "f8"),  # the same in the current step: 1 on a straight
     ("straight_std", "f8"),  # of the scale on straights, as a share, by what the turns do not show of it
     ("straight_way", "c16"),  # way on straights at this scale, in n (m)
+    # Share of the gyro's turn that the mice show now, see `slip`: forgetting sums.
+    ("slip_judges", "i8"),  # bit mask of the mice that are compared
+    ("slip_s", "f8"),  # time (s)
+    ("slip_turn", "f8"),  # turn by the gyro (rad)
+    ("slip_shown", "f8"),  # by the mice (rad)
+    ("slip_placed", "f8"),  # by the mice calibrated and placed as in the rig (rad)
+    ("slip_variance", "f8"),  # of the turn by the mice (rad²)
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
     ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
@@ -198,6 +205,7 @@ _FIELDS = [
     ("rows", "i8"),
     ("always", "i8"),  # rows that count whatever the innovation
     ("seen_by", "i8"),  # bit mask
+    ("is_blind", "?"),  # whether no mouse counted in the last update
     ("has_snapping", "?"),  # whether a mouse has been found that snaps to its axes
     ("snapped", "i8"),  # bit mask of mice whose last counts were snapped to an axis
     ("rate_variance", "f8"),  # of the gyro's mean rate ((rad/s)²)
