@@ -17,6 +17,8 @@ from linkpose.localization.distance_field import COUNT_M, FARTHEST_M, DistanceFi
 from linkpose.localization.doubts import scan_doubts, with_doubtful_clock
 from linkpose.localization.events import Event, Log, Scan
 from linkpose.localization.grid import OCCUPIED, UNKNOWN, GridMap
+from linkpose.localization.hypotheses import INCUMBENT, Contest, Hypothesis
+from linkpose.localization.kalman import UNICYCLE, KalmanFilter
 from linkpose.localization.localizer import estimate_track
 from linkpose.localization.map_check import check_map
 from linkpose.localization.paths import Paths, localize
@@ -314,6 +316,43 @@ def test_a_robot_that_was_carried_is_found_again(drive):
     assert track.relocated >= 1
     true = np.interp(track.time_s[-1] - shift, other.time_s, other.pose[:, 0])
     assert track.known[-1] and abs(track.state[-1, 0] - true) < 0.2
+
+
+def test_a_robot_that_was_carried_into_a_room_where_only_one_wall_is_as_before_is_missed() -> None:
+    """All other beams ended in free space of the hall, as at people: it was followed there for good, in silence."""
+    blocked = np.full((80, 120), UNKNOWN, np.uint8)
+    blocked[0:80, 0:62] = blocked[9:45, 79:107] = OCCUPIED
+    blocked[1:79, 1:61] = blocked[10:44, 80:106] = 0
+    blocked[10:16, 80:88] = blocked[36:44, 100:106] = OCCUPIED
+    grid = GridMap(blocked, np.array([0.1, 0.0, 0.0, 0.0]))
+    hall = [(1.2 + 0.05 * i, 4.0, 0.3 * i) for i in range(5)]
+    room = [(9.2, 2.7, 1.5 + 0.3 * i) for i in range(14)]
+    log: Log = [*scans_from(grid, [*hall, *room]), *(Event(0.1 * i, "odometry", (0.0, 0.3)) for i in range(190))]
+    track = estimate_track(sorted(log, key=lambda e: e.time_s), "scan-match", Settings(start=hall[0]), grid)
+    assert track.relocated == 1
+    late = track.time_s > 5.0 + 9.0
+    assert np.hypot(*(track.position_m[late, :2] - room[0][:2]).T).max() < 0.1
+
+
+def test_people_around_a_carried_robot_do_not_delay_the_decision_in_a_map_that_is_right() -> None:
+    """Three of ten beams end at people. In an old map, where the rest fits no better, a wrong place could win."""
+    at = KalmanFilter("ekf", UNICYCLE, np.zeros(3), np.eye(3), np.eye(2))
+
+    def scans_until_decided(is_right: bool, of_seen: float) -> int:
+        poses = [np.array((5.0 * i, 0.0, 0.0)) for i in range(3)]
+        filters = [replace(at, state=pose) for pose in poses]
+        tracked = Hypothesis(filters[2], poses[2], INCUMBENT, True)
+        contest = Contest([*map(Hypothesis, filters[:2], poses[:2]), tracked], is_right)
+        for count in range(1, 40):
+            each = [{0: -4.0, 5: -6.0, 10: -14.0}[round(one.first[0])] for one in contest.hypotheses]
+            if contest.judge(each, [of_seen] * len(each)):
+                assert contest.hypotheses[0].first[0] == 0.0
+                return count
+            contest.moved(0.3, 0.0)
+        return 40
+
+    assert scans_until_decided(True, -0.1) == 7
+    assert scans_until_decided(False, -0.1) == scans_until_decided(True, -4.0) == 40
 
 
 def test_monte_carlo_localization_is_seeded(drive):

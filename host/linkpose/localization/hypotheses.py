@@ -29,21 +29,24 @@ LEAD_SHARE, HOPELESS_SHARE = 0.5, 0.75
 # Scans from one place repeat each other: a scan counts when the robot has moved this far (m) or turned (rad) since the
 # last one that counted. SCANS must count before one decides: a single scan may fit two corridors alike.
 COUNTS_AFTER_M, COUNTS_AFTER_RAD = 0.2, 0.2
-# Against a tracked pose more are required: in an old map, a wrong place can fit better for two metres.
-SCANS, SCANS_AGAINST_INCUMBENT = 4, 10
+# Against a tracked pose more are required: in an old map, a wrong place can fit better for two metres. Fewer do once
+# the tracked pose is hopeless.
+SCANS, SCANS_AGAINST_INCUMBENT, SCANS_WITHOUT_INCUMBENT = 4, 10, 6
 
 
 @dataclass(slots=True)
 class Hypothesis:
     """A filter and the log-likelihood of the scans that it has explained; `is_incumbent` if it was tracked before.
 
-    `first` (3,) is the pose with which it entered the contest.
+    `first` (3,) is the pose with which it entered the contest. `misfit` is the negative log-likelihood without the
+    beams that end in free space.
     """
 
     filter: KalmanFilter
     first: Floats
     score: float = 0.0
     is_incumbent: bool = False
+    misfit: float = 0.0
 
     def is_near(self, other: Hypothesis) -> bool:
         """Whether both are one pose."""
@@ -53,10 +56,12 @@ class Hypothesis:
 
 
 class Contest:
-    """Hypotheses until one wins."""
+    """Hypotheses until one wins. In a map that `is_right`, as scans have shown, what does not fit the best of them is
+    people: differences do not grow with these.
+    """
 
-    def __init__(self, hypotheses: list[Hypothesis]) -> None:
-        self.hypotheses = hypotheses
+    def __init__(self, hypotheses: list[Hypothesis], is_right: bool = False) -> None:
+        self.hypotheses, self.is_right = hypotheses, is_right
         self.required = SCANS_AGAINST_INCUMBENT if self.incumbent else SCANS
         self.scans = 0
         self.moved_m = self.turned_rad = 0.0
@@ -88,14 +93,18 @@ class Contest:
         self.moved_m += abs(distance_m)
         self.turned_rad += abs(turn_rad)
 
-    def judge(self, log_likelihoods: list[float]) -> Hypothesis | None:
-        """Scores, drops and merges hypotheses after a scan; returns the winner, if there is one."""
+    def judge(self, log_likelihoods: list[float], seen: list[float]) -> Hypothesis | None:
+        """Scores, drops and merges hypotheses after a scan; returns the winner, if there is one.
+
+        `seen` are the log-likelihoods without the beams that end in free space.
+        """
         if self.scans == 0 or self.moved_m > COUNTS_AFTER_M or self.turned_rad > COUNTS_AFTER_RAD:
             self.scans, self.moved_m, self.turned_rad = self.scans + 1, 0.0, 0.0
-            for hypothesis, log_likelihood in zip(self.hypotheses, log_likelihoods, strict=True):
+            for hypothesis, log_likelihood, of_seen in zip(self.hypotheses, log_likelihoods, seen, strict=True):
                 hypothesis.score += log_likelihood
+                hypothesis.misfit -= of_seen
         ranked = sorted(self.hypotheses, key=lambda hypothesis: -hypothesis.score)
-        misfit = max(0.0, -ranked[0].score)
+        misfit = max(0.0, ranked[0].misfit if self.is_right else -ranked[0].score)
         self.lead, hopeless = max(LEAD, LEAD_SHARE * misfit), max(HOPELESS, HOPELESS_SHARE * misfit)
         kept: list[Hypothesis] = []
         for hypothesis in ranked:
@@ -107,6 +116,8 @@ class Contest:
         self.hypotheses = kept
         if len(kept) == 1 and kept[0].is_incumbent:
             return kept[0]
+        if self.incumbent is None:
+            self.required = min(self.required, SCANS_WITHOUT_INCUMBENT)
         if self.scans >= self.required and (len(kept) == 1 or kept[0].score > kept[1].score + self.lead):
             return kept[0]
         return None
