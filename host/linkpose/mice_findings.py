@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from linkpose.estimation import Estimator
 
 _LONG_S = 5.0  # longer than robots slip or are carried
+_GYRO_SCALE = 0.045  # share below which it may be the gyro's scale, as in the planar filters
 _SHORTEST_S = 0.2  # of exclusions that are reported: a late packet excludes a mouse for a sample
 
 
@@ -31,13 +32,23 @@ def mice_findings(estimator: Estimator) -> Iterator[str]:
         )
     yield from estimator.mice_remarks
     if estimator.mice_scale:
-        factor, std = estimator.mice_scale
-        change = "more" if factor > 1 else "fewer"
-        yield (
-            f"in turns, the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig "
-            "file states, compared with the gyro: either they slip in turns, or the floor is another one; for that "
-            "one, type `linkpose calibrate mice`"
+        yield _share_of_turns(*estimator.mice_scale)
+
+
+def _share_of_turns(factor: float, std: float) -> str:
+    """All mice turn by another share than the gyro."""
+    if abs(factor - 1.0) < _GYRO_SCALE:
+        return (
+            f"in turns, gyro and mice differ by {100 * abs(factor - 1):.1f} ± {100 * std:.1f} %: the gyro's scale is "
+            "off (its data sheet allows 3 %), the mice slip in turns, or the floor is another one. Turns do not show "
+            "which, and σ includes each of them; for another floor, type `linkpose calibrate mice`"
         )
+    change = "more" if factor > 1 else "fewer"
+    return (
+        f"in turns, the mice count {100 * abs(factor - 1):.1f} ± {100 * std:.1f} % {change} per metre than the rig "
+        "file states, compared with the gyro: either they slip in turns, or the floor is another one; for that "
+        "one, type `linkpose calibrate mice`"
+    )
 
 
 def _excluded(estimator: Estimator) -> Iterator[str]:

@@ -370,6 +370,10 @@ REMARKS: dict[str, str | Producer] = {
     "mouse … is … mm from its place in the rig file: the turns show it at x_m = …, y_m = …": reported(
         moved_mice=[SimpleNamespace(mouse=2, off_m=0.03, x_m=0.1, y_m=0.0)]
     ),
+    "over all turns, gyro and mice differ by … %: the gyro's scale is off (its data sheet allows 3 %), the mice slip in turns, or the floor is another one. Turns do not show which, and σ includes each of them": "test_planar_faults.py::test_a_gyro_whose_scale_is_off_is_named_and_in_sigma",
+    "in turns, gyro and mice differ by … ± … %: the gyro's scale is off (its data sheet allows 3 %), the mice slip in turns, or the floor is another one. Turns do not show which, and σ includes each of them; for another floor, type linkpose calibrate mice": reported(
+        mice_scale=(1.03, 0.001)
+    ),
     "in turns, the mice count … ± … % … per metre than the rig file states, compared with the gyro: either they slip in turns, or the floor is another one; for that one, type linkpose calibrate mice": reported(
         mice_scale=(1.05, 0.001)
     ),
@@ -377,7 +381,7 @@ REMARKS: dict[str, str | Producer] = {
     "the gyro states the reverse of the turns that the mice show: its z axis must point up": "test_planar_faults.py::test_a_gyro_that_is_upside_down_is_named",
     "the mice show no speed above … m/s, where gyro or accelerometer show more: this is the limit of their sensors. Where the robot was faster, the path is too short, and the σ of the position includes it. Drive slower, or use mice for higher speeds": "test_planar_faults.py::test_a_speed_limit_of_all_mice_shows_in_bends_and_widens_the_position",
     "in two turns in a row, all mice count … times as much as before, found at … s by the gyro: their resolution was switched, or they slip in turns": "test_planar_faults.py::test_another_resolution_of_all_mice_is_found_in_two_turns",
-    "from turn to turn, the mice show … % more or less than the gyro: they slip, or the floor changes. The σ of the position includes this share of the way": "test_planar_faults.py::test_slips_in_some_turns_widen_the_position",
+    "from turn to turn, the mice show … % more or less than the gyro: they slip, the floor changes, or the gyro's scale is off. The σ of the position includes this share of the way": "test_planar_faults.py::test_slips_in_some_turns_widen_the_position",
     "…: readings without counts during motion; the report rate is lower than the sample rate. The motion between two reports is interpolated": "test_planar_faults.py::test_mice_that_report_at_40_hz_are_used",
     "…: single counts while the robot rests. They are not taken for motion. Check the surface": "test_planar_faults.py::test_one_count_in_a_second_does_not_end_a_rest",
     "…: no counts across an axis while the motion is almost along the other one (angle snapping). In bends, the position is less accurate. Use mice without this function": "test_planar_faults.py::test_mice_that_snap_to_their_axes_do_not_spoil_the_path",

@@ -9,7 +9,7 @@ and bias.
 Angles, relative scales and positions of the mice follow from any drive with turns. Two things cannot be observed: the
 angle common to all mice, which defines "ahead", and their common scale beyond what the gyro and the positions of the
 mice show. Another floor, which changes the scale of all mice, is recognised when the robot turns. An error of the
-gyro's own scale is not observable; it is not in the standard deviation of the heading.
+gyro's own scale is not observable. Where it may explain the turns of the mice, it is in the standard deviations.
 
 Source: [Thesis], equations (1)-(17); [Mice], (6), (7).
 """
@@ -52,6 +52,7 @@ _WIDTH = ESTIMATE.itemsize // np.dtype(np.float64).itemsize
 _COLUMNS = ("x_m", "y_m", "heading_rad", "vx_m_s", "vy_m_s", "wz_rad_s")
 
 
+_SCALE_LEAST = 0.01  # another scale of the mice is reported from here on
 _SPREAD = 0.02  # of the share of the turns that the mice show: reported from here on
 # A mouse is reported as snapping to its axes after so many readings, as creeping after so many counts at rest, and as
 # slow from this share of missing reports on.
@@ -170,10 +171,17 @@ class _PlanarFilter:
                 f"in two turns in a row, all mice count {state.resolution.factor:.2f} times as much as before, found "
                 f"at {state.resolution.time:.1f} s by the gyro: their resolution was switched, or they slip in turns"
             )
+        if state.gyro_std > 0.0 and abs(self.scale_change[0] - 1.0) < _SCALE_LEAST:  # else the scale is reported
+            yield (
+                f"over all turns, gyro and mice differ by {100 * abs(state.all_product / state.all_square - 1):.1f} %: "
+                "the gyro's scale is off (its data sheet allows 3 %), the mice slip in turns, or the floor is another "
+                "one. Turns do not show which, and σ includes each of them"
+            )
         if state.turn_spread > _SPREAD**2:
             yield (
                 f"from turn to turn, the mice show {100 * math.sqrt(state.turn_spread):.0f} % more or less than the "
-                "gyro: they slip, or the floor changes. The σ of the position includes this share of the way"
+                "gyro: they slip, the floor changes, or the gyro's scale is off. The σ of the position includes this "
+                "share of the way"
             )
 
     def _remarks_on_each(self) -> Iterator[str]:

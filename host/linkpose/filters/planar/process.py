@@ -535,6 +535,7 @@ def _scatter_way(state: Record, m: Record, p: Record, q: Record, dt: float, miss
         length = dt * math.sqrt(speed2)
         way = scaled(dt, turned(unit(state.at.heading), complex(state.at.vx, state.at.vy)))
         widen_way(state, q.slip * math.sqrt(q.slip_m / length), way)
+        state.swept += scaled(state.at.heading, complex(-way.imag, way.real))
         if not is_turning(state, m):
             state.straight_way += way
 
@@ -627,14 +628,16 @@ def _show(state: Record, m: Record, mice: Records, time_s: float, out: Record) -
     lag = since + (0.5 * m.interval if math.isfinite(m.interval) else 0.0)
     by_scale, by_angle = _common_errors(state, m, mice)
     other = state.dispute.position - complex(at.x, at.y)
-    straight = scaled(state.straight_std, state.straight_way)
+    straight, swept = scaled(state.straight_std, state.straight_way), scaled(state.gyro_std, state.swept)
     spread, last = state.turn_spread, complex(at.x, at.y) - state.turn_end
     x_variance = by_scale * out.x**2 + by_angle * out.y**2 + other.real**2 + straight.real**2
-    x_variance += spread * last.real**2
+    x_variance += spread * last.real**2 + swept.real**2
     y_variance = by_scale * out.y**2 + by_angle * out.x**2 + other.imag**2 + straight.imag**2
-    y_variance += spread * last.imag**2
+    y_variance += spread * last.imag**2 + swept.imag**2
     out.x_std, out.y_std = _std(state, X, since, math.sqrt(x_variance)), _std(state, Y, since, math.sqrt(y_variance))
-    out.heading_std = _std(state, HEADING, since, state.dispute.heading - at.heading)
+    out.heading_std = _std(
+        state, HEADING, since, abs(state.dispute.heading - at.heading) + state.gyro_std * abs(at.heading)
+    )
     out.vx_std, out.vy_std = _std(state, VX, since, _ACCEL_M_S2 * lag), _std(state, VY, since, _ACCEL_M_S2 * lag)
     out.wz_std = _std(state, WZ, since, _ANGULAR_RAD_S2 * lag)
 

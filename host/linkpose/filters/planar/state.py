@@ -179,6 +179,11 @@ _FIELDS = [
     ("slip_shown", "f8"),  # by the mice (rad)
     ("slip_placed", "f8"),  # by the mice calibrated and placed as in the rig (rad)
     ("slip_variance", "f8"),  # of the turn by the mice (rad²)
+    # The gyro's scale.
+    ("all_square", "f8"),  # ∫ ω² dt of all turns of the gyro (rad²/s)
+    ("all_product", "f8"),  # ∫ ω ω_mice dt, with the mice as the rig states them (rad²/s)
+    ("gyro_std", "f8"),  # σ of the gyro's scale, as a share
+    ("swept", "c16"),  # ∂(x + jy) / ∂(the gyro's scale) (m)
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
     ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
