@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.table import Table
 from terminal import Terminal
 
 import linkpose as lp
@@ -21,7 +22,7 @@ from linkpose.cli.characters import replacement
 from linkpose.cli.curve import Canvas, curve, path_map, time_axis
 from linkpose.cli.keys import Keys, Marker
 from linkpose.cli.live import health_line, progress_line
-from linkpose.cli.rendering import wrapped
+from linkpose.cli.rendering import show_table, wrapped
 from linkpose.cli.screen import Screen, final_table
 from linkpose.estimation import Estimator
 from linkpose.extremes import Extremes
@@ -498,6 +499,17 @@ def test_a_recording_ends_in_a_table_on_a_terminal(tmp_path: Path, linkpose: Cal
 class _Tty(io.StringIO):
     def isatty(self) -> bool:
         return True
+
+
+@pytest.mark.parametrize(("width", "most"), [(120, 80), (78, 78), (72, 72)])
+def test_a_table_is_as_wide_as_the_terminal(width: int, most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table of a robot was 2 characters wider than a terminal of 80: each of its lines broke."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setattr("sys.stdout", shown := _Tty())
+    table = Table(*(f"column {at}" for at in range(7)))
+    table.add_row(*"1234567")
+    show_table(table)
+    assert max(map(len, re.sub(r"\x1b\[[0-9;]*m", "", shown.getvalue()).splitlines())) <= most
 
 
 def test_sentences_break_between_words_on_a_terminal_alone(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,7 +55,12 @@ def wrapped(text: str, stream: TextIO) -> str:
 
 
 def show_table(table: Table) -> None:
-    """Prints a table below its title. It is never cut: a narrow terminal wraps its lines, a file gets whole ones."""
+    """Prints a table below its title.
+
+    On a narrow terminal it has fewer lines and spaces between its columns. It is never cut: a terminal that is narrower
+    still wraps its lines, a file gets whole ones.
+    """
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
 
     class SafeConsole(Console):
@@ -63,7 +68,11 @@ def show_table(table: Table) -> None:
             return super().render_str(fitting(printable(text), sys.stdout.encoding), **options)
 
     console = SafeConsole(file=unfiltered(sys.stdout))
+    terminal_width = console.width if sys.stdout.isatty() else _TABLE_WIDTH
     console.width = max(console.width, _TABLE_WIDTH)
+    for box in (SIMPLE_HEAD, None):
+        if console.measure(table).maximum > terminal_width:
+            table.box, table.show_edge, table.pad_edge, table.padding = box, False, False, (0, 1, 0, 0)
     title, table.title = table.title, None  # above the table, rich would wrap it at the table's width
     if title:
         console.print(title, highlight=False)
