@@ -54,6 +54,11 @@ def wrapped(text: str, stream: TextIO) -> str:
     )
 
 
+def show_text(text: str) -> None:
+    """Prints sentences; a terminal breaks them between words."""
+    click.echo(wrapped(text, sys.stdout))
+
+
 def show_table(table: Table) -> None:
     """Prints a table below its title.
 
@@ -105,13 +110,13 @@ def show_experiment(
     from linkpose.experiments.variants import remark
 
     click.echo("\n\n".join(as_table(table) for table in tables))
-    click.echo("\n".join(["", "Claims of the thesis:", *(one.text for one in verdicts if one.table)]))
+    show_text("\n".join(["", "Claims of the thesis:", *(one.text for one in verdicts if one.table)]))
     further = [one.text for one in verdicts if not one.table]
     if further:
-        click.echo("\n".join(["", "Comparisons that the thesis does not make:", *further]))
+        show_text("\n".join(["", "Comparisons that the thesis does not make:", *further]))
     note = remark(seeds)
     if note:
-        click.echo(f"\n{note}")
+        show_text(f"\n{note}")
 
 
 def files_of_figures(place: Path | None, whole: str, numbers: Sequence[str], force: bool) -> dict[str, Path]:

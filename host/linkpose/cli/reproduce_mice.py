@@ -46,7 +46,7 @@ def command(seeds: int, plot_path: Path | None, force: bool, json_lines: bool, q
 def _show(rows: list[Redundancy], seeds: int) -> None:
     from rich.table import Table
 
-    from linkpose.cli.rendering import show_table
+    from linkpose.cli.rendering import show_table, show_text
 
     table = Table(
         "", "mice", title=f"Noise of the estimated velocity compared with one mouse, {counted(seeds, 'seed')}"
@@ -59,7 +59,7 @@ def _show(rows: list[Redundancy], seeds: int) -> None:
         table.add_row(row.quantity, str(row.mice), *values, f"{row.theory_ratio:.3f}")
     show_table(table)
     best = [1 - row.ratio for row in rows if row.mice == 3]
-    click.echo(
+    show_text(
         f"Three mice reduce the error by {100 * sum(best) / len(best):.0f} %. The paper reads about 30 % from its "
         "Figures 2 and 3; least squares predicts 1 − 1/√3 = 42 %."
     )
