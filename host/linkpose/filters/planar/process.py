@@ -104,7 +104,7 @@ def _move_on(state: Record, p: Record, dt: float) -> None:
     _decay(state, VY, p.speed_m_s, keep)
     _decay(state, WZ, p.turn_rad_s, math.exp(-dt / p.turn_s))
     cov = state.covariance
-    cov[BIAS, BIAS] += p.bias_walk**2 * dt
+    cov[BIAS, BIAS] += (p.bias_walk**2 + 2.0 * state.drift2 * state.since_rest_s) * dt
     for at in range(MICE, state.size, OF_MOUSE):
         cov[at + SCALE, at + SCALE] += p.scale_walk**2 * dt
         cov[at + ANGLE, at + ANGLE] += p.angle_walk**2 * dt

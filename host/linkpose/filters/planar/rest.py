@@ -27,6 +27,9 @@ _NEW_BIAS_S = 2.0
 _LARGEST_RAD_S = 0.45
 _UNSEEN_S = 10.0  # for at most so long a jump of the bias stays unnoticed while the robot moves (s)
 _DRIFTED_Z = 5.0  # a change of the bias by more standard deviations is a drift. Doubled: small jumps stay unnoticed
+# A bias that changes with the temperature: between two rests at least so far apart (s), by more standard deviations
+# than this. The last interval has this weight in the drift. Doubled: an interval without a drift ends it.
+_DRIFT_S, _DRIFT_Z, _DRIFT_NEW = 3.0, 2.0, 0.5
 _GUARD_Z = 5.0  # standard normal quantile of the guards
 # A block that differs from those after it by so many σ is dropped: the robot came to rest in it, by turning less than a
 # count. Doubled: the bias takes up part of such a turn.
@@ -39,6 +42,7 @@ _NOISE_MARGIN = 9.0
 def watch_rest(state: Record, is_silent: bool, rate: float, step: float, time_s: float) -> None:
     """Take one reading into account: `is_silent` when no mouse counted, `rate` (rad/s) the gyro's, NaN without one."""
     state.since_rest_s += step
+    state.rested_s += step
     if not is_silent:
         _end_rest(state)
         return
@@ -67,6 +71,7 @@ def _contradicts(state: Record, rate: float) -> bool:
 def _end_rest(state: Record) -> None:
     """The robot has begun to turn, perhaps up to QUEUE blocks ago: in this time, the gyro shows the turn."""
     if state.at_rest:
+        _learn_drift(state)
         turn, span, count = state.block_sum, state.block_s, state.block_count
         turn = turn * span / count if count > 0 else 0.0
         variance = span * span / count if count > 0 else 0.0
@@ -171,6 +176,20 @@ def _drop_oldest(state: Record) -> None:
         to, block = state.queue[k - 1], state.queue[k]
         to.mean, to.count, to.squares = block.mean, block.count, block.squares
     state.queued -= 1
+
+
+@inner
+def _learn_drift(state: Record) -> None:
+    """Rate of the bias's drift (its square) from the change of the bias since the end of the last rest."""
+    variance = state.covariance[BIAS, BIAS]
+    if state.rested_s > _DRIFT_S:
+        off2 = (state.at.bias - state.rested_bias) ** 2
+        is_drift = state.rested_variance > 0.0 and off2 > _DRIFT_Z**2 * (variance + state.rested_variance)
+        shown = off2 / (state.rested_s * state.rested_s) if is_drift else 0.0
+        unknown = max(0.0, shown - state.drift2)  # the heading since then has turned by a drift that σ did not include
+        state.covariance[HEADING, HEADING] += 0.25 * unknown * state.rested_s**4
+        state.drift2 += _DRIFT_NEW * (shown - state.drift2)
+    state.rested_s, state.rested_bias, state.rested_variance = 0.0, state.at.bias, variance
 
 
 @inner

@@ -185,6 +185,10 @@ _FIELDS = [
     ("gyro_std", "f8"),  # σ of the gyro's scale, as a share
     ("swept", "c16"),  # ∂(x + jy) / ∂(the gyro's scale) (m)
     ("dead_turn", "f8"),  # turn of the mice beyond a gyro that repeats one value (rad)
+    ("rested_s", "f8"),  # time since the end of the last rest (s)
+    ("rested_bias", "f8"),  # bias then (rad/s)
+    ("rested_variance", "f8"),  # and its variance ((rad/s)²)
+    ("drift2", "f8"),  # square of the bias's drift, as the rests show it ((rad/s²)²)
     ("since_rest_s", "f8"),  # time since the bias was last seen at a rest (s)
     ("strange_s", "f8"),  # how long a silent robot's gyro has shown one rate that is not its bias (s)
     ("strange", "f8"),  # that rate (rad/s)
