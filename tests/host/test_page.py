@@ -512,6 +512,27 @@ def test_each_update_has_the_newest_row_and_some_have_the_charts() -> None:
     assert np.subtract(array(high), array(low)) == pytest.approx(0.08 * np.ones(19), rel=1e-4)
 
 
+def test_charts_end_where_a_filter_lost_its_sensor() -> None:
+    """What it predicts after that is blank in numbers, too."""
+    rows, sent = link_rows(40), []
+    with Page(LINK, Rig().with_j2s(J2S_M), "sim://link") as page:
+        page._has_ended = True
+        page._redraw()
+        page._server.get_clients = lambda: {7: None}  # type: ignore[method-assign, dict-item]
+        browser = connection(lambda: 0, lambda frame: sent.append(decoded(frame[4 if frame[1] == 126 else 10 :])))
+        page._changes._socket._live_connections = {7: browser}
+        page.show(rows, status())
+        failed = status(imu="silent")()
+        assert failed.health is not None
+        failed.health.sensors["imu"]["since_s"], failed.health.duration_s = rows[25, 0], rows[-1, 0]  # type: ignore[misc]
+        page.show(rows[-1] + np.array([0.05, *[0.0] * 6]), lambda: failed)
+        page.show(np.empty(0), lambda: failed)
+        page._update()
+        ((messages, _),) = sent
+        _, _, _, height = next(m["updates"]["data"] for m in messages if "data" in str(m))
+    assert height[:25] == pytest.approx(rows[:25, 1]) and height[25:] == [None] * 16
+
+
 def test_an_error_of_the_sender_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(_: Page) -> None:
         raise RuntimeError("cannot draw")

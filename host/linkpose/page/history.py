@@ -59,6 +59,15 @@ class History:
         if len(self._path) > PATH_POINTS:
             self._path, self._step = self._path[::2], 2 * self._step
 
+    def forget(self, columns: Sequence[int], since_s: float) -> None:
+        """Takes out of these columns what is not older than `since_s`: a filter without its sensor only predicts."""
+        rows = self._rows[self._start : self._end]
+        rows[np.searchsorted(rows[:, 0], since_s) :, columns] = math.nan
+        for row in reversed(self._path):
+            if row[0] < since_s:
+                break
+            row[columns] = math.nan
+
     @property
     def newest(self) -> Floats | None:
         """The newest row (columns,)."""

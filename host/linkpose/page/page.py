@@ -22,13 +22,14 @@ from linkpose.page.drawing import Drawing
 from linkpose.page.history import History, Replay
 from linkpose.page.origin import own_requests_only
 from linkpose.page.status import PageStatus
-from linkpose.presentation import fault_lines, lost_filters, working_sensors
+from linkpose.presentation import fault_lines, lost_filters, lost_since, working_sensors
 from linkpose.sensors.measurements import Floats
 from linkpose.sensors.rig import Rig
 
 if TYPE_CHECKING:
     import viser
 
+    from linkpose.device.session import Health
     from linkpose.estimation import FoundJ2s
 
 LOOPBACK = "127.0.0.1"
@@ -292,11 +293,20 @@ class Page:
                 self._panel.draw_charts(is_whole=self._updates == 1)
         self._changes.broadcast(self._clients)
 
+    def _lose_filters(self, health: Health) -> None:
+        """Blanks the filters that have lost a sensor which they need, from the time on at which they lost it."""
+        needed, self._lost_at = self._needed.__getitem__, []
+        for name in lost_filters(self._of_filter, health, needed):
+            columns = [self._columns.index(column) for column in self._of_filter[name].values()]
+            self._lost_at += columns
+            if isinstance(self._history, History):
+                self._history.forget(columns, lost_since(name, health, needed))
+
     def _draw_status(self, time_s: float | None, status: PageStatus) -> None:
         """Draws what changes with the health, at the time (s) of the newest row, if there is one."""
         health, words = status.health, []
-        lost = lost_filters(self._of_filter, health, self._needed.__getitem__) if health is not None else ()
-        self._lost_at = [self._columns.index(column) for name in lost for column in self._of_filter[name].values()]
+        if health is not None:
+            self._lose_filters(health)
         if time_s is not None:
             words.append(f"{time_s:.1f} s")
         if health is not None:
