@@ -310,6 +310,16 @@ def test_info_json(linkpose):
     assert info["board"]["stack_free_bytes"] is info["board"]["vcc_mv"] is None, "a simulated board has no processor"
 
 
+def test_info_of_a_recording_names_chips_and_units(linkpose, tmp_path):
+    recording = tmp_path / "r.csv"
+    linkpose("record", recording, "--port", "sim://link?speed=0", "--duration", 3, "-q")
+    shown = linkpose("info", recording).out.splitlines()
+    assert "barometer            BMP180" in shown
+    assert "noise at rest        2.0 s" in shown and shown[shown.index("noise at rest        2.0 s") + 1].endswith(
+        " m/s²"
+    )
+
+
 UNO = PortInfo("/dev/ttyACM0", "Arduino Uno", 0x2341, 0x0043, "55", True, False)
 OTHER = PortInfo("/dev/ttyS0", "", None, None, None, False, None)
 

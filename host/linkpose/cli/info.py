@@ -194,7 +194,7 @@ def _rounded(value: float | None) -> float | None:
 # Units at the end of a report's keys, as a person reads them.
 _UNITS = {
     "_hz": "Hz", "_g": "g", "_rad_s": "rad/s", "_deg_s": "°/s", "_ppm": "ppm", "_percent": "%", "_us": "µs",
-    "_mv": "mV", "_bytes": "bytes", "_m_s2": "m/s²", "_Pa": "Pa", "_s": "s", "_m": "m",
+    "_mv": "mV", "_bytes": "bytes", "_m_s2": "m/s²", "_Pa": "Pa", "_s": "s", "_m": "m", "seconds": "s",
 }  # fmt: skip
 
 
@@ -240,8 +240,17 @@ def _label(name: str) -> tuple[str, str]:
 
 
 def _item(name: str, value: Any) -> tuple[str, str, str]:
+    if name == "family":
+        return "", _family_name(value), ""
     label, unit = _label(name)
     return (label, _MISSING.get(name, "not measured"), "") if value is None else (label, _text(value), unit)
+
+
+def _family_name(family: Any) -> str:
+    """The chips of a family, or its number as the file has it."""
+    from linkpose.wire.messages import DeviceFamily
+
+    return next((known.name for known in DeviceFamily if known == family), _text(family))
 
 
 def _device_line(device: dict[str, Any]) -> str:
