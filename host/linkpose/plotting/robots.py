@@ -27,6 +27,7 @@ _MARKS = 12  # heading ticks and ellipses along a path
 _TICK_INCHES = 0.22  # length of a heading tick
 _TICKS_APART = 1.4  # lengths of a tick between two, at least: those of a robot that moves little hid its path
 _MOST_CELLS = 3000  # of a map, along a side
+_MAP_COLOURS = ("white", "#707070", "#E8E8E8")  # of cells that are free, occupied, unknown
 _WIDE_RATIO = 2.2  # of a path's extents, from which on it is drawn over the whole width
 
 TimePanel = tuple[float, Callable[["Axes"], list[str]]]
@@ -107,16 +108,20 @@ def _draw_scene(axes: Axes, scene: Surroundings) -> None:
 
 
 def draw_map(axes: Axes, grid: GridMap) -> None:
-    """Cells that stop beams, in grey. The map's own axes may be turned against those of the path."""
+    """Walls in grey, and what nobody has seen in light grey. Its own axes may be turned against those of the path."""
+    from matplotlib.colors import ListedColormap
     from matplotlib.transforms import Affine2D
 
     _, x, y, turn = grid.geometry.tolist()
     width, height = grid.size_m
     cells = grid.blocked[:: _stride(grid.blocked.shape[0]), :: _stride(grid.blocked.shape[1])]
+    limits = axes.dataLim.frozen()
     image = axes.imshow(
-        cells, cmap="Greys", vmin=0, vmax=2, extent=(0, width, 0, height), origin="lower", interpolation="nearest"
-    )
+        cells, cmap=ListedColormap(_MAP_COLOURS), vmin=0, vmax=2, extent=(0, width, 0, height), origin="lower",
+        interpolation="nearest",
+    )  # fmt: skip
     image.set_zorder(0)
+    axes.dataLim.set(limits)  # matplotlib takes the extent for the place
     placed = Affine2D().rotate(turn).translate(x, y)
     image.set_transform(placed + axes.transData)
     corners = placed.transform(np.array([(0, 0), (width, 0), (width, height), (0, height)]))

@@ -14,7 +14,7 @@ from linkpose.evaluation.scoring import Score
 from linkpose.evaluation.series import interval
 from linkpose.evaluation.takes import MOTION_CAPTURE
 from linkpose.plotting.canvas import REFERENCES
-from linkpose.plotting.lines import gaps, lost_samples
+from linkpose.plotting.lines import gaps, is_regular, lost_samples
 from linkpose.presentation import counted
 from linkpose.quantities import HEADING, HEIGHT, QW, ROLL, Quantity, by_filter, split, std_column
 from linkpose.recording.table import Table
@@ -195,10 +195,12 @@ def _describe(table: Table) -> str:
     time_s, whole = table.columns["time_s"], table.whole
     step = whole.interval_s if whole else interval(time_s)
     length = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    words = [shortened(table.path.name), _length(length), f"{1 / step:.4g} Hz" if step > 0 else ""]
+    words = [shortened(table.path.name), _length(length)]
+    lost = (table.closing or {}).get("lost")
+    if whole is None and lost is None and not is_regular(time_s):
+        return "   ·   ".join([*words, counted(len(time_s), "row")])
+    words.append(f"{1 / step:.4g} Hz" if step > 0 else "")
     holes = whole.gaps if whole else len(gaps(time_s))
-    closing = table.closing or {}
-    lost = closing.get("lost")
     if not isinstance(lost, int) or (holes and not lost):  # rows were taken out of the file afterwards
         lost = whole.lost if whole else lost_samples(time_s)
     words.append("no samples lost" if not (lost or holes) else f"{lost} samples lost in {counted(holes, 'gap')}")
