@@ -21,8 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.carmen_units import check_beam_angles, check_headings, check_ranges
+from linkpose.localization.carmen_units import check_beam_angles, check_ranges
 from linkpose.localization.events import Event, Log, LogFile, Scan, check_clock, in_order, read_number
+from linkpose.localization.headings import check_headings
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.models.se2 import sinc
 from linkpose.presentation import counted
@@ -92,7 +93,7 @@ def read_carmen(path: Path, lines: Sequence[str]) -> LogFile:
     check_clock([scans, [reading for reading in timed if reading.ranges_m is None]], path)
     ordered, moved = in_order(timed)
     check_ranges([reading.ranges_m for reading in ordered if reading.ranges_m is not None], path)
-    check_headings(np.array([reading.odometry for reading in ordered]), path)
+    check_headings(np.array([reading.odometry for reading in ordered]), path, "the odometry")
     if moved:
         remarks.append(f"{path}: {counted(moved, 'line')} moved into the order of time")
     return LogFile(as_log(_without_echo(ordered)), ordered[0].odometry, tuple(remarks), is_carmen=True)

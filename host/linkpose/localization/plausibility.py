@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from linkpose.errors import LinkposeError
-from linkpose.localization.carmen_units import check_headings
 from linkpose.localization.events import NAMED, Event, Log
+from linkpose.localization.headings import check_headings
 from linkpose.localization.tables import Beacons
 
 # The median range in units of the beacons' largest distance from each other, beyond which it cannot be metres: a robot

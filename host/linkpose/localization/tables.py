@@ -10,8 +10,8 @@ import numpy as np
 
 from linkpose.errors import LinkposeError
 from linkpose.inputs import read_bytes
-from linkpose.localization.carmen_units import check_headings
 from linkpose.localization.events import beacon_name, read_number
+from linkpose.localization.headings import check_headings
 from linkpose.localization.linalg import Floats, wrap_angle
 from linkpose.localization.track import Track
 from linkpose.recording.delimited import split_cells, to_utf8
