@@ -176,11 +176,9 @@ def with_doubtful_robot(track: Track) -> Track:
     if track.robot_errors is None or track.heading_rad is None:
         return track
     angle, ahead, left = track.robot_errors.likely[:3].tolist()
-    off = np.zeros((len(track.time_s), len(track.names)))
-    at = [track.names.index(name) for name in ("x_m", "y_m", "heading_rad")]
-    c, s = np.cos(track.heading_rad), np.sin(track.heading_rad)
-    off[:, at] = np.column_stack((c * ahead - s * left, s * ahead + c * left, np.full(len(c), angle)))
-    return replace(track, covariance=track.covariance + off[:, :, np.newaxis] * off[:, np.newaxis, :])
+    heading = track.heading_rad[track.known]
+    c, s = np.cos(heading), np.sin(heading)
+    return _widened(track, np.column_stack((c * ahead - s * left, s * ahead + c * left, np.full(len(c), angle))), 1.0)
 
 
 def with_doubtful_clock(log: Log, track: Track) -> Track:
@@ -196,11 +194,16 @@ def with_doubtful_clock(log: Log, track: Track) -> Track:
     times = track.time_s[known]
     path = np.column_stack((track.position_m[known, :2], np.unwrap(track.heading_rad[known])))
     late = np.column_stack([np.interp(times + lag, times, column) for column in path.T])
+    return _widened(track, late - path, 0.5)
+
+
+def _widened(track: Track, off: Floats, probability: float) -> Track:
+    """The track, whose known poses (N) may be off by `off` (N, 3; x m, y m, rad) with this probability."""
     at = [track.names.index(name) for name in ("x_m", "y_m", "heading_rad")]
+    whole = np.zeros((len(off), len(track.names)))
+    whole[:, at] = off
     covariance = track.covariance.copy()
-    moved = np.zeros((len(times), len(track.names)))
-    moved[:, at] = late - path
-    covariance[known] += 0.5 * moved[:, :, np.newaxis] * moved[:, np.newaxis, :]
+    covariance[track.known] += probability * whole[:, :, np.newaxis] * whole[:, np.newaxis, :]
     return replace(track, covariance=covariance)
 
 
